@@ -55,7 +55,7 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/numpydoc lint $$(find iscat_analysis -name '*.py' -not -path '*/_*')
+	$(BIN)/python .ci/docstrings.py
 
 kernels: $(KERNELS)
 

@@ -28,34 +28,12 @@ products that are divided once more take several times the processors, and longe
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run `iscat`.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Without the program's name; default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run `iscat`."""
     return _start("iscat", arguments)
 
 
 def main_fit(arguments: Sequence[str] | None = None) -> int:
-    """Run `iscat-fit`, which is ``iscat fit``.
-
-    Parameters
-    ----------
-    arguments : sequence of str, optional
-        Without the program's name; default those of the process.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run `iscat-fit`, which is ``iscat fit``."""
     return _start("iscat-fit", arguments)
 
 

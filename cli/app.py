@@ -68,20 +68,7 @@ GROUPS = (("calibrate", CALIBRATE_SUMMARY, _CALIBRATIONS),)
 
 
 def run(program: str, arguments: Sequence[str]) -> int:
-    """Run one of the two programs.
-
-    Parameters
-    ----------
-    program : str
-        ``"iscat"`` or ``"iscat-fit"``, which is ``iscat fit``.
-    arguments : sequence of str
-        Without the program's name.
-
-    Returns
-    -------
-    int
-        Exit status.
-    """
+    """Run one of the two programs."""
     given = list(arguments)
     if program == "iscat-fit":
         app = _empty()

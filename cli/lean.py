@@ -30,17 +30,7 @@ def load_numpy() -> None:
 
 @contextmanager
 def without(name: str) -> Iterator[None]:
-    """Have libraries that are loaded take an optional one for missing, if nobody has loaded it.
-
-    Parameters
-    ----------
-    name : str
-        Of the optional library.
-
-    Yields
-    ------
-    None
-    """
+    """Have libraries that are loaded take an optional one for missing, if nobody has loaded it."""
     hidden = name not in sys.modules
     if hidden:
         sys.modules[name] = None  # type: ignore[assignment]  # which import takes for missing

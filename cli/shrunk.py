@@ -14,13 +14,7 @@ _handlers: list[object] = []  # the system holds their addresses alone
 
 
 def explain_bus_errors(program: str) -> None:
-    """Have this process say what has happened before it ends.
-
-    Parameters
-    ----------
-    program : str
-        What the message begins with.
-    """
+    """Have this process say what has happened before it ends."""
     if not hasattr(signal, "SIGBUS"):
         return
     ours = os.getpid()

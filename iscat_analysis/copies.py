@@ -32,18 +32,7 @@ class LostError(Exception):
 
 
 class Copy:
-    """A copy of this process, which leads a group of processes with those that it starts.
-
-    Parameters
-    ----------
-    work : callable
-        What it is asked → what it answers; both are pickled.
-
-    Raises
-    ------
-    OSError
-        There is no room for another process.
-    """
+    """A copy of this process, which leads a group of processes with those that it starts."""
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
         theirs, asking = os.pipe()
@@ -66,23 +55,7 @@ class Copy:
         self._asking, self._telling = os.fdopen(asking, "wb"), os.fdopen(telling, "rb")
 
     def do(self, asked: Any) -> Any:
-        """Have it do something, and wait for that.
-
-        Parameters
-        ----------
-        asked : Any
-            What `work` is given there.
-
-        Returns
-        -------
-        Any
-            What it gives; what it raises is raised.
-
-        Raises
-        ------
-        LostError
-            The copy has ended.
-        """
+        """Have it do something, and wait for that."""
         self.ask(asked)
         try:
             failed, result = _received(self._telling)
@@ -93,18 +66,7 @@ class Copy:
         return result
 
     def ask(self, asked: Any) -> None:
-        """Have it do something, and do not wait for that; nothing can be had from it afterwards.
-
-        Parameters
-        ----------
-        asked : Any
-            As in `do`.
-
-        Raises
-        ------
-        LostError
-            The copy has ended.
-        """
+        """Have it do something, and do not wait for that; nothing can be had from it afterwards."""
         try:
             _send(self._asking, asked)
         except OSError:
@@ -127,23 +89,7 @@ class Copy:
 
 
 def aside(work: Callable[[], T]) -> Future[T]:
-    """Begin work in a copy of this process, which then ends.
-
-    Parameters
-    ----------
-    work : callable
-        What to do.
-
-    Returns
-    -------
-    Future
-        What it gives; `LostError` where the copy has ended before.
-
-    Raises
-    ------
-    OSError
-        There is no room for another process.
-    """
+    """Begin work in a copy of this process, which then ends."""
     copy = Copy(lambda _: work())
     done: Future[T] = Future()
 

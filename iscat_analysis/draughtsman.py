@@ -54,40 +54,18 @@ class Draughtsman:
                 self._thread.submit(self._other.do, None)
 
     def begin(self, analysis: Analysis, folder: Path, most: int) -> None:
-        """Let it draw what does not depend on the species, once and where there is such a process.
-
-        Parameters
-        ----------
-        analysis : Analysis
-            What was found, perhaps without species.
-        folder : Path
-            An existing folder.
-        most : int
-            Events whose images are drawn, at most.
-        """
+        """Let it draw what does not depend on the species, once, if there is such a process."""
         if not self._begun and self._other is not None:
             self._begun = True
             self._thread.submit(self._other.do, (analysis, folder, most))
 
     def end(self, summary: Mapping[str, Any]) -> None:
-        """Let it draw the rest of what was begun.
-
-        Parameters
-        ----------
-        summary : mapping
-            Of the whole analysis.
-        """
+        """Let it draw the rest of what was begun."""
         if self._begun and self._other is not None:
             self._answer = self._thread.submit(self._other.do, summary)
 
     def page(self) -> str | None:
-        """Wait until all is drawn.
-
-        Returns
-        -------
-        str or None
-            The page; None where nothing was begun or the process failed, and another has to draw.
-        """
+        """Wait until all is drawn."""
         if self._answer is None or self._other is None:
             return None
         try:

@@ -20,20 +20,7 @@ class FloodError(DataError):
 
 
 class SignError(DataError):
-    """Most particles of a calibrant have the sign of those that leave.
-
-    Parameters
-    ----------
-    said : str
-        That, and in which case what is to be done.
-    advice : str
-        What is to be done.
-
-    Attributes
-    ----------
-    said : str
-        As given, for another advice.
-    """
+    """Most particles of a calibrant have the sign of those that leave."""
 
     def __init__(self, said: str, advice: str) -> None:
         super().__init__(said, advice)  # both, so that it can be pickled

@@ -13,22 +13,7 @@ _UNFINISHED: dict[Path, bool] = {}  # all true; the last begun is last
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Have `discard_unfinished` remove something for as long as the block runs.
-
-    Parameters
-    ----------
-    path : Path
-        A file or a folder, which need not exist yet.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    KeyboardInterrupt
-        The block ended well, but `path` is being discarded: the process ends.
-    """
+    """Have `discard_unfinished` remove something for as long as the block runs."""
     _UNFINISHED[path] = True
     try:
         yield
@@ -40,18 +25,7 @@ def unfinished(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Put a file in place once everything is written.
-
-    Parameters
-    ----------
-    path : Path
-        Replaced where it exists.
-
-    Yields
-    ------
-    Path
-        Beside it: where to write.  It is removed if writing fails.
-    """
+    """Put a file in place once everything is written."""
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         with unfinished(partial):
@@ -72,13 +46,7 @@ def discard_unfinished() -> None:
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder, also if an interrupt or a new file arrives meanwhile.
-
-    Parameters
-    ----------
-    folder : Path
-        It need not exist.
-    """
+    """Remove a folder, also if an interrupt or a new file arrives meanwhile."""
     try:
         shutil.rmtree(folder, ignore_errors=True)
     finally:

@@ -25,20 +25,7 @@ _ASIDE = 5  # on the scale of `nice`: a quarter of a processor that is wanted, a
 
 
 class BegunHash:
-    """A file that is hashed while something else is done.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    digest : Future of str
-        What `sha256_of_files` gives of it alone; raises `DataError` where it cannot be read.
-    """
+    """A file that is hashed while something else is done."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -65,18 +52,7 @@ class BegunHash:
         return digest
 
     def is_of(self, files: Sequence[Path]) -> bool:
-        """Tell whether a movie is this file, as it was when its hash was begun.
-
-        Parameters
-        ----------
-        files : sequence of Path
-            That hold the movie.
-
-        Returns
-        -------
-        bool
-            False where the file was replaced or written to since then.
-        """
+        """Tell whether a movie is this file, as it was when its hash was begun."""
         return tuple(files) == (self.path,) and _state(self.path) == self._state
 
     def close(self) -> None:
@@ -102,25 +78,7 @@ def _hash_aside(files: Sequence[Path]) -> str:
 
 
 def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
-    """Hash a movie, without holding it in memory.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        That hold it.
-    part : str
-        What it is of them.
-
-    Returns
-    -------
-    str
-        SHA-256 of the bytes of the files, and of the part, as 64 hexadecimal digits.
-
-    Raises
-    ------
-    DataError
-        A file cannot be read.
-    """
+    """Hash a movie, without holding it in memory."""
     digest, room = hashlib.sha256(), memoryview(bytearray(_BLOCK_BYTES))
     for path in files:
         try:
@@ -134,20 +92,7 @@ def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
 
 
 def fingerprint(files: Sequence[Path], part: str = "") -> str:
-    """Tell a movie's content from another's without reading all of it.
-
-    Parameters
-    ----------
-    files : sequence of Path
-        That hold it.
-    part : str
-        What it is of them.
-
-    Returns
-    -------
-    str
-        Hash of the sizes, times of change and ends of the files, and of the part.
-    """
+    """Tell a movie's content from another's without reading all of it."""
     end = max(_END_BYTES // max(len(files), 1), _LEAST_END_BYTES)
     digest = hashlib.sha256(part.encode("utf-8", "backslashreplace"))
     for path in files:

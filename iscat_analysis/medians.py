@@ -11,15 +11,7 @@ from numpy.typing import NDArray
 def middle(values: NDArray[np.floating]) -> Any:
     """Give medians along the last axis, several times as fast as NumPy, which looks for NaN.
 
-    Parameters
-    ----------
-    values : ndarray, shape (..., n)
-        Finite; sorted by halves afterwards.
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Of the same type; of an even number, the mean of the two in the middle.
+    Shapes: `values` (..., n), result (...).
     """
     half = values.shape[-1] // 2
     values.partition(half, axis=-1)

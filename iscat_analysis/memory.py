@@ -21,10 +21,6 @@ def freed_memory_kept() -> Iterator[None]:
 
     The system clears memory before it gives it, which takes longer than many a step of ours with
     the array that lies in it.
-
-    Yields
-    ------
-    None
     """
     _keep_up_to(_EVERYTHING, _EVERYTHING)
     try:

@@ -50,13 +50,7 @@ R = TypeVar("R")
 
 
 def versions() -> dict[str, str]:
-    """Tell the versions that results depend on.
-
-    Returns
-    -------
-    dict of str to str
-        Of this package, Python and `DEPENDENCIES`.
-    """
+    """Tell the versions that results depend on."""
     return {
         "iscat-analysis": version("iscat-analysis"),
         "python": platform.python_version(),
@@ -72,68 +66,16 @@ class Place(Protocol):
         """Whether jobs run in other processes, which read movies by their paths."""
 
     def threads(self, wanted: int) -> int:
-        """Say how many threads this process may use.
-
-        Parameters
-        ----------
-        wanted : int
-            ``compute.workers``.
-
-        Returns
-        -------
-        int
-            At least 1.
-        """
+        """Say how many threads this process may use."""
 
     def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
-        """Do a job and wait for it.
-
-        Parameters
-        ----------
-        job : callable
-            A function at module level, with an option `progress`.
-        *arguments : Any
-            Of the job.
-        progress : Progress
-            Told how far a job in this process is; one elsewhere tells nothing.
-
-        Returns
-        -------
-        Any
-            What the job gives; what it raises is raised.
-        """
+        """Do a job and wait for it."""
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, several at a time where jobs run elsewhere.
-
-        Parameters
-        ----------
-        work : callable
-            Makes `call` do the most of it.
-        items : sequence
-            In the order in which they are begun.
-
-        Yields
-        ------
-        int
-            Number of an item.
-        Any
-            What `work` gave for it, as soon as it is there.
-        """
+        """Do something with every item, several at a time where jobs run elsewhere."""
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
-        """Say what a user should know before work begins.
-
-        Parameters
-        ----------
-        memory_limit_mb : int
-            ``compute.memory_limit_mb``.
-
-        Returns
-        -------
-        list of str
-            One line each.
-        """
+        """Say what a user should know before work begins."""
 
 
 class Here:
@@ -161,20 +103,7 @@ class Here:
 
 
 class Cluster:
-    """The workers of a Dask cluster; `open_place` connects to one.
-
-    Parameters
-    ----------
-    client : distributed.Client
-        Connected; whoever gives it closes it.
-    address : str
-        What messages call the cluster.
-
-    Raises
-    ------
-    ConfigError
-        A worker has other versions of what results depend on.
-    """
+    """The workers of a Dask cluster; `open_place` connects to one."""
 
     distant = True
 
@@ -334,27 +263,7 @@ def _work(expected: dict[str, str], sent: bytes) -> bytes:
 def open_place(
     scheduler: str = THREADS, scheduler_file: str | Path | None = None
 ) -> Iterator[Place]:
-    """Connect to where work shall run.
-
-    Parameters
-    ----------
-    scheduler : str
-        ``"threads"``, or the address of the scheduler of a Dask cluster, as in
-        ``"tcp://10.0.0.1:8786"``.
-    scheduler_file : str or Path, optional
-        File in which such a scheduler has left its address, instead of `scheduler`.
-
-    Yields
-    ------
-    Place
-        Until the block ends; the cluster goes on.
-
-    Raises
-    ------
-    ConfigError
-        The scheduler cannot be reached, the file holds no address, a worker has other versions, or
-        Dask is not installed.
-    """
+    """Connect to where work shall run."""
     for name, value in (("scheduler", scheduler), ("scheduler_file", scheduler_file)):
         if value is not None and not isinstance(value, (str, Path)):
             raise ConfigError(f"`{name}` = {value!r}: give a text or a path")

@@ -68,33 +68,14 @@ class _Watched(ThreadPoolExecutor):
 
 
 def processors() -> int:
-    """Count the processors that this process may use, which may be fewer than there are.
-
-    Returns
-    -------
-    int
-        At least one.
-    """
+    """Count the processors that this process may use, which may be fewer than there are."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Begin work in a thread of its own, with no more threads than are allotted to this one.
-
-    Parameters
-    ----------
-    work : callable
-        What to do.
-    *arguments : object
-        Given to it.
-
-    Returns
-    -------
-    Future
-        Its result.
-    """
+    """Begin work in a thread of its own, with no more threads than are allotted to this one."""
     pool = ThreadPoolExecutor(1)
     begun = pool.submit(copy_context().run, work, *arguments)
     pool.shutdown(wait=False)
@@ -103,12 +84,7 @@ def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
 
 @contextmanager
 def one_thread_algebra() -> Iterator[None]:
-    """Keep linear algebra to the thread that calls it, so that its sums have one order.
-
-    Yields
-    ------
-    None
-    """
+    """Keep linear algebra to the thread that calls it, so that its sums have one order."""
     with threadpool_limits(1, user_api="blas"):
         yield
 
@@ -119,16 +95,6 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
 
     Linear algebra keeps to the thread that calls it: libraries would start one more for every
     processor in each of ours, and small products then take several times as long.
-
-    Parameters
-    ----------
-    count : int
-        Threads at most; within `allotted`, what is allotted counts instead.
-
-    Yields
-    ------
-    ThreadPoolExecutor
-        Open until the block ends.
     """
     given = _ALLOTTED.get()
     if given is not None:
@@ -144,48 +110,18 @@ def over_frames(pool: ThreadPoolExecutor, shape: tuple[int, ...]) -> Mapper:
 
     Below `_LARGE_PX` such calls are so short that threads wait longer for their turn at Python than
     they save, in whatever number.
-
-    Parameters
-    ----------
-    pool : ThreadPoolExecutor
-        From `threads`.
-    shape : (int, int)
-        Rows and columns.
-
-    Returns
-    -------
-    callable
-        That of the pool, or `map`.
     """
     return pool.map if math.prod(shape) >= _LARGE_PX else map
 
 
 def is_allotted() -> bool:
-    """Tell whether work in this thread has the threads of a place, and no more.
-
-    Returns
-    -------
-    bool
-        Whether it is done within `allotted`.
-    """
+    """Tell whether work in this thread has the threads of a place, and no more."""
     return _ALLOTTED.get() is not None
 
 
 @contextmanager
 def allotted(count: int, stop: Callable[[], None]) -> Iterator[None]:
-    """Let `threads` start as many threads as a place has, whatever number it is asked for.
-
-    Parameters
-    ----------
-    count : int
-        Threads.
-    stop : callable
-        Called before each task in them; raises where the work is no longer wanted.
-
-    Yields
-    ------
-    None
-    """
+    """Let `threads` start as many threads as a place has, whatever number it is asked for."""
     token = _ALLOTTED.set(_Allotment(count, stop))
     try:
         yield

@@ -16,56 +16,17 @@ KILODALTON_KG = 1e3 * DALTON_KG
 
 
 def sphere_mass_kda(diameter_nm: float, density_kg_m3: float) -> float:
-    """Mass of a sphere.
-
-    Parameters
-    ----------
-    diameter_nm : float
-        Diameter [nm].
-    density_kg_m3 : float
-        Density [kg/m³].
-
-    Returns
-    -------
-    float
-        Mass [kDa].
-    """
+    """Mass of a sphere."""
     return density_kg_m3 * math.pi / 6 * (diameter_nm * NM) ** 3 / KILODALTON_KG
 
 
 def count(n: int, noun: str) -> str:
-    """Write so many of something, in the plural unless it is one.
-
-    Parameters
-    ----------
-    n : int
-        How many.
-    noun : str
-        Of what.
-
-    Returns
-    -------
-    str
-        "1 event", "2 events".
-    """
+    """Write so many of something, in the plural unless it is one."""
     return f"{n} {noun}{'' if n == 1 else 's'}"
 
 
 def listed(items: Iterable[object], most: int) -> str:
-    """Write the first few things, and how many more there are.
-
-    Parameters
-    ----------
-    items : iterable
-        Things.
-    most : int
-        How many are written out.
-
-    Returns
-    -------
-    str
-        "1, 2", "1, 2, 3 and 5 more".
-    """
+    """Write the first few things, and how many more there are."""
     words = [str(item) for item in items]
     more = f" and {len(words) - most} more" if len(words) > most else ""
     return ", ".join(words[:most]) + more

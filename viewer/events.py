@@ -28,15 +28,7 @@ class EventPanel(QGroupBox):
         self._inside.addStretch(1)
 
     def show_row(self, result: ia.StoredResult, row: int) -> None:
-        """Show a row of a result; where there are no images, say why.
-
-        Parameters
-        ----------
-        result : StoredResult
-            The result.
-        row : int
-            Position in its table.
-        """
+        """Show a row of a result; where there are no images, say why."""
         if self.canvas is not None:
             self._inside.removeWidget(self.canvas)
             self.canvas.deleteLater()
@@ -55,18 +47,7 @@ class EventPanel(QGroupBox):
 
 
 def facts_of(row: pd.Series) -> str:
-    """Write the numbers of an event.
-
-    Parameters
-    ----------
-    row : pandas.Series
-        Of the table.
-
-    Returns
-    -------
-    str
-        Lines of rich text.
-    """
+    """Write the numbers of an event."""
     kind = "leaves" if row["mass_kda"] < 0 else "frame"
     named = f"event {row['event']}"
     if "track" in row and pd.notna(row["track"]):

@@ -45,13 +45,7 @@ _LANDS, _LEAVES = "yellow", "deepskyblue"
 
 
 class Explorer(QWidget):
-    """Searches the frames that are shown, and shows the images of events.
-
-    Parameters
-    ----------
-    napari_viewer : napari.viewer.Viewer
-        Given by napari.
-    """
+    """Searches the frames that are shown, and shows the images of events."""
 
     def __init__(self, napari_viewer: napari.viewer.Viewer) -> None:
         super().__init__()
@@ -175,13 +169,7 @@ class Explorer(QWidget):
     # ---- the search ------------------------------------------------------------------------
 
     def prepare(self) -> ia.Preview | None:
-        """Make ready to search the chosen movie with the chosen configuration.
-
-        Returns
-        -------
-        Preview or None
-            None where that cannot be done; the widget says why.
-        """
+        """Make ready to search the chosen movie with the chosen configuration."""
         layer, path = self.movie.currentData(), self.config.text().strip()
         if layer is None:
             self._say("open a movie first")
@@ -320,15 +308,7 @@ class Explorer(QWidget):
                 return
 
     def show_event(self, result: ia.StoredResult, row: int) -> None:
-        """Show data, model and residual of a row of a result.
-
-        Parameters
-        ----------
-        result : StoredResult
-            The result.
-        row : int
-            Position in its table.
-        """
+        """Show data, model and residual of a row of a result."""
         with _busy():
             self.event.show_row(result, row)
 
@@ -349,17 +329,7 @@ class Explorer(QWidget):
 
 
 class RatioFrames(LazyFrames):
-    """The contrast at every frame, as the search compares its windows.
-
-    Parameters
-    ----------
-    preview : Preview
-        Of the movie.
-    shape : (int, int, int)
-        Of the movie.
-    window : int
-        Frames that are summed; it may be changed.
-    """
+    """The contrast at every frame, as the search compares its windows."""
 
     def __init__(self, preview: ia.Preview, shape: tuple[int, int, int], window: int) -> None:
         super().__init__(shape, np.float32, lambda t: preview.look(t, self.window).image)

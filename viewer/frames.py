@@ -13,17 +13,7 @@ from iscat_analysis import Stack
 
 
 class LazyFrames:
-    """What a viewer takes for an array (t, y, x): each frame is made when it is asked for.
-
-    Parameters
-    ----------
-    shape : (int, int, int)
-        Frames, rows, columns.
-    dtype : dtype
-        Of the frames.
-    frame : callable
-        Number of a frame → the frame, of shape (y, x).
-    """
+    """What a viewer takes for an array (t, y, x): each frame is made when it is asked for."""
 
     ndim = 3
 
@@ -64,13 +54,7 @@ class LazyFrames:
 
 
 class LazyMovie(LazyFrames):
-    """The counts of an open movie; it is closed when nothing shows it any more.
-
-    Parameters
-    ----------
-    stack : Stack
-        The movie.
-    """
+    """The counts of an open movie; it is closed when nothing shows it any more."""
 
     def __init__(self, stack: Stack) -> None:
         super().__init__(stack.shape, stack.dtype, lambda t: stack.read(t, t + 1)[0])

@@ -30,18 +30,7 @@ _SAMPLED = 5  # frames from which the contrast limits of a movie are taken
 
 
 def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
-    """Tell whether this is a movie that `open_stack` may read.
-
-    Parameters
-    ----------
-    path : str or sequence of str
-        What napari was asked to open.
-
-    Returns
-    -------
-    callable or None
-        Path → its layer; None for several paths, for results and for other folders.
-    """
+    """Tell whether this is a movie that `open_stack` may read."""
     if not isinstance(path, str) or _is_result(Path(path)):
         return None
     if Path(path).is_dir() and Path(path).suffix.lower() != ".zarr":
@@ -50,18 +39,7 @@ def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] 
 
 
 def result_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
-    """Tell whether this is the output folder of a movie.
-
-    Parameters
-    ----------
-    path : str or sequence of str
-        What napari was asked to open.
-
-    Returns
-    -------
-    callable or None
-        Path → its layers; None for anything else.
-    """
+    """Tell whether this is the output folder of a movie."""
     if not isinstance(path, str) or not _is_result(Path(path)):
         return None
     return lambda path: result_layers(open_result(path))
@@ -72,35 +50,13 @@ def _is_result(path: Path) -> bool:
 
 
 def movie_layer(movie: LazyMovie) -> LayerData:
-    """Make the layer of a movie.
-
-    Parameters
-    ----------
-    movie : LazyMovie
-        The movie.
-
-    Returns
-    -------
-    tuple
-        An image layer; its contrast limits are those of a few frames.
-    """
+    """Make the layer of a movie."""
     options = {"name": movie.stack.name, "contrast_limits": limits_of(movie), "colormap": "gray"}
     return movie, options, "image"
 
 
 def limits_of(frames: LazyFrames) -> tuple[float, float]:
-    """Give the limits between which most of the pixels of a few frames lie.
-
-    Parameters
-    ----------
-    frames : LazyFrames
-        Frames (t, y, x).
-
-    Returns
-    -------
-    (float, float)
-        Different.
-    """
+    """Give the limits between which most of the pixels of a few frames lie."""
     numbers = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED).astype(int))
     seen = np.concatenate([np.ravel(frames[int(t)]) for t in numbers]).astype(float)
     seen = seen[np.isfinite(seen)]
@@ -109,19 +65,7 @@ def limits_of(frames: LazyFrames) -> tuple[float, float]:
 
 
 def result_layers(result: StoredResult) -> list[LayerData]:
-    """Make the layers of a result.
-
-    Parameters
-    ----------
-    result : StoredResult
-        From `open_result`.
-
-    Returns
-    -------
-    list of tuple
-        The movie, where it is found; the tracks of mode ``track``; and a point for each row of the
-        table, whose columns are its features.
-    """
+    """Make the layers of a result."""
     layers: list[LayerData] = []
     name = result.folder.name
     with contextlib.suppress(DataError):  # the table is worth looking at without the movie

@@ -63,13 +63,7 @@ UNKEPT: dict[str, str] = {}
 
 
 def environment() -> dict[str, str]:
-    """Give the environment of a process that keeps compiled kernels where this one does.
-
-    Returns
-    -------
-    dict of str to str
-        For `subprocess.Popen`.
-    """
+    """Give the environment of a process that keeps compiled kernels where this one does."""
     return os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if TEMPORARY else {})
 
 
@@ -118,18 +112,6 @@ def kernel(
 
     What only other kernels call is compiled as a part of them (`iscat_analysis._kernels.compiler`).
     It runs without the interpreter's lock, and divides by zero as NumPy does.
-
-    Parameters
-    ----------
-    fastmath, forceinline
-        As of `numba.njit`.
-    _nrt : bool
-        Whether it may ask for memory; without, a call costs less.
-
-    Returns
-    -------
-    callable
-        The decorator.
     """
 
     def compiled(function: Callable[..., Any]) -> Any:

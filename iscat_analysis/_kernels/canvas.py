@@ -32,22 +32,7 @@ Counts = NDArray[np.uint16] | NDArray[np.float32]
 
 
 class Pictures(NamedTuple):
-    """Pictures of one microscope, one for each blur.
-
-    Attributes
-    ----------
-    heights : ndarray, shape (groups or 1, n, 3, channels, width)
-        As in `AxialTable`.
-    first_nm, step_nm, kappa : float
-        As in `AxialTable`.
-    lens : Lens
-        What turns a profile into a signal, but for its window.
-    windows : ndarray, shape (groups or 1, degree + 1, TAPS)
-        Those of the blurs.
-    nodes : ndarray, shape (2, n, n)
-        The samples of a picture at one height once more, from which it is drawn, in single
-        precision; none along z.  Gradients are in the precision of these.
-    """
+    """Pictures of one microscope, one for each blur."""
 
     heights: FloatArray
     first_nm: float
@@ -59,21 +44,7 @@ class Pictures(NamedTuple):
 
 
 class Light(NamedTuple):
-    """A movie and what is known of its light.
-
-    Attributes
-    ----------
-    counts : ndarray of uint16 or float32, shape (t, y, x)
-        As stored [counts].
-    gain, offset : float
-        A count less the offset stands for so many photoelectrons [e/count, counts].
-    power : ndarray, shape (t,)
-        Power of each frame, 1 on average.
-    background : ndarray, shape (y, x)
-        Photoelectrons at power 1; 0 in pixels that are not used [e].
-    read : ndarray, shape (y, x)
-        Variance of the read noise; 0 there too [e²].
-    """
+    """A movie and what is known of its light."""
 
     counts: Counts
     gain: float
@@ -84,21 +55,7 @@ class Light(NamedTuple):
 
 
 class Field(NamedTuple):
-    """The pixels, and how far each particle is drawn and fitted.
-
-    Attributes
-    ----------
-    pixels : Pixels
-        Of the whole field.
-    pixel_nm : float
-        Side of a pixel [nm].
-    side, drawn : int
-        Sides of the square that is fitted and of that which is drawn [pixels].
-    slack : ndarray, shape (4,)
-        How far x, y, z [nm] and the amplitude, relative, may be from where the rings were drawn.
-    alike : bool
-        Whether the pictures for drawing are good enough for the fitted square as well.
-    """
+    """The pixels, and how far each particle is drawn and fitted."""
 
     pixels: Pixels
     pixel_nm: float
@@ -109,17 +66,7 @@ class Field(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """What the rows add up to in every frame.
-
-    Attributes
-    ----------
-    total : ndarray of float32, shape (t, y, x)
-        Signal of all rows of a frame.
-    rings, squares : ndarray, shape (rows, 5)
-        θ at which the rings and the fitted square of each row are drawn.
-    drawn : ndarray of bool, shape (t,)
-        Whether the frame holds these rows at all.
-    """
+    """What the rows add up to in every frame."""
 
     total: NDArray[np.float32]
     rings: FloatArray
@@ -279,24 +226,7 @@ def draw_frames(
 ) -> None:  # fmt: skip
     """Bring frames first…last − 1 of the canvas to the rows as they are.
 
-    Parameters
-    ----------
-    field, near, far
-        Pixels, and pictures of the fitted squares and of what is drawn around them.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    first, last : int
-        Frames.
-    theta : ndarray, shape (rows, 5)
-        The rows.
-    group : ndarray of int, shape (rows,)
-        Number of each row's picture.
-    canvas : Canvas
-        Drawn on.
-    near_profile, far_profile : ndarray
-        Room for a profile of `near` and one of `far`.
-    image : ndarray, shape (side²,)
-        Room for the larger of the squares that are drawn and fitted.
+    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `image` (side²,).
     """
     for t in range(first, last):
         _ready_frame(
@@ -408,16 +338,7 @@ def leave_over(
 ) -> None:
     """Take off frames what is expected of them.
 
-    Parameters
-    ----------
-    light : Light
-        The movie.
-    signal : ndarray of float32, shape (n, y, x)
-        Of all rows of each frame.
-    first : int
-        Number of the first of these frames.
-    out : ndarray of float32, shape (n, y, x)
-        Filled with photoelectrons [e]; 0 in pixels that are not used.
+    Shapes: `signal` (n, y, x), `out` (n, y, x).
     """
     for t in range(out.shape[0]):
         w = light.power[first + t]
@@ -437,21 +358,8 @@ def add_squares(
 ) -> None:  # fmt: skip
     """Put squares of frames on top of each other.
 
-    Parameters
-    ----------
-    light : Light
-        The movie.
-    total : ndarray of float32, shape (t, y, x)
-        Signal of all rows of each frame.
-    frame : ndarray of int, shape (n,)
-        Of each square.
-    corner : ndarray of int, shape (n, 2)
-        Row and column of its first pixel, which may lie outside the field.
-    owner : ndarray of int, shape (n,)
-        To which of the sums it adds.
-    out : ndarray, shape (m, 3, side, side)
-        Counts minus what is expected, light without particles [e], and variance of the read noise
-        [e²] are added to it.
+    Shapes: `total` (t, y, x), `frame` (n,), `corner` (n, 2), `owner` (n,), `out` (m, 3, side,
+    side).
     """
     rows, columns = light.background.shape
     side = out.shape[2]

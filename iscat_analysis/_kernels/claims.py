@@ -22,13 +22,6 @@ def claimed(folder: str, subject: str) -> Iterator[None]:
 
     The system takes back the claims of a process that ends.  Where it keeps none, as on some file
     servers, or where two processes wait for each other, the block goes on without.
-
-    Parameters
-    ----------
-    folder : str
-        Where compiled kernels are kept.
-    subject : str
-        What only one process at a time may do there.
     """
     place = zlib.crc32(subject.encode())
     file = _claimed(folder, place)

@@ -209,33 +209,13 @@ def _no_search_for_cycles() -> Iterator[None]:
 
 
 class Kernel(CPUDispatcher):  # type: ignore[misc]
-    """A function that Numba compiles when it is called.
-
-    Parameters
-    ----------
-    function : callable
-        In Python.
-    options : dict
-        Of `numba.njit`.
-    """
+    """A function that Numba compiles when it is called."""
 
     def __init__(self, function: Any, options: dict[str, Any]) -> None:
         super().__init__(function, {}, {"nopython": True, **options}, _Compiler)
 
     def compile(self, sig: Any) -> Any:
-        """Compile it, or load what was compiled.
-
-        Parameters
-        ----------
-        sig : numba signature or tuple of types
-            Of its arguments.
-
-        Returns
-        -------
-        object
-            What Python calls; where another kernel is what needs it, something by which that one
-            finds it.
-        """
+        """Compile it, or load what was compiled."""
         arguments, result = sigutils.normalize_signature(sig)
         with global_compiler_lock:
             known = self.overloads.get(tuple(arguments))
@@ -283,13 +263,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
         )
 
     def add_overload(self, cres: Any) -> None:
-        """Note what was compiled; to Python only wholes are shown.
-
-        Parameters
-        ----------
-        cres : numba.core.compiler.CompileResult
-            A body or a whole.
-        """
+        """Note what was compiled; to Python only wholes are shown."""
         if isinstance(cres.library, _Body):
             self.overloads[tuple(cres.signature.args)] = cres
         else:
@@ -323,18 +297,7 @@ class KernelStore(CompileResultCacheImpl):  # type: ignore[misc]
     """How bodies and wholes are written to disk and read again."""
 
     def reduce(self, cres: Any) -> tuple[Any, ...]:
-        """Give what is written.
-
-        Parameters
-        ----------
-        cres : numba.core.compiler.CompileResult
-            A body or a whole.
-
-        Returns
-        -------
-        tuple
-            For `rebuild`.
-        """
+        """Give what is written."""
         library = cres.library
         bitcode = library._get_module_for_linking().as_bitcode()
         code = None if isinstance(library, _Body) else library._get_compiled_object()
@@ -347,20 +310,7 @@ class KernelStore(CompileResultCacheImpl):  # type: ignore[misc]
         )  # fmt: skip
 
     def rebuild(self, target_context: Any, payload: tuple[Any, ...]) -> Any:
-        """Make of what was written what it had been.
-
-        Parameters
-        ----------
-        target_context : numba.core.cpu.CPUContext
-            Into which it is loaded.
-        payload : tuple
-            As from `reduce`.
-
-        Returns
-        -------
-        numba.core.compiler.CompileResult
-            A body or a whole.
-        """
+        """Make of what was written what it had been."""
         name, code, bitcode, function, environment, signature, reload, environments = payload
         for again in reload:
             again()

@@ -258,27 +258,7 @@ def errors_and_bias(
 ) -> bool:
     """Fill what the likelihood says of the errors of a fit.
 
-    Parameters
-    ----------
-    kind, data, level, rows
-        As in `observed_information`.
-    like : ndarray, shape (5, 5)
-        The expected information nearby, whose diagonal scales the observed one.
-    free, moving : ndarray of bool, shape (5,)
-        What was fitted, and what of it is not on a wall.
-    slope : float
-        By which errors of the amplitude are multiplied.
-    sigma : ndarray, shape (4,)
-        Filled with the errors of x, y, z and the amplitude; NaN where not free.
-    covariance : ndarray, shape (n, n)
-        Filled with that of the n free ones among these.
-    bias : ndarray, shape (5,)
-        Filled with the first-order bias.
-
-    Returns
-    -------
-    bool
-        Whether the observed information is positive; all are NaN where it is not.
+    Shapes: `like` (5, 5), `free, moving` (5,), `sigma` (4,), `covariance` (n, n), `bias` (5,).
     """
     information, inverse = np.empty((5, 5)), np.empty((5, 5))
     observed_information(kind, data, level, rows, information)

@@ -43,25 +43,7 @@ def displacement_likelihood(
     they are made.  Because the covariance is linear in D, the second derivative of its
     log-determinant is −tr[(Σ⁻¹A)²], so that the Fisher information comes along exactly.
 
-    Parameters
-    ----------
-    steps : ndarray, shape (c, n)
-        Displacements along each axis.
-    error, error_next : ndarray, shapes (c, n) and (c, n − 1)
-        Diagonal of E and the band beside it.
-    rate, rate_next : ndarray, shapes (n,) and (n − 1,)
-        Diagonal of A and the band beside it.
-    diffusion : float
-        D.
-
-    Returns
-    -------
-    value, slope, curvature : float
-        Log-likelihood and its first two derivatives with respect to D.
-    information : float
-        Fisher information on D.
-    log_determinant, its_slope : float
-        Of the covariance, all axes together.
+    Shapes: `steps` (c, n).
     """
     axes, n = steps.shape
     total0, total1, total2 = 0.0, 0.0, 0.0
@@ -111,17 +93,7 @@ def displacement_likelihoods(
     A pivot waits for the division by the one before it; those of several D need not wait for each
     other, so that ten cost twice as much as one.
 
-    Parameters
-    ----------
-    steps, error, error_next, rate, rate_next
-        As in `displacement_likelihood`.
-    diffusion : ndarray, shape (m,)
-        D.
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        Log-likelihoods.
+    Shapes: `diffusion` (m,), result (m,).
     """
     axes, n = steps.shape
     state = np.empty((4, diffusion.size))
@@ -162,20 +134,7 @@ def most_likely_diffusion(
     rate_next: FloatArray,
     scale: float,
 ) -> float:
-    """Maximise the likelihood of free diffusion by Newton's method, from one or two ladders of D.
-
-    Parameters
-    ----------
-    steps, error, error_next, rate, rate_next
-        As in `displacement_likelihood`.
-    scale : float
-        Above 0; D is looked for up to twice it and beyond, as long as the likelihood rises.
-
-    Returns
-    -------
-    float
-        D, at least 0.
-    """
+    """Maximise the likelihood of free diffusion by Newton's method, from one or two values of D."""
     top = 2.0 * scale
     while displacement_likelihood(steps, error, error_next, rate, rate_next, top)[1] > 0.0:
         top *= 2.0

@@ -21,12 +21,7 @@ def _fade(share: float) -> float:
 def extend(image: FloatArray, out: FloatArray) -> None:
     """Continue an image beyond its edges so that opposite ends meet.
 
-    Parameters
-    ----------
-    image : ndarray, shape (y, x)
-        The image.
-    out : ndarray, shape (y + m, x + n)
-        Filled: the image, then its reflections at either end, one fading into the other.
+    Shapes: `image` (y, x), `out` (y + m, x + n).
     """
     rows, columns = image.shape
     more_rows, more_columns = out.shape[0] - rows, out.shape[1] - columns
@@ -57,18 +52,8 @@ def mismatch(
 ) -> None:
     """Contrast of an image against a pattern in standard deviations.
 
-    Parameters
-    ----------
-    pattern, image : ndarray, shape (y, x)
-        Summed photoelectrons [e].
-    used : ndarray of bool, shape (y, x)
-        Pixels that count.
-    pattern_read, image_read : ndarray, shape (y, x)
-        Their read-noise variance [e²].
-    ratio : float
-        Light of the image over that of the pattern.
-    out : ndarray, shape (y, x)
-        Filled; NaN where not used.
+    Shapes: `pattern, image` (y, x), `used` (y, x), `pattern_read, image_read` (y, x), `out` (y,
+    x).
     """
     rows, columns = pattern.shape
     for i in range(rows):
@@ -95,26 +80,8 @@ def shift_equations(
 ) -> float:
     """Weighted least squares of the shift and level that explain a mismatch.
 
-    Parameters
-    ----------
-    pattern, pattern_read, image_read : ndarray, shape (y, x)
-        As in `mismatch`.
-    ratio : float
-        As in `mismatch`.
-    deviation : ndarray, shape (y, x)
-        From `mismatch`.
-    limit : float
-        Largest deviation that counts.
-    normal : ndarray, shape (3, 3)
-        Filled: normal matrix for dy, dx [pixels] and the level, with what the noise of the pattern
-        adds to the square of its gradient taken off.
-    right : ndarray, shape (3,)
-        Filled.
-
-    Returns
-    -------
-    float
-        What was taken off a diagonal element: the gradient that noise alone would have.
+    Shapes: `pattern, pattern_read, image_read` (y, x), `deviation` (y, x), `normal` (3, 3),
+    `right` (3,).
     """
     rows, columns = pattern.shape
     normal[:] = 0.0

@@ -36,19 +36,7 @@ _LARGEST = 32767.0
 
 
 class Slopes(NamedTuple):
-    """What rows change of the light in their squares; without room, left alone.
-
-    Attributes
-    ----------
-    squares : ndarray of int, shape (rows, 4)
-        First and last row and column of each, half-open; all 0 where a row is not fitted.
-    values : ndarray of int16, shape (rows, k, side²)
-        G, w B ∂C for each free parameter, over `units`: half the memory of single precision.
-    units : ndarray, shape (rows, k)
-        What one of them stands for [e per unit of the parameter].
-    moves : ndarray, shape (rows, k)
-        How far the last fit of each row went.
-    """
+    """What rows change of the light in their squares; without room, left alone."""
 
     squares: IntArray
     values: NDArray[np.int16]
@@ -57,23 +45,7 @@ class Slopes(NamedTuple):
 
 
 class Clusters(NamedTuple):
-    """Rows of a frame that overlap one another, and the information on them.
-
-    Attributes
-    ----------
-    rows : ndarray of int, shape (rows,)
-        Numbers of the rows, cluster after cluster.
-    edges : ndarray of int, shape (clusters + 1,)
-        Where in `rows` each begins.
-    frame : ndarray of int, shape (clusters,)
-        Frame of each.
-    corners : ndarray of int, shape (clusters + 1,)
-        Where in `factors` each begins.
-    factors : ndarray, shape (sum of (k rows of a cluster)²,)
-        Cholesky's factors L of F = L Lᵀ.
-    steps : ndarray, shape (rows, k)
-        By what rows that overlap follow one another; without room, left alone.
-    """
+    """Rows of a frame that overlap one another, and the information on them."""
 
     rows: IntArray
     edges: IntArray
@@ -156,14 +128,7 @@ def mix(
 def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
     """Say which rows overlap by half their squares, directly or through others.
 
-    Parameters
-    ----------
-    squares : ndarray of int, shape (rows, 4)
-        As in `Slopes`.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    owner : ndarray of int, shape (rows,)
-        Filled with the first row of the cluster of each.
+    Shapes: `squares` (rows, 4), `starts` (t + 1,), `owner` (rows,).
     """
     for t in range(starts.size - 1):
         for r in range(starts[t], starts[t + 1]):
@@ -192,26 +157,8 @@ def join_rows(
     Each row was fitted with the others as they were then.  Those that came after it have moved
     since, and left it a score of -Σ F Δ, which all rows of the cluster take up together.
 
-    Parameters
-    ----------
-    slopes : Slopes
-        Of all rows.
-    clusters : Clusters
-        Their factors and steps are filled.
-    light : Light
-        The movie.
-    totals : ndarray of float32, shape (t, y, x)
-        Signal of all rows of each frame.
-    information : ndarray, shape (rows, k, k)
-        On each row alone.
-    first, last : int
-        Clusters first…last − 1.
-    numbers : ndarray, shape (2 n² + 2 n + k²,)
-        Room for n, the parameters of the largest cluster.
-    order : ndarray of int, shape (n,)
-        Room for their places.
-    work : ndarray of float32, shape (1 + 2 k, side²)
-        Room for what two rows share.
+    Shapes: `totals` (t, y, x), `information` (rows, k, k), `numbers` (2 n² + 2 n + k²,), `order`
+    (n,), `work` (1 + 2 k, side²).
     """
     k, most = slopes.values.shape[1], order.size
     scale, step = numbers[:most], numbers[most : 2 * most]
@@ -313,22 +260,7 @@ def follow_rows(
 ) -> None:  # fmt: skip
     """Tell by what the rows of some clusters follow a change of the logarithm of the background.
 
-    Parameters
-    ----------
-    slopes, clusters
-        As `join_rows` left them.
-    first, last : int
-        Clusters first…last − 1.
-    move : ndarray, shape (y, x)
-        Change.
-    steps : ndarray, shape (rows, k)
-        Filled with F⁻¹ G move.
-    out : ndarray, shape (y, x)
-        Σ Gᵀ F⁻¹ G move, what they take up of it, is added to it [e]; without room, left alone.
-    seen : ndarray of float32, shape (side²,)
-        Room for a square.
-    step : ndarray
-        Room for the steps of a cluster.
+    Shapes: `move` (y, x), `steps` (rows, k), `out` (y, x), `seen` (side²,).
     """
     k = slopes.values.shape[1]
     for c in range(first, last):

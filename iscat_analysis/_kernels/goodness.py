@@ -31,17 +31,7 @@ def look(
     rate: FloatArray,
     tails: FloatArray,
 ) -> tuple[float, int, float, float, float, int, float, float, int]:
-    """Look at the residuals of one fit; all arguments are those of the three kernels it calls.
-
-    Returns
-    -------
-    chi2, pixels, excess, least : float, int, float, float
-        As from `residuals`, but for the largest kurtosis.
-    mode_chi2, freedom, mode_excess : float, int, float
-        As from `mode_statistic`.
-    least_tail, count : float, int
-        As from `suspects`.
-    """
+    """Look at the residuals of one fit; all arguments are those of the three kernels it calls."""
     residual, terms = np.empty(rate.shape), np.empty((rate.shape[0], 4, rate.shape[1]))
     chi2, pixels, excess, largest, least = residuals(kind, data, level, rows, rate, residual, terms)
     mode_chi2, freedom, mode_excess = mode_statistic(

@@ -54,15 +54,7 @@ def signal_hessian(
 ) -> None:
     """Signal, gradient and second derivatives on a pixel grid, averaged over the samples.
 
-    Parameters
-    ----------
-    profile : ndarray
-        Three orders; of a radial one, shape (intervals, 6, 4·orders), the first alone leaves out
-        derivatives in z, which then are 0.
-    lens, pixels, x_p, y_p, amplitude
-        As in `iscat_analysis._kernels.image.signal_gradient`.
-    out : ndarray, shape (ny, ROWS, nx)
-        Filled with s, its derivatives in (x_p, y_p, z, a), and those of `PAIRS`.
+    Shapes: `out` (ny, ROWS, nx).
     """
     if len(lens) == LATTICE:
         _lattice_hessian(profile, lens, pixels, x_p, y_p, amplitude, out)

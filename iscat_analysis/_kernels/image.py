@@ -34,15 +34,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Pixels(NamedTuple):
-    """A grid of pixels and the samples inside each.
-
-    Attributes
-    ----------
-    x, y : ndarray, shape (nx,), (ny,)
-        Pixel centres [nm].
-    offsets, weights : ndarray, shape (q,)
-        Samples inside a pixel [nm] and their weights, summing to 1.
-    """
+    """A grid of pixels and the samples inside each."""
 
     x: FloatArray
     y: FloatArray
@@ -126,20 +118,7 @@ def signal_gradient(
 ) -> None:
     """Signal and gradient on a pixel grid.
 
-    Parameters
-    ----------
-    profile : ndarray
-        Radial, shape (intervals, 6, 8 or more), or on a lattice, shape (channels, nodes, nodes).
-    lens : Lens
-        Step, reference, polarisation.
-    pixels : Pixels
-        Grid and samples.
-    x_p, y_p : float
-        Particle [nm].
-    amplitude : float
-        a.
-    out : ndarray, shape (ny, 5, nx)
-        Filled with s, ∂s/∂x_p, ∂s/∂y_p, ∂s/∂z, ∂s/∂a.
+    Shapes: `out` (ny, 5, nx).
     """
     if len(lens) == STAMP:
         stamp_gradient(profile, lens, pixels, x_p, y_p, amplitude, out)

@@ -143,27 +143,8 @@ def judge_frames(
 ) -> None:
     """Say of the rows of frames first…last − 1 what their likelihoods know, at θ.
 
-    Parameters
-    ----------
-    light, field, near, free, starts, theta, group, canvas, first, last
-        As in `fit_frames`; frames first…last − 1.
-    slopes : Slopes
-        Filled.
-    fisher : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a).  Of rows without a square this is left
-        alone, as is what follows.
-    turned, ways : ndarray, shape (rows, 4, 4)
-        Filled with O V and V, the columns of V directions of one standard deviation in the free
-        parameters, and O the observed information; left alone where the information is singular.
-    bias : ndarray, shape (rows, 4)
-        Filled with what the score is expected to be off by through curvature, −½ Σ V tr(F⁻¹∂²η) ∂η:
-        F⁻¹ times it is the bias of order 1/N (see `iscat_analysis.inference.precision`).
-    numbers : ndarray, shape (rows, 6)
-        Filled with the log-likelihood over that without the particle, χ², pixels, the largest
-        residual in standard deviations, mean background of the square [e], and ∂ ln F/∂ ln a of the
-        information F on the amplitude a.
-    room : Room
-        For what is needed for a moment.
+    Shapes: `fisher` (rows, 4, 4), `turned, ways` (rows, 4, 4), `bias` (rows, 4), `numbers` (rows,
+    6).
     """
     rows, columns = light.background.shape
     area, index, ways_here = field.side**2, room.free, room.ways

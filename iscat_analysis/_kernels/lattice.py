@@ -53,12 +53,7 @@ _BLOCK = 128  # radial nodes whose Bessel functions are held at once
 def window() -> tuple[FloatArray, FloatArray]:
     """Weights of the nodes, and the filter that undoes their smoothing.
 
-    Returns
-    -------
-    weights : ndarray, shape (degree + 1, TAPS)
-        Weight of node floor(p) − 3 + l at position p: coefficients of the powers of p − floor(p).
-    undo : ndarray, shape (2·half + 1,)
-        Filter that turns samples of the field into coefficients.
+    Shapes: `weights` (degree + 1, TAPS), `undo` (2·half + 1,).
     """
     half = TAPS / 2
     count = DEGREE + 1
@@ -89,22 +84,7 @@ def radial_waves(
 ) -> FloatArray:
     """Radial functions i^m ∫ a_m J_m of every harmonic, as quintics.
 
-    Parameters
-    ----------
-    harmonics : complex ndarray, shape (k, 2·M + 1, n)
-        Pupil weights of k fields, harmonics −M…M, on n angles.
-    transverse : ndarray, shape (n,)
-        Transverse wavenumbers [rad/nm].
-    step_nm : float
-        Radial step [nm].
-    intervals : int
-        Number of intervals.
-
-    Returns
-    -------
-    ndarray, shape (intervals, 6, M + 1, 4, k)
-        Powers of t in each interval; real and imaginary part of the sum of harmonics ±m, and of
-        i times their difference: the factors of cos mφ and of sin mφ.
+    Shapes: `harmonics` (k, 2·M + 1, n), `transverse` (n,), result (intervals, 6, M + 1, 4, k).
     """
     fields, count, _ = harmonics.shape
     largest = count // 2
@@ -236,16 +216,7 @@ def sum_waves(
 ) -> None:
     """Fill `out` (n, 2, k) with real and imaginary part of k fields at n positions.
 
-    Parameters
-    ----------
-    waves : ndarray, shape (intervals, 6, M + 1, 4, k)
-        From `radial_waves`.
-    inv_step : float
-        One over its radial step [1/nm].
-    dx, dy : ndarray, shape (n,)
-        Camera minus particle [nm].
-    out : ndarray, shape (n, 2, k)
-        Filled; zero beyond the last interval.
+    Shapes: `waves` (intervals, 6, M + 1, 4, k), `dx, dy` (n,), `out` (n, 2, k).
     """
     intervals, _, count, _, fields = waves.shape
     flat = waves.reshape(intervals, 6, -1)
@@ -297,19 +268,7 @@ def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) ->
 def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) -> FloatArray:
     """Coefficients of k fields on the lattice.
 
-    Parameters
-    ----------
-    waves : ndarray, shape (intervals, 6, M + 1, 4, k)
-        From `radial_waves`, out to `reach_of_samples`.
-    radial_step_nm, step_nm : float
-        Steps of the radial grid and of the lattice [nm].
-    half : int
-        Nodes on either side of the particle.
-
-    Returns
-    -------
-    ndarray, shape (k, 2, 2·half + 1, 2·half + 1)
-        Real and imaginary parts; x along the third axis, y along the fourth.
+    Shapes: `waves` (intervals, 6, M + 1, 4, k), result (k, 2, 2·half + 1, 2·half + 1).
     """
     side = 2 * (half + FILTER) + 1
     fields = np.empty((waves.shape[4], 2, side, side))
@@ -321,15 +280,7 @@ def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) 
 def undo_window(samples: FloatArray) -> FloatArray:
     """Turn samples of fields into coefficients.
 
-    Parameters
-    ----------
-    samples : ndarray, shape (k, n, n)
-        At the nodes.
-
-    Returns
-    -------
-    ndarray, shape (k, n − 2·FILTER, n − 2·FILTER)
-        Of the nodes that have all those under the filter.
+    Shapes: `samples` (k, n, n), result (k, n − 2·FILTER, n − 2·FILTER).
     """
     side = samples.shape[1] - 2 * FILTER
     out = np.empty((len(samples), side, side))

@@ -279,16 +279,7 @@ def lattice_values(
 ) -> None:
     """Signal of a field and its derivatives along changes of that field.
 
-    Parameters
-    ----------
-    stack : ndarray, shape (k·components·2, nodes, nodes)
-        Real and imaginary part of each component: of the field, then of each change of it.
-    lens, pixels, x_p, y_p, amplitude
-        As in `signal_gradient`.
-    components : int
-        Components of the field.
-    out : ndarray, shape (k, ny, nx)
-        Filled with the signal and its derivatives.
+    Shapes: `stack` (k·components·2, nodes, nodes), `out` (k, ny, nx).
     """
     first, rows = node_rows(lens, pixels, y_p)
     columns = pixels.x.size

@@ -18,19 +18,7 @@ FloatArray = NDArray[np.float64]
 
 
 class RoundLens(NamedTuple):
-    """Of a round pupil, whose fields are radial profiles.
-
-    Attributes
-    ----------
-    inv_step : float
-        One over the step of the profile [1/nm].
-    rho : float
-        1 with a reference, 0 in dark field.
-    cos_psi, sin_psi : float
-        Polarisation angle.
-    co, cross, ring : float
-        How a profile makes the components; see `iscat_analysis._kernels.radial_rows`.
-    """
+    """Of a round pupil, whose fields are radial profiles."""
 
     inv_step: float
     rho: float
@@ -42,21 +30,7 @@ class RoundLens(NamedTuple):
 
 
 class LatticeLens(NamedTuple):
-    """Of any pupil, whose fields are on a lattice.
-
-    Attributes
-    ----------
-    inv_step : float
-        One over the step of the lattice [1/nm].
-    rho : float
-        1 with a reference, 0 in dark field.
-    half : int
-        Nodes on either side of the particle.
-    components : int
-        Of the field.
-    window : ndarray, shape (degree + 1, TAPS)
-        Weights of the nodes.
-    """
+    """Of any pupil, whose fields are on a lattice."""
 
     inv_step: float
     rho: float
@@ -66,19 +40,7 @@ class LatticeLens(NamedTuple):
 
 
 class StampLens(NamedTuple):
-    """Of any pupil at one height, whose picture was sampled.
-
-    Attributes
-    ----------
-    inv_step : float
-        One over the step of the samples [1/nm].
-    half : int
-        Samples on either side of the particle.
-    window : ndarray, shape (degree + 1, TAPS)
-        Weights of the samples.
-    fine : int
-        Samples per pixel.
-    """
+    """Of any pupil at one height, whose picture was sampled."""
 
     inv_step: float
     half: int

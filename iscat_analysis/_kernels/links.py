@@ -25,35 +25,8 @@ def link_surely(
     one.  Where it has one new position in reach, and this has no other particle, they are linked; a
     position without any begins a track.
 
-    Parameters
-    ----------
-    places : ndarray, shape (n, axes)
-        Positions, in the order of their frames.
-    starts : ndarray of int, shape (t + 1,)
-        First position of each frame.
-    first : int
-        Frame to go on with.
-    reach : float
-        Farthest from a position to the next one.
-    memory : int
-        Frames in which a particle may be missed.
-    track : ndarray of int, shape (n,)
-        Filled with the number of the track of each.
-    taken : ndarray of bool, shape (n,)
-        Which positions are linked to later ones.
-    waiting : ndarray of int, shape (n,)
-        The last positions of the particles that wait.
-    state : ndarray of int, shape (4,)
-        How many wait; the next number of a track; of the frame in which there is a choice, how many
-        of those that wait and how many new positions are left to be linked.
-    doubtful : ndarray of int, shape (n,)
-        Filled with these, one after the other.
-
-    Returns
-    -------
-    int
-        The first frame with a choice, all of whose other positions are linked, or the number of
-        frames.
+    Shapes: `places` (n, axes), `starts` (t + 1,), `track` (n,), `taken` (n,), `waiting` (n,),
+    `state` (4,), `doubtful` (n,).
     """
     onward, backward = np.empty(len(places), dtype=np.int64), np.empty(len(places), dtype=np.int64)
     only = np.empty(len(places), dtype=np.int64)

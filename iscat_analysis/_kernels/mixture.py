@@ -141,20 +141,7 @@ def mixture_sums(
 ) -> tuple[float, FloatArray]:
     """Sum over events what steps and slopes are made of.
 
-    Parameters
-    ----------
-    x, noise : ndarray, shape (n,)
-        Measured values and σ_i².
-    weight, mean, variance : ndarray, shape (k,)
-        w, μ and τ².
-
-    Returns
-    -------
-    value : float
-        Σ_i log Σ_k w_k N(x_i; μ_k, τ_k² + σ_i²).
-    sums : ndarray, shape (k, 5)
-        With r the chance that an event is of a species and u = 1/(τ² + σ²): Σ r, Σ r u (x − μ),
-        Σ r u² (x − μ)², Σ r u and Σ r u σ².
+    Shapes: `x, noise` (n,), `weight, mean, variance` (k,), `sums` (k, 5).
     """
     n, k = x.size, weight.size
     sums = np.zeros((k, 5))
@@ -185,14 +172,7 @@ def mixture_em(
 ) -> None:
     """Take steps of expectation and maximisation, in place.
 
-    Parameters
-    ----------
-    x, noise : ndarray, shape (n,)
-        Measured values and σ_i².
-    weight, mean, variance : ndarray, shape (k,)
-        w, μ and τ²; overwritten.
-    steps : int
-        How many.
+    Shapes: `x, noise` (n,), `weight, mean, variance` (k,).
     """
     for _ in range(steps):
         _, sums = mixture_sums(x, noise, weight, mean, variance)
@@ -211,19 +191,7 @@ def mixture_score(
 ) -> tuple[float, FloatArray]:
     """Log-likelihood and its gradient.
 
-    Parameters
-    ----------
-    x, noise : ndarray, shape (n,)
-        Measured values and σ_i².
-    weight, mean, variance : ndarray, shape (k,)
-        w, μ and τ².
-
-    Returns
-    -------
-    value : float
-        Σ_i log Σ_k w_k N(x_i; μ_k, τ_k² + σ_i²).
-    gradient : ndarray, shape (3, k)
-        With respect to log w (each by itself), μ and τ².
+    Shapes: `x, noise` (n,), `weight, mean, variance` (k,), `gradient` (3, k).
     """
     value, sums = mixture_sums(x, noise, weight, mean, variance)
     gradient = np.empty((3, weight.size))
@@ -255,23 +223,7 @@ def detection_score(
 ) -> tuple[float, FloatArray]:
     """Logarithm of the chance to see the events, and its gradient.
 
-    Parameters
-    ----------
-    noise : ndarray, shape (n,)
-        s_i² of the estimate that decides.
-    threshold : float
-        What it must exceed.
-    times : int
-        How often each counts.
-    weight, mean, variance : ndarray, shape (k,)
-        w, μ and τ².
-
-    Returns
-    -------
-    value : float
-        Σ_i log Z_i, Z_i = Σ_k w_k Φ((μ_k − threshold)/√(τ_k² + s_i²)).
-    gradient : ndarray, shape (3, k)
-        With respect to log w (each by itself), μ and τ².
+    Shapes: `noise` (n,), `weight, mean, variance` (k,), `gradient` (3, k).
     """
     n, k = noise.size, weight.size
     gradient = np.zeros((3, k))

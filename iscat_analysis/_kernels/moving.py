@@ -49,23 +49,7 @@ ASTRAY = 4
 
 
 class Search(NamedTuple):
-    """What is fitted, and how.
-
-    Attributes
-    ----------
-    free : ndarray of bool, shape (5,)
-        Free parameters.
-    reach : ndarray, shape (5,)
-        How far each may move from its start.
-    lower, upper : ndarray, shape (5,)
-        Bounds besides.
-    max_step : ndarray, shape (5,)
-        Largest change in one step.
-    tolerance : float
-        Expected gain in log-likelihood at which a fit ends.
-    passes : int
-        Passes over the data at most.
-    """
+    """What is fitted, and how."""
 
     free: BoolArray
     reach: FloatArray
@@ -77,25 +61,7 @@ class Search(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Where the kernels of rows keep what they need for a moment; none of them asks for memory.
-
-    Attributes
-    ----------
-    pixels : ndarray, shape (15 side²,)
-        In the precision of gradients: first the constants of a likelihood, (4, ny, nx).
-    line : ndarray of float32, shape (side²,)
-        For the slopes of a row.
-    profile : ndarray
-        For a picture and its ∂/∂z, as `iscat_analysis._kernels.scoring.blank_profile` makes it.
-    free : ndarray of int, shape (k,)
-        Places of the free parameters.
-    small : ndarray, shape (11, 5)
-        For numbers of a row; a fit leaves its start in the last line.
-    ways : ndarray, shape (4, k)
-        For directions.
-    work : ndarray, shape (10 side²,)
-        For two pictures in double precision; empty at one height.
-    """
+    """Where the kernels of rows keep what they need for a moment; none of them asks for memory."""
 
     pixels: AnyFloatArray
     line: NDArray[np.float32]
@@ -133,47 +99,9 @@ def fit_frames(
     A row that needs more care is left to the caller, with its place, its constants and a start in
     its box; with its maximum in `theta`, `outcome` and `gain` the next call goes on.
 
-    Parameters
-    ----------
-    light, field, near, search
-        Movie, pixels, pictures to fit, and what is fitted.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    last : int
-        The frame after those that are fitted.
-    sweeps : int
-        How often; 0 sums only.
-    theta : ndarray, shape (rows, 5)
-        Starts; overwritten with the estimates.
-    group : ndarray of int, shape (rows,)
-        Number of each row's picture.
-    canvas : Canvas
-        From `draw_frames`; the rows' own squares follow the estimates.
-    slopes : Slopes
-        Filled by the last fit of each row.
-    outcome : ndarray of int, shape (rows,)
-        Filled with how the last fit ended.
-    information : ndarray, shape (rows, 4, 4)
-        Filled with the expected information in (x, y, z, a) of the last fit; left alone where a row
-        has no square.
-    gain : ndarray, shape (rows,)
-        Filled with its log-likelihood over that without the particle, the others in place.
-    expected : ndarray, shape (t,)
-        Filled with what particles add to the photoelectrons of the used pixels at power 1.
-    background : ndarray of float32, shape (y, x)
-        That of `light`.
-    sums : ndarray of float32, shape (y, x)
-        Added to: Σ w C over the frames.
-    place : ndarray of int, shape (7,)
-        Where to begin, and left where the caller has to help: frame, sweep and row, and the row's
-        square, first and last row and column, half-open; all 0 where it is yet to be found.
-    room : Room
-        The same one until all frames are done.
-
-    Returns
-    -------
-    bool
-        Whether all frames are done.
+    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `outcome` (rows,), `information`
+    (rows, 4, 4), `gain` (rows,), `expected` (t,), `background` (y, x), `sums` (y, x), `place`
+    (7,).
     """
     rows, columns = light.background.shape
     area = field.side**2

@@ -45,21 +45,7 @@ def place_score(
 ) -> float:
     """Fill score and Fisher matrix of (x, y, z, a), and give the log-likelihood.
 
-    Parameters
-    ----------
-    data : ndarray, shape (4, ny, nx)
-        Constants of the likelihood.
-    here : ndarray, shape (ny, 5, nx)
-        Signal and its gradient.
-    lens : Lens
-        Of the picture; where it is of one height, what belongs to z is 0.
-    score, fisher : ndarray, shape (5,), (5, 5)
-        Filled; 0 for the level.
-
-    Returns
-    -------
-    float
-        Over that without the particle.
+    Shapes: `data` (4, ny, nx), `here` (ny, 5, nx), `score, fisher` (5,).
     """
     if len(lens) != STAMP:
         image_score(np.int64(POISSON), data, 1.0, here, score, fisher)

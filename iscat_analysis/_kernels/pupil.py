@@ -19,23 +19,7 @@ ComplexArray = NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Pupil:
-    """The scattered wave on a quadrature of polar angles.
-
-    Attributes
-    ----------
-    theta, weight : ndarray, shape (n,)
-        Nodes and weights of ∫dθ [rad].
-    transverse : ndarray, shape (n,)
-        n_i k sinθ, the transverse wavenumber [rad/nm].
-    t_p_cos, t_s : complex ndarray, shape (n,)
-        t_p cosθ_s and t_s, with the emission model's factor.
-    axial : complex ndarray, shape (n,)
-        k n_s (cosθ_s + ξ), the phase per height of the particle [rad/nm].
-    oil : ndarray, shape (n,)
-        k n_i (cosθ − 1), the phase per excess oil thickness [rad/nm].
-    apodization : ndarray, shape (n,)
-        sinθ √cosθ.
-    """
+    """The scattered wave on a quadrature of polar angles."""
 
     theta: FloatArray
     weight: FloatArray
@@ -58,24 +42,6 @@ def gauss_legendre(
 
     cosθ_s has a square-root branch at θ_c; θ = θ_c ∓ u² on either side makes the integrand
     analytic in u.
-
-    Parameters
-    ----------
-    alpha : float
-        Upper limit [rad].
-    critical : float or None
-        Critical angle [rad], None where it is far above α.
-    nodes : int
-        Nodes of a panel below the critical angle.
-    nodes_above : int
-        Nodes of a panel above it.
-    edge : float
-        Angle at which the integrand steps [rad]; outside (0, α) it does not.
-
-    Returns
-    -------
-    theta, weight : ndarray
-        Ascending nodes and their weights [rad].
     """
     ends = {0.0, alpha} | {b for b in (critical, edge) if b is not None and 0 < b < alpha}
     bounds = sorted(ends)
@@ -107,17 +73,7 @@ def _unit_gauss_legendre(nodes: int) -> tuple[FloatArray, FloatArray]:
 def rectangle(alpha: float, nodes: int) -> tuple[FloatArray, FloatArray]:
     """Make the rule of D21's program: both ends included, step α/n (physics.md, section 7).
 
-    Parameters
-    ----------
-    alpha : float
-        Upper limit [rad].
-    nodes : int
-        Number of nodes.
-
-    Returns
-    -------
-    theta, weight : ndarray, shape (nodes,)
-        Nodes and weights [rad].
+    Shapes: `theta, weight` (nodes,).
     """
     return np.linspace(0.0, alpha, nodes), np.full(nodes, alpha / nodes)
 
@@ -135,23 +91,7 @@ def make_pupil(
 ) -> Pupil:
     """Evaluate the wave at given angles.
 
-    Parameters
-    ----------
-    theta, weight : ndarray, shape (n,)
-        Quadrature [rad].
-    wavenumber : float
-        2π over the vacuum wavelength [rad/nm].
-    n_immersion, n_glass, n_sample : float
-        Refractive indices.
-    direction : float
-        ξ: +1 where the particle is lit from below (iSCAT), −1 from above.
-    reciprocal : bool
-        Energy-conserving emission (physics.md, section 8) instead of D21's.
-
-    Returns
-    -------
-    Pupil
-        The wave on the nodes.
+    Shapes: `theta, weight` (n,).
     """
     sin, cos = np.sin(theta), np.cos(theta)
     cos_s = np.sqrt(1 - (n_immersion * sin / n_sample) ** 2 + 0j)

@@ -33,13 +33,7 @@ def padded(pixels: int) -> int:
 def evaluate(profile: FloatArray, f: FloatArray) -> None:
     """Evaluate the first four channels of a profile.
 
-    Parameters
-    ----------
-    profile : ndarray, shape (intervals, 6, 4 or more)
-        See `iscat_analysis._kernels.radial`.
-    f : ndarray, shape (rows, padded)
-        Row `DISTANCE` has the distances of the pixels, in intervals and below their number; the
-        first four rows are filled with the channels.
+    Shapes: `profile` (intervals, 6, 4 or more), `f` (rows, padded).
     """
     for j in range(0, f.shape[1], LANES):
         _values(profile, f, j)

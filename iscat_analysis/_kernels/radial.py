@@ -45,17 +45,7 @@ _CHANNELS = 4  # of an order of a radial profile
 
 
 class AxialTable(NamedTuple):
-    """Profiles along z, without their carrier exp(iκz).
-
-    Attributes
-    ----------
-    heights : ndarray, shape (n, 3, channels, width)
-        At each height: the flattened profile, step·∂z and step²·∂z² of it.
-    first_nm, step_nm : float
-        First height and step [nm].
-    kappa : float
-        Wavenumber of the carrier [rad/nm].
-    """
+    """Profiles along z, without their carrier exp(iκz)."""
 
     heights: FloatArray
     first_nm: float
@@ -68,15 +58,7 @@ def reduced_bessel(x: FloatArray) -> FloatArray:
 
     Upward recurrence from scipy's J0 and J1 where it is stable, the power series below.
 
-    Parameters
-    ----------
-    x : ndarray
-        Arguments ≥ 0, any shape.
-
-    Returns
-    -------
-    ndarray, shape (5, *x.shape)
-        The five functions.
+    Shapes: result (5, *x.shape).
     """
     out = np.empty((5, *x.shape))
     small = x < 5.0
@@ -104,19 +86,7 @@ def reduced_bessel(x: FloatArray) -> FloatArray:
 def bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> FloatArray:
     """Bessel matrices of the radial grid.
 
-    Parameters
-    ----------
-    transverse : ndarray, shape (n,)
-        Transverse wavenumbers a [rad/nm].
-    step_nm : float
-        Radial step h [nm].
-    intervals : int
-        Number of intervals.
-
-    Returns
-    -------
-    ndarray, shape (2, n, 3, intervals + 1)
-        For F0 and F2: value, h·∂r and h²·∂r² at every node.
+    Shapes: `transverse` (n,), result (2, n, 3, intervals + 1).
     """
     a = transverse[:, None]
     h = step_nm
@@ -161,22 +131,8 @@ def radial_profile(
 ) -> None:
     """Fill a profile at height z.
 
-    Parameters
-    ----------
-    table : ndarray, shape (2, n, 3, intervals + 1)
-        From `bessel_table`; n a multiple of 4.
-    source : complex ndarray, shape (2, n)
-        Pupil weights of F0 and F2 at z = 0.
-    axial : complex ndarray, shape (n,)
-        Phase per height [rad/nm]; the imaginary part is evanescent decay.
-    z_nm : float
-        Height [nm].
-    orders : int
-        1: fields only; 2: with ∂/∂z; 3: with ∂²/∂z².
-    nodes : ndarray, shape (4·orders, 3·(intervals + 1))
-        Scratch.
-    profile : ndarray, shape (intervals, 6, 4·orders)
-        Filled.
+    Shapes: `table` (2, n, 3, intervals + 1), `source` (2, n), `axial` (n,), `nodes` (4·orders,
+    3·(intervals + 1), `profile` (intervals, 6, 4·orders).
     """
     n = axial.size
     points = table.shape[3]
@@ -291,21 +247,7 @@ _radial_1, _radial_2, _radial_3, _lattice_1, _lattice_2, _lattice_3 = (
 
 @kernel()
 def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: FloatArray) -> None:
-    """Fill a range of a flattened profile by interpolation along z.
-
-    Parameters
-    ----------
-    axial : AxialTable
-        Profiles along z.
-    z_nm : float
-        Height [nm], inside the table.
-    start, stop : int
-        Range of the flattened profile, of eight numbers at least.
-    profile : ndarray
-        Filled; with twice the channels of the table ∂/∂z too, with three times ∂²/∂z² as well.
-        The channels of a radial profile are its last axis, those of a lattice its first; a lattice
-        has an odd number of nodes and a quintic six powers, which tells them apart.
-    """
+    """Fill a range of a flattened profile by interpolation along z."""
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
     i = min(max(int(place), 0), heights.shape[0] - 2)

@@ -63,18 +63,7 @@ def copy_region(
 ) -> None:
     """Copy a region of frames.
 
-    Parameters
-    ----------
-    stored : ndarray, shape (n,)
-        Bytes of the frames.
-    start : int
-        Where the region begins.
-    steps : (int, int)
-        Bytes from one frame to the next, and from one row to the next.
-    shape : (int, int, int)
-        Frames and rows, and bytes of a row; all of it lies in `stored`.
-    out : ndarray, shape (frames·rows·bytes,)
-        Filled.
+    Shapes: `stored` (n,), `out` (frames·rows·bytes,).
     """
     frames, rows, width = shape
     to = 0

@@ -92,31 +92,7 @@ def residuals(
 ) -> tuple[float, int, float, float, float]:
     """Fill what every pixel expects and how far its count is from it.
 
-    Parameters
-    ----------
-    kind, data, level
-        As in `iscat_analysis._kernels.scoring.score_pass`.
-    rows : ndarray, shape (ny, 5 or more, nx)
-        Signal and gradient.
-    rate : ndarray, shape (ny, nx)
-        Filled with the expected counts after landing.
-    residual : ndarray, shape (ny, nx)
-        Filled with the residuals in standard deviations; 0 where masked.
-    terms : ndarray, shape (ny, 4, nx)
-        Filled with the information ω on the logarithm of the light, the residual times √ω, the
-        derivative of that logarithm by the signal, and the excess kurtosis of the counts; all but
-        the third are 0 where masked.
-
-    Returns
-    -------
-    chi2 : float
-        Sum of the squares of the residuals.
-    pixels : int
-        Those that are not masked.
-    excess, largest : float
-        Sum of their excess kurtosis, and its largest size.
-    least : float
-        Smallest of their rates.
+    Shapes: `rows` (ny, 5 or more, nx), `rate` (ny, nx), `residual` (ny, nx), `terms` (ny, 4, nx).
     """
     chi2 = excess = largest = 0.0
     pixels, least = 0, np.inf
@@ -154,25 +130,7 @@ def suspects(
 ) -> tuple[float, int]:  # fmt: skip
     """Fill what the exact tails of the pixels farthest out are functions of.
 
-    Parameters
-    ----------
-    kind, data
-        As in `residuals`.
-    rate, residual : ndarray, shape (ny, nx)
-        From `residuals`.
-    many : float
-        Variance of counts above which their tail is normal.
-    tails : ndarray, shape (3, k)
-        Filled for counts of less variance.  CONDITIONAL: a, b and x of the regularised incomplete
-        beta function.  POISSON: a and x of an incomplete gamma function, the lower one where the
-        third is 1.
-
-    Returns
-    -------
-    least : float
-        Smallest two-sided tail of those that are normal; 1 without any.
-    count : int
-        Tails that were filled.
+    Shapes: `rate, residual` (ny, nx), `tails` (3, k).
     """
     flat, rates, left = data.reshape(4, rate.size), rate.reshape(-1), residual.reshape(-1)
     index = np.empty(min(tails.shape[1], rate.size), dtype=np.int64)

@@ -129,22 +129,7 @@ def _mode_information(
     matrix: FloatArray,
     vector: FloatArray,
 ) -> None:
-    """Fill the information on the fitted directions and the modes, and the residual along them.
-
-    Parameters
-    ----------
-    rows, terms
-        From `signal_gradient` or `signal_hessian`, and from `residuals`.
-    free : ndarray of bool, shape (5,)
-        Fitted parameters.
-    along, across : ndarray, shape (n, nx), (n, ny)
-        H_i(x) and H_j(y).
-    matrix : ndarray, shape (k + m, k + m)
-        Lower triangle filled; the k fitted directions come first, then the m = n (n + 1)/2 modes
-        with i + j < n, j running faster.
-    vector : ndarray, shape (k + m,)
-        Filled.
-    """
+    """Fill the information on the fitted directions and the modes, and the residual along them."""
     index = marked(free)
     fitted, count, nx = index.size, along.shape[0], along.shape[1]
     products, lines = _products(along), np.ascontiguousarray(_products(across).T)
@@ -181,28 +166,7 @@ def _mode_information(
 def _score_statistic(
     matrix: FloatArray, vector: FloatArray, fitted: int, dependent: float, used: BoolArray
 ) -> tuple[float, int]:
-    """Sum of squares of the residual along the modes.
-
-    Parameters
-    ----------
-    matrix : ndarray, shape (n, n)
-        Lower triangle of the information; overwritten with its Cholesky factor.
-    vector : ndarray, shape (n,)
-        The residual; overwritten with its components along orthonormal directions.
-    fitted : int
-        How many of them are fitted directions.
-    dependent : float
-        Share of a direction outside the preceding ones that counts as none; it is left out.
-    used : ndarray of bool, shape (n,)
-        Filled: which took part.
-
-    Returns
-    -------
-    chi2 : float
-        The statistic.
-    freedom : int
-        Modes that took part.
-    """
+    """Sum of squares of the residual along the modes."""
     chi2, freedom = 0.0, 0
     used[:] = False
     for k in range(vector.size):
@@ -296,35 +260,7 @@ def mode_statistic(
 ) -> tuple[float, int, float]:
     """Rao's score test of the modes H_i(x) H_j(y) around a particle, i + j ≤ `order`.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (nx,), (ny,)
-        Pixel centres [nm].
-    theta : ndarray, shape (2 or more,)
-        Centre of the modes [nm].
-    waist : float
-        Theirs [nm].
-    order : int
-        The largest.
-    rows, terms
-        From `signal_gradient` or `signal_hessian`, and from `residuals`.
-    free : ndarray of bool, shape (5,)
-        Fitted parameters.
-    dependent : float
-        Share of a mode outside the fitted directions that counts as none.
-    excess : float
-        Largest size of a pixel's excess kurtosis.
-    negligible : float
-        Excess kurtosis that changes no p-value.
-
-    Returns
-    -------
-    chi2 : float
-        The statistic.
-    freedom : int
-        Modes that took part.
-    excess : float
-        Excess kurtosis of the statistic over `freedom`, or its bound where that is negligible.
+    Shapes: `x, y` (nx,), `theta` (2 or more,), `free` (5,).
     """
     along, across = _hermite(x, theta[0], waist, order), _hermite(y, theta[1], waist, order)
     fitted = 0

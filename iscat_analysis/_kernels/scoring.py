@@ -398,41 +398,8 @@ def maximize(
 ) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
-    Parameters
-    ----------
-    table, optics, grid : tuple
-        Fields of the `AxialTable`, the `Lens` and the `Pixels` of the model; without their names,
-        which it takes longer to hand over.
-    kind : int
-        CONDITIONAL or POISSON.
-    data : ndarray, shape (4, ny, nx)
-        See the module's docstring.
-    free : ndarray of bool, shape (5,)
-        Which parameters move.
-    lower, upper, max_step : ndarray, shape (5,)
-        Box, and largest change of each parameter in one step.
-    tolerance : float
-        When the expected gain in log-likelihood, half the squared step in standard deviations,
-        falls below it, that step is taken and is the last: what remains is smaller by the relative
-        difference between observed and expected information.
-    iterations : int
-        Passes over the data at most.
-    theta : ndarray, shape (5,)
-        Start; overwritten.
-    fisher : ndarray, shape (5, 5)
-        Filled with that of the last pass.
-    least : float
-        Log-likelihood below which the maximum is of no interest: where `HOPE` times the expected
-        gain would not reach it, the search ends after that step, HOPELESS.
-
-    Returns
-    -------
-    value : float
-        Log-likelihood at the estimate.
-    passes : int
-        Passes over the data.
-    outcome : int
-        CONVERGED, STALLED, EXHAUSTED or HOPELESS.
+    Shapes: `data` (4, ny, nx), `free` (5,), `lower, upper, max_step` (5,), `theta` (5,), `fisher`
+    (5, 5).
     """
     axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 2)

@@ -24,20 +24,8 @@ def own_shares(
 ) -> None:  # fmt: skip
     """Give what the background takes from each row alone.
 
-    Parameters
-    ----------
-    slopes : Slopes
-        Of all rows.
-    rows : ndarray of int, shape (n,)
-        Those of the track.
-    squares : ndarray of int, shape (n, 4)
-        Of these, in the images.
-    weight : ndarray, shape (y, x)
-        Of the pixels.
-    out : ndarray, shape (n, k, k)
-        Filled with Σ weight G Gᵀ.
-    work, weighted : ndarray, shape (side²,)
-        Room for squares.
+    Shapes: `rows` (n,), `squares` (n, 4), `weight` (y, x), `out` (n, k, k), `work, weighted`
+    (side²,).
     """
     k = slopes.values.shape[1]
     for q in range(rows.size):
@@ -58,16 +46,7 @@ def send(
 ) -> None:  # fmt: skip
     """Add to images what rows send to them.
 
-    Parameters
-    ----------
-    slopes, rows, squares
-        As in `own_shares`.
-    by : ndarray, shape (n, b, k)
-        Numbers.
-    out : ndarray, shape (b, y, x)
-        Σ Gᵀ by is added to it.
-    work : ndarray, shape (side²,)
-        Room for a square.
+    Shapes: `by` (n, b, k), `out` (b, y, x), `work` (side²,).
     """
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
@@ -84,22 +63,8 @@ def follow(
 ) -> None:  # fmt: skip
     """Give what rows feel of images, and what they send back as they follow.
 
-    Parameters
-    ----------
-    slopes, rows, squares
-        As in `own_shares`.
-    covariance : ndarray, shape (n, k, k)
-        Of each row, by which it follows.
-    images : ndarray, shape (b, y, x)
-        Of the pixels.
-    felt : ndarray, shape (n, b, k)
-        Filled with G image.
-    out : ndarray, shape (b, y, x)
-        Σ Gᵀ covariance G image is added to it.
-    work : ndarray, shape (side²,)
-        Room for a square.
-    by : ndarray, shape (k,)
-        Room for a change.
+    Shapes: `covariance` (n, k, k), `images` (b, y, x), `felt` (n, b, k), `out` (b, y, x), `work`
+    (side²,), `by` (k,).
     """
     k = slopes.values.shape[1]
     for q in range(rows.size):

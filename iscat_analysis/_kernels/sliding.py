@@ -25,18 +25,7 @@ def block_sums(
 ) -> None:
     """Sum a block of frames.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    good : ndarray of bool, shape (t,)
-        Frames to take.
-    total : ndarray, shape (x,)
-        Scratch in a type that holds a block's sum exactly.
-    sums : ndarray, shape (y, x)
-        Filled with the sum of the good frames.
-    highest : ndarray, shape (y, x)
-        Updated with the highest count of every pixel in the good frames.
+    Shapes: `counts` (t, y, x), `good` (t,), `total` (x,), `sums` (y, x), `highest` (y, x).
     """
     frames, rows, columns = counts.shape
     for i in range(rows):
@@ -57,16 +46,7 @@ def block_sums(
 def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolArray) -> None:
     """Sum every frame, and see whether it repeats the one before it.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    zero : int or float
-        0 in the type to sum in.
-    out : ndarray, shape (t,)
-        Filled with the sums.
-    same : ndarray of bool, shape (t,)
-        Filled; the first frame has none before it.
+    Shapes: `counts` (t, y, x), `out` (t,), `same` (t,).
     """
     frames, rows, columns = counts.shape
     for t in range(frames):
@@ -91,14 +71,7 @@ def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolA
 def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
     """Add the good frames to `out`.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, n)
-        Stored counts of n pixels.
-    good : ndarray of bool, shape (t,)
-        Frames to take.
-    out : ndarray, shape (n,)
-        Added to.
+    Shapes: `counts` (t, n), `good` (t,), `out` (n,).
     """
     for t in range(counts.shape[0]):
         if good[t]:
@@ -110,19 +83,7 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
 def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, with its weighted mean taken off.
 
-    Parameters
-    ----------
-    earlier, later : ndarray, shape (k, y, x)
-        Photoelectrons of the blocks before and after; any number of each.
-    weight : ndarray, shape (y, x)
-        Information of a pixel; 0 where it is not used.
-    out : ndarray, shape (y, x) or larger
-        Its corner is filled with weight·contrast.
-
-    Returns
-    -------
-    float
-        Power after over power before.
+    Shapes: `earlier, later` (k, y, x), `weight` (y, x), `out` (y, x).
     """
     rows, columns = weight.shape
     before, after = np.zeros((rows, columns)), np.zeros((rows, columns))
@@ -152,12 +113,7 @@ def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: 
 def strongest_maps(maps: MapArray, index: NDArray[np.int64]) -> None:
     """Find the map of a stack that is farthest from 0, at each pixel.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (k, y, x)
-        Signal-to-noise ratios, k at least 1.
-    index : ndarray of int, shape (y, x)
-        Filled; the first of several that are as far.
+    Shapes: `maps` (k, y, x), `index` (y, x).
     """
     depth, rows, columns = maps.shape
     highest = np.empty(columns, dtype=np.float32)
@@ -177,17 +133,7 @@ def strongest_maps(maps: MapArray, index: NDArray[np.int64]) -> None:
 def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     """Local extremes of a stack of maps.
 
-    Parameters
-    ----------
-    maps : ndarray, shape (k, y, x)
-        Signal-to-noise ratios.
-    threshold : float
-        Least magnitude.
-
-    Returns
-    -------
-    ndarray of int, shape (n, 3)
-        Index (k, y, x) of each value that no neighbour of its sign exceeds.
+    Shapes: `maps` (k, y, x), result (n, 3).
     """
     found = []
     depth, rows, columns = maps.shape
@@ -227,21 +173,7 @@ def in_shadow(
 ) -> BoolArray:
     """Tell which peaks may be lobes of an earlier one, or the same step.
 
-    Parameters
-    ----------
-    peaks : ndarray, shape (n, 4)
-        Frame, x and y [pixels], height; highest first.
-    frames : (int, int)
-        Apart, below which two near each other are the same, and up to which one is another's lobe.
-    distances : (float, float, float)
-        Below which two are the same, lobes are near ones, and there are lobes [pixels].
-    shares : (float, float)
-        Of the higher peak, which near and far lobes stay below.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        True for these.
+    Shapes: `peaks` (n, 4), result (n,).
     """
     hidden = np.zeros(len(peaks), dtype=np.bool_)
     for own in range(len(peaks)):

@@ -20,16 +20,7 @@ Ends = tuple[int, int, int, int]
 def part_sums(counts: NDArray[Any], good: BoolArray, edges: IntArray, out: FloatArray) -> None:
     """Sum the good frames of contiguous parts.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    good : ndarray of bool, shape (t,)
-        Frames to take.
-    edges : ndarray of int, shape (n + 1,)
-        Where the parts begin and end.
-    out : ndarray, shape (n, y, x)
-        Filled.
+    Shapes: `counts` (t, y, x), `good` (t,), `edges` (n + 1,), `out` (n, y, x).
     """
     out[:] = 0.0
     for n in range(edges.size - 1):
@@ -44,16 +35,7 @@ def part_sums(counts: NDArray[Any], good: BoolArray, edges: IntArray, out: Float
 def add_image(total: FloatArray, corner: tuple[int, int], image: FloatArray, scale: float) -> None:
     """Add a multiple of an image to a field.
 
-    Parameters
-    ----------
-    total : ndarray, shape (y, x)
-        Added to.
-    corner : (int, int)
-        Row and column of the image's first pixel, all of which lie in the field.
-    image : ndarray, shape (ny, nx)
-        Its values.
-    scale : float
-        The multiple.
+    Shapes: `total` (y, x), `image` (ny, nx).
     """
     for i in range(image.shape[0]):
         for j in range(image.shape[1]):
@@ -66,17 +48,7 @@ def times_change(
 ) -> None:  # fmt: skip
     """Multiply a ratio with (1 + after·image)/(1 + before·image).
 
-    Parameters
-    ----------
-    ratio : ndarray, shape (y, x)
-        Changed where it shows the image.
-    here, inside : (int, int, int, int)
-        The same pixels of `ratio` and of `image`: first and last row, first and last column,
-        half-open.
-    image : ndarray, shape (ny, nx)
-        A particle's contrast.
-    before, after : float
-        Share of the light before and after in which the particle is there.
+    Shapes: `ratio` (y, x), `image` (ny, nx).
     """
     for i in range(here[0], here[1]):
         for j in range(here[2], here[3]):
@@ -90,23 +62,7 @@ def one_change(
 ) -> tuple[float, int]:
     """Compare what precedes each change of mean with what follows it.
 
-    Parameters
-    ----------
-    heights : ndarray, shape (t,)
-        A value for every frame.
-    weight : ndarray, shape (t,)
-        One over its variance; 0 leaves it out.
-    jump : ndarray, shape (t − 1,)
-        Filled with the mean after frame k less that up to it; 0 where one side has no weight.
-    gain : ndarray, shape (t − 1,)
-        Filled with the gain in log-likelihood of that change; NaN where one side has no weight.
-
-    Returns
-    -------
-    float
-        The largest gain.
-    int
-        Frames with weight.
+    Shapes: `heights` (t,), `weight` (t,), `jump` (t − 1,), `gain` (t − 1,).
     """
     light, total, lit = 0.0, 0.0, 0
     for t in range(heights.size):
@@ -135,23 +91,8 @@ def projector(
 ) -> float:
     """Weights that measure the amplitude of an image and ignore a common level.
 
-    Parameters
-    ----------
-    mean : ndarray, shape (y, x)
-        Photoelectrons of a frame of unit power.
-    read : ndarray, shape (y, x) or (1, 1)
-        Read noise of one frame [e].
-    used : ndarray of bool, shape (y, x)
-        Pixels in use.
-    image : ndarray, shape (y, x)
-        Contrast.
-    weights : ndarray, shape (y, x)
-        Filled.
-
-    Returns
-    -------
-    float
-        Their answer to a frame of unit power that holds the image once.
+    Shapes: `mean` (y, x), `read` (y, x) or (1, 1), `used` (y, x), `image` (y, x), `weights` (y,
+    x).
     """
     rows, columns = image.shape
     even = read.size == 1
@@ -180,16 +121,7 @@ def frame_scores(
 ) -> None:
     """Weigh some frames in several ways at once.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, p)
-        Stored counts of p pixels.
-    lit : ndarray of bool, shape (t,)
-        Frames to take.
-    weights : ndarray, shape (n, p)
-        Of the pixels.
-    out : ndarray, shape (n, m)
-        Filled, one column for each frame that is taken.
+    Shapes: `counts` (t, p), `lit` (t,), `weights` (n, p), `out` (n, m).
     """
     m = 0
     for t in range(counts.shape[0]):
@@ -209,21 +141,7 @@ def mean_of(
 ) -> tuple[float, float]:
     """Average contiguous frames per unit of power.
 
-    Parameters
-    ----------
-    values, power : ndarray, shape (t,)
-        A value and the light of every frame.
-    shot, read : float
-        Variance of a value that is expected, per unit of power and per frame.
-    start, stop : int
-        Half-open range of frames.
-
-    Returns
-    -------
-    float
-        Their mean.
-    float
-        Its expected variance.
+    Shapes: `values, power` (t,).
     """
     total, light = 0.0, 0.0
     for t in range(start, stop):
@@ -239,21 +157,8 @@ def spreads(
 ) -> None:  # fmt: skip
     """Add up how parts of the frames of one window differ, over what is expected.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n, t)
-        Several values for every frame.
-    power : ndarray, shape (t,)
-        Its light.
-    shot, read : ndarray, shape (n,)
-        Variance of each value that is expected, per unit of power and per frame.
-    edges : ndarray of int, shape (k + 1,)
-        Contiguous parts, which are compared with their mean.
-    lengths : ndarray of int, shape (m,)
-        Frames in averages that are compared with their neighbours.
-    out : ndarray, shape (1 + m, n + 1)
-        Added to: squares over what is expected, and in the last column how many; the parts come
-        first.
+    Shapes: `values` (n, t), `power` (t,), `shot, read` (n,), `edges` (k + 1,), `lengths` (m,),
+    `out` (1 + m, n + 1).
     """
     frames, parts = power.size, edges.size - 1
     last = values.shape[0]
@@ -290,20 +195,7 @@ def ring_heights(
 ) -> None:  # fmt: skip
     """Find how high a map rises in each sector of a ring around a particle.
 
-    Parameters
-    ----------
-    snr : ndarray, shape (y, x)
-        The map.
-    centre, place : (float, float)
-        The particle, and what lies in the middle of the ring, (x, y) [pixels].
-    ring : float
-        From the middle of the ring to its edges [pixels].
-    patch : float
-        Nearer than this to `place`, and to the highest of what is left, pixels do not count.
-    others : ndarray, shape (n, 2)
-        (x, y) of places that take the pixels that are nearer to them than to the particle.
-    highest : ndarray, shape (sectors,)
-        Filled, for sectors of the same angle; −1 where one has no pixel.
+    Shapes: `snr` (y, x), `others` (n, 2), `highest` (sectors,).
     """
     x0, y0 = centre
     xc, yc = place

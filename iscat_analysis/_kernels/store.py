@@ -15,18 +15,7 @@ class KeptFiles(IndexDataCacheFile):  # type: ignore[misc]  # Numba is not typed
     """Numba's files of one function."""
 
     def load(self, key: Any) -> Any:
-        """Give what was kept.
-
-        Parameters
-        ----------
-        key : tuple
-            Of the signature and the machine.
-
-        Returns
-        -------
-        object or None
-            None where it was not, or cannot be read.
-        """
+        """Give what was kept."""
         try:
             return super().load(key)
         except _UNREADABLE:

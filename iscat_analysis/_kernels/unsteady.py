@@ -19,16 +19,7 @@ def block_extremes(
 ) -> None:
     """Sum frames, and see which pixels change.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    summed : ndarray, shape (y, x)
-        The frames are added to it.
-    highest : ndarray, shape (y, x)
-        Updated with the highest count of every pixel.
-    still : ndarray of bool, shape (y, x)
-        Made false where a pixel changes.
+    Shapes: `counts` (t, y, x), `summed` (y, x), `highest` (y, x), `still` (y, x).
     """
     frames, rows, columns = counts.shape
     for t in range(frames):
@@ -46,19 +37,7 @@ def block_powers(
 ) -> FloatArray:
     """Mean photoelectrons of every frame.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    gain, offset : ndarray, shape (y, x)
-        Of the camera.
-    lit : ndarray of bool, shape (y, x)
-        Pixels to take.
-
-    Returns
-    -------
-    ndarray, shape (t,)
-        Per pixel [e].
+    Shapes: `counts` (t, y, x), `gain, offset` (y, x), `lit` (y, x), result (t,).
     """
     frames, rows, columns = counts.shape
     powers = np.zeros(frames)
@@ -88,20 +67,8 @@ def add_scatter(
 ) -> None:
     """Add what frames have beyond their mean, squared, and times what those beside have.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    gain, offset : ndarray, shape (y, x)
-        Of the camera.
-    powers : ndarray, shape (t,)
-        What each frame is divided by.
-    mean : ndarray, shape (y, x)
-        Filled with the mean of the frames [e].
-    change : ndarray, shape (y, x)
-        Scratch.
-    squares, products : ndarray, shape (y, x) and (2, y, x)
-        Added to, as by `add_image`.
+    Shapes: `counts` (t, y, x), `gain, offset` (y, x), `powers` (t,), `mean` (y, x), `change` (y,
+    x), `squares, products` (y, x) and (2, y, x).
     """
     frames, rows, columns = counts.shape
     mean[:] = 0.0
@@ -124,14 +91,7 @@ def add_scatter(
 def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> None:
     """Add an image squared, and times the mean of the pixels on both sides.
 
-    Parameters
-    ----------
-    image : ndarray, shape (y, x)
-        What pixels have beyond their mean.
-    squares : ndarray, shape (y, x)
-        Added to.
-    products : ndarray, shape (2, y, x)
-        Added to, along y and x; at the border both sides are the one inside.
+    Shapes: `image` (y, x), `squares` (y, x), `products` (2, y, x).
     """
     rows, columns = image.shape
     for i in range(rows):

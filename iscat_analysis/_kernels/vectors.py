@@ -23,17 +23,7 @@ _FLAGS = ("contract", "nsz")
 
 
 class Code:
-    """Writes the instructions of a function of two arrays and the first of eight places.
-
-    Attributes
-    ----------
-    one, other
-        The arrays.
-    first
-        The place.
-    factors
-        Registers of numbers that are the same in all lanes.
-    """
+    """Writes the instructions of a function of two arrays and the first of eight places."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         self._b = builder

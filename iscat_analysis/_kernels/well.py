@@ -39,23 +39,8 @@ def harmonic_likelihoods(
     The state is the place at the start of an exposure, dx = −κ x dt + √(2D) dW, in equilibrium at
     first.  A flat prior of the centre is integrated out, which leaves the density of displacements.
 
-    Parameters
-    ----------
-    positions : ndarray, shape (c, n)
-        Averages over each exposure, along each axis.
-    variance : ndarray, shape (c, n)
-        Of the error of each position.
-    gaps : ndarray, shape (n − 1,)
-        Time from the start of one exposure to the start of the next [s].
-    exposure : float
-        Its length [s].
-    diffusion, stiffness : ndarray, shape (m,)
-        D and κ of each well, κ above 0 [1/s].
-
-    Returns
-    -------
-    ndarray, shape (m,)
-        Log-likelihoods.
+    Shapes: `positions` (c, n), `variance` (c, n), `gaps` (n − 1,), `diffusion, stiffness` (m,),
+    result (m,).
     """
     axes, n = positions.shape
     m = diffusion.size
@@ -129,22 +114,6 @@ def most_likely_well(
 
     Of a square of nine points in their logarithms the highest becomes the middle of the next; where
     it is the middle already, the square shrinks around the vertex of a parabola.
-
-    Parameters
-    ----------
-    positions, variance, gaps, exposure
-        As in `harmonic_likelihoods`.
-    scale : float
-        D of free diffusion.
-    softest, stiffest : float
-        Range of κ [1/s].
-
-    Returns
-    -------
-    value : float
-        Log-likelihood.
-    diffusion, stiffness : float
-        D and κ there.
     """
     low, high, best = np.empty(2), np.empty(2), np.empty(2)
     low[0], low[1], high[0], high[1] = -_WIDEST, math.log(softest), _WIDEST, math.log(stiffest)

@@ -25,20 +25,7 @@ def orders(j: int) -> tuple[int, int]:
 
 
 def zernike(j: int, rho: FloatArray, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Z_j(ρ, φ) − Z_j(0) and its derivative along ρ.
-
-    Parameters
-    ----------
-    j : int
-        Noll's index.
-    rho, phi : ndarray
-        Radius over the pupil's and angle [rad]; they broadcast.
-
-    Returns
-    -------
-    value, slope : ndarray
-        Both of the broadcast shape.
-    """
+    """Z_j(ρ, φ) − Z_j(0) and its derivative along ρ."""
     n, m = orders(j)
     radial, slope = np.zeros_like(rho), np.zeros_like(rho)
     for k in range((n - m) // 2 + 1):

@@ -35,15 +35,7 @@ TAKES_PART = 1e-3
 
 @dataclass(frozen=True)
 class Unidentifiable:
-    """A direction along which the image does not change.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters that take part, as in `PARAMETERS`.
-    direction : tuple of float
-        How far each moves [nm, kDa], the first by one unit.
-    """
+    """A direction along which the image does not change."""
 
     names: tuple[str, ...]
     direction: tuple[float, ...]
@@ -58,26 +50,7 @@ class Unidentifiable:
 
 @dataclass(frozen=True)
 class EventBounds:
-    """Bounds for one particle, in the order and the units of `PARAMETERS`; NaN where not free.
-
-    Attributes
-    ----------
-    crb_single : ndarray, shape (4,)
-        1/√J_jj, everything else known.
-    crb_joint : ndarray, shape (4,)
-        √[(J⁻¹)_jj] over the free parameters; NaN where it is unidentifiable.
-    qcrb : ndarray, shape (4,)
-        1/√(N K_jj) for N collected scattered photons.
-    fisher, quantum : ndarray, shape (4, 4)
-        J and N K, all four parameters.
-    unidentifiable : tuple of Unidentifiable
-        Directions among the free parameters that the image does not show.
-    weakest : tuple of float
-        The free parameters' best-hidden direction, each in units of its single bound.
-    inflation : float
-        How much larger than a unit step the bound along it is; 1 without crosstalk, NaN where
-        unidentifiable.
-    """
+    """Bounds for one particle, in the order and the units of `PARAMETERS`; NaN where not free."""
 
     crb_single: FloatArray
     crb_joint: FloatArray
@@ -100,31 +73,7 @@ def event_bounds(
 ) -> EventBounds:
     """Classical and quantum bounds of one particle.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of measured or expected counts; its expected information is used.
-    theta : ndarray, shape (5,)
-        Where: x, y, z [nm], amplitude, level.
-    free : tuple of str
-        Free parameters, a subset of `PARAMETERS`.
-    collected : float
-        Scattered photons that the pupil collects in all frames.
-    quantum : complex ndarray, shape (4, 4), optional
-        `quantum_information` of one photon at this height, where it is known already.
-    level : bool
-        Whether a common background level is fitted as well, as a nuisance.
-
-    Returns
-    -------
-    EventBounds
-        A singular matrix gives NaN and names the direction; there is no quantum bound where the
-        picture was measured.
-
-    Raises
-    ------
-    ConfigError
-        `free` is empty or names an unknown parameter.
+    Shapes: `theta` (5,), `quantum` (4, 4).
     """
     unknown = [name for name in free if name not in PARAMETERS]
     if unknown or not free:
@@ -151,19 +100,7 @@ def bounds_from_matrices(
 ) -> EventBounds:
     """Turn a Fisher matrix and a quantum one into bounds.
 
-    Parameters
-    ----------
-    fisher : ndarray, shape (4, 4)
-        J over `PARAMETERS`.
-    quantum : ndarray, shape (4, 4)
-        N K over `PARAMETERS`; it sets the scale on which J counts as zero.
-    free : tuple of str
-        Free parameters.
-
-    Returns
-    -------
-    EventBounds
-        Cramér–Rao and quantum Cramér–Rao bounds of the free parameters.
+    Shapes: `fisher` (4, 4), `quantum` (4, 4).
     """
     index = [i for i, name in enumerate(PARAMETERS) if name in free]
     seen = np.diag(fisher).copy()

@@ -31,21 +31,7 @@ _FAINT = 1e-6  # of the particle's amplitude: where derivatives with the place a
 
 @dataclass(frozen=True)
 class DetectionLimit:
-    """What can be detected; build it with `detection_limit`.
-
-    Attributes
-    ----------
-    false_alarm, miss : float
-        Probabilities: that noise alone is taken for a particle, and that a particle is not found.
-    threshold_known, threshold_searched : float
-        Of the signal-to-noise ratio, where the place is known and where the field is searched.
-    snr_known, snr_searched : float
-        That a particle needs.
-    mass_known_kda, mass_searched_kda : float
-        Its mass [kDa].
-    snr_per_amplitude : float
-        √J_aa of an empty field, for all frames.
-    """
+    """What can be detected; build it with `detection_limit`."""
 
     false_alarm: float
     miss: float
@@ -59,38 +45,12 @@ class DetectionLimit:
 
 
 def power_known(snr: float, threshold: float) -> float:
-    """Probability to detect a particle whose place is known.
-
-    Parameters
-    ----------
-    snr : float
-        Its signal-to-noise ratio.
-    threshold : float
-        What the matched filter must exceed.
-
-    Returns
-    -------
-    float
-        Φ(snr − threshold).
-    """
+    """Probability to detect a particle whose place is known."""
     return float(ndtr(snr - threshold))
 
 
 def power_searched(snr: float, threshold: float) -> float:
-    """Probability to detect a particle whose place is fitted.
-
-    Parameters
-    ----------
-    snr : float
-        Its signal-to-noise ratio.
-    threshold : float
-        What √(2Δℓ) over place and amplitude must exceed.
-
-    Returns
-    -------
-    float
-        Of a χ² with three degrees of freedom and non-centrality snr².
-    """
+    """Probability to detect a particle whose place is fitted."""
     # the length of a normal vector in space whose mean lies snr from the origin
     far, near = threshold + snr, threshold - snr
     if snr < _NO_PARTICLE:
@@ -101,20 +61,7 @@ def power_searched(snr: float, threshold: float) -> float:
 
 
 def detection_limit(experiment: Experiment) -> DetectionLimit | None:
-    """Tell the smallest mass that can be detected.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        From `plan`; ``bounds.false_alarm_probability`` and ``bounds.miss_probability`` say how
-        surely.
-
-    Returns
-    -------
-    DetectionLimit or None
-        For all frames; None in dark field, where the signal is not linear in the amplitude, and
-        for an image that does not change with the mass.
-    """
+    """Tell the smallest mass that can be detected."""
     model, at = experiment.model, experiment.config.bounds
     if not model.rho:
         return None

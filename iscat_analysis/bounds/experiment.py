@@ -36,27 +36,7 @@ LOST_LIGHT = 1e-3
 
 @dataclass(frozen=True)
 class Experiment:
-    """One particle, one microscope, a number of frames; build it with `plan`.
-
-    Attributes
-    ----------
-    config : Config
-        What was asked for.
-    model : ForwardModel
-        The optics.
-    grid : PixelGrid
-        The field.
-    likelihood : Likelihood
-        Of the expected counts of all frames.
-    theta : ndarray, shape (5,)
-        The particle.
-    mass_kda : float
-        Its mass [kDa].
-    on_camera, collected : float
-        Scattered photons on the camera and through the pupil, in all frames after landing.
-    peak_e : float
-        Largest expected count in a pixel and frame [e].
-    """
+    """One particle, one microscope, a number of frames; build it with `plan`."""
 
     config: Config
     model: ForwardModel
@@ -74,20 +54,7 @@ class Experiment:
         return quantum_information(self.model, self.theta[2])
 
     def bounds(self, free: tuple[str, ...], *, level: bool = False) -> EventBounds:
-        """Bounds over chosen free parameters.
-
-        Parameters
-        ----------
-        free : tuple of str
-            A subset of `PARAMETERS`.
-        level : bool
-            Whether the level of the light is unknown too.
-
-        Returns
-        -------
-        EventBounds
-            For all frames.
-        """
+        """Bounds over chosen free parameters."""
         return event_bounds(
             self.likelihood, self.theta, free, self.collected, quantum=self.quantum, level=level
         )
@@ -100,30 +67,7 @@ def plan(
     scale: MassScale | None = None,
     like: ForwardModel | None = None,
 ) -> Experiment:
-    """Set up the experiment of ``[bounds]``.
-
-    Parameters
-    ----------
-    config : Config
-        All sections but detection, fit range and posterior take part.
-    model : ForwardModel, optional
-        The forward model, where the optics are those of an earlier experiment.
-    scale : MassScale, optional
-        Mass ↔ amplitude of an earlier experiment, in place of ``[calibration]``: the line was
-        measured at the optics of that one.
-    like : ForwardModel, optional
-        A neighbour in a scan, whose tables may serve again.
-
-    Returns
-    -------
-    Experiment
-        Ready for bounds.
-
-    Raises
-    ------
-    ConfigError
-        The pixel size is missing, the read noise is a map, or the particle leaves the field.
-    """
+    """Set up the experiment of ``[bounds]``."""
     at, camera = config.bounds, config.camera
     pixel_nm = camera.pixel_size_nm
     if pixel_nm is None:
@@ -197,28 +141,7 @@ def expected_likelihood(
 ) -> Likelihood:
     """Likelihood of the expected counts of a planned experiment.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        The optics.
-    grid : PixelGrid
-        The field.
-    theta : ndarray, shape (5,)
-        The particle.
-    level_e : float
-        Background per pixel and frame [e].
-    scale_e : float
-        Photoelectrons per pixel and frame for unit signal; where there is a reference, the
-        background.
-    n_before, n_after : int
-        Frames; 0 before where the background is known.
-    read_noise_e : float
-        Standard deviation per pixel and frame [e].
-
-    Returns
-    -------
-    Likelihood
-        Conditional where the background is measured and multiplied, Poisson otherwise.
+    Shapes: `theta` (5,).
     """
     read = read_noise_e**2
     if model.rho and n_before:
@@ -234,41 +157,13 @@ def expected_likelihood(
 
 
 def bounds_report(config: Config) -> dict[str, Any]:
-    """Everything `iscat bounds --json` prints.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment; ``fit.mode`` chooses the free parameters of the joint bound.
-
-    Returns
-    -------
-    dict
-        Bounds per scattered photon on the camera (CRB) or collected (QCRB), and for the planned
-        frames; NaN where a bound does not exist.
-
-    Raises
-    ------
-    ConfigError
-        As in `plan`.
-    """
+    """Everything `iscat bounds --json` prints."""
     experiment = plan(config)
     return report_of(experiment)
 
 
 def report_of(experiment: Experiment) -> dict[str, Any]:
-    """Report one experiment; see `bounds_report`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        From `plan`.
-
-    Returns
-    -------
-    dict
-        As `bounds_report` gives it.
-    """
+    """Report one experiment; see `bounds_report`."""
     config, model = experiment.config, experiment.model
     free = FREE_PARAMETERS[config.fit.mode]
     z_nm = float(experiment.theta[2])
@@ -359,32 +254,13 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
 def information_fraction(bounds: EventBounds) -> FloatArray:
     """Share of the collected light's information that the microscope uses.
 
-    Parameters
-    ----------
-    bounds : EventBounds
-        Of one particle.
-
-    Returns
-    -------
-    ndarray, shape (4,)
-        J_jj / (N K_jj), between 0 and 1.
+    Shapes: result (4,).
     """
     return (bounds.qcrb / bounds.crb_single) ** 2
 
 
 def warnings_of(experiment: Experiment) -> list[str]:
-    """Say what makes the numbers unattainable or wrong, one line each.
-
-    Parameters
-    ----------
-    experiment : Experiment
-        From `plan`.
-
-    Returns
-    -------
-    list of str
-        Empty where all is well.
-    """
+    """Say what makes the numbers unattainable or wrong, one line each."""
     config, lines = experiment.config, []
     well = config.camera.well_depth_e
     if well is not None and experiment.peak_e >= well:

@@ -46,15 +46,7 @@ ComplexArray = npt.NDArray[np.complex128]
 
 @dataclass(frozen=True)
 class Holevo:
-    """A bound on all parameters at once.
-
-    Attributes
-    ----------
-    sum : float
-        C_H = Tr WV; with W = K it is the number of parameters where all of them commute.
-    covariance : ndarray, shape (d, d)
-        V of a measurement that reaches it.
-    """
+    """A bound on all parameters at once."""
 
     sum: float
     covariance: FloatArray
@@ -68,21 +60,6 @@ class Holevo:
 def natural_bound(information: ComplexArray) -> Holevo:
     """Holevo bound with every parameter weighed by its own information, W = K.
 
-    Parameters
-    ----------
-    information : complex ndarray, shape (d, d)
-        Rows and columns of `quantum_information`, times the number of photons where wanted.
-
-    Returns
-    -------
-    Holevo
-        Exact, from the closed form above.
-
-    Raises
-    ------
-    ConfigError
-        The matrix is not Hermitian and positive, or its parameters are not independent.
-
     Examples
     --------
     A wave's phase and amplitude cost twice the variance when they are measured together.
@@ -91,6 +68,8 @@ def natural_bound(information: ComplexArray) -> Holevo:
     >>> from iscat_analysis.bounds import natural_bound
     >>> natural_bound(np.array([[1, 1j], [-1j, 1]])).sigma.round(3)
     array([1.414, 1.414])
+
+    Shapes: `information` (d, d).
     """
     unit, commutator = _orthonormal(information)
     squared, vectors = np.linalg.eigh(commutator.T @ commutator)
@@ -102,23 +81,7 @@ def natural_bound(information: ComplexArray) -> Holevo:
 def holevo_over_quantum(
     model: ForwardModel, z_nm: float, free: tuple[str, ...]
 ) -> dict[str, float]:
-    """Cost of estimating parameters together, of which each has a measurement of its own.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Optics.
-    z_nm : float
-        Height of the particle [nm].
-    free : tuple of str
-        Free parameters, a subset of `PARAMETERS`.
-
-    Returns
-    -------
-    dict of str to float
-        For each free parameter σ of the Holevo bound with W = K over 1/√K_jj: at least 1, whatever
-        the number of photons and the unit of the mass.
-    """
+    """Cost of estimating parameters together, of which each has a measurement of its own."""
     index = [PARAMETERS.index(name) for name in free]
     information = quantum_information(model, z_nm)[np.ix_(index, index)]
     own = np.sqrt(np.diag(information).real)
@@ -128,28 +91,13 @@ def holevo_over_quantum(
 def holevo_bound(information: ComplexArray, weight: FloatArray) -> Holevo:
     """Holevo bound for any weight.
 
-    Parameters
-    ----------
-    information : complex ndarray, shape (d, d)
-        As in `natural_bound`.
-    weight : ndarray, shape (d, d)
-        W, symmetric and positive semidefinite, in the inverse units of the covariance.
-
-    Returns
-    -------
-    Holevo
-        From the semidefinite program, to a few 1e-8 of `sum`.
-
-    Raises
-    ------
-    ConfigError
-        A matrix is not what it must be, or the solver did not converge.
-
     Notes
     -----
     min Tr WV subject to [[V, X†], [X, 1]] ⪰ 0 and 2 Re(X†L) = 1, with L†L = Q/4 (Albarelli et al.
     2019, equation 7, for pure states), in coordinates in which K is the identity and the weight is
     of order one; solved by Clarabel.
+
+    Shapes: `information` (d, d), `weight` (d, d).
     """
     unit, commutator = _orthonormal(information)
     weight = np.asarray(weight, dtype=np.float64)
@@ -167,28 +115,12 @@ def holevo_bound(information: ComplexArray, weight: FloatArray) -> Holevo:
 def tradeoff(information: ComplexArray, points: int = 101) -> FloatArray:
     """Edge of what one measurement can reach for two parameters.
 
-    Parameters
-    ----------
-    information : complex ndarray, shape (2, 2)
-        As in `natural_bound`.
-    points : int
-        How many.
-
-    Returns
-    -------
-    ndarray, shape (points, 2)
-        Standard deviations of the two; the ends tend to a single parameter's own bound, where
-        nothing is learned of the other, and are cut at five times it.
-
-    Raises
-    ------
-    ConfigError
-        The matrix is not (2, 2), Hermitian and positive.
-
     Notes
     -----
     For W' = diag(cos²τ, sin²τ) in the coordinates of `natural_bound` the optimum lies on the curve
     of the module's page; the ellipse of V touches the axes of the given parameters at its σ.
+
+    Shapes: `information` (2, 2), result (points, 2).
     """
     if np.shape(information) != (2, 2):
         raise ConfigError(f"information: has shape {np.shape(information)}; give (2, 2)")

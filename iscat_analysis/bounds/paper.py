@@ -77,21 +77,7 @@ PRINTED = {"x": 71.0, "y": 57.0, "z_iscat": 18.0, "z_cobri": 114.0, "mass": 0.5}
 
 @dataclass(frozen=True)
 class Reproduction:
-    """Everything D21 shows.
-
-    Attributes
-    ----------
-    curves : pandas.DataFrame
-        Long form, one row per point: ``panel`` ("2b", "2c", "2d", "2e", "3", "4a"…"4d"),
-        ``scheme``, ``convention``, ``attenuation``, ``quantity``, ``x``, ``value``.
-    images : dict
-        (scheme, height [nm]) → intensity over the incident, shape (151, 151); Fig. 2a.
-    table : pandas.DataFrame
-        Table 1: ``quantity``, ``unit``, ``printed``, ``authors``, ``dong2021``, ``exact``,
-        ``reciprocal``.
-    quantum : dict
-        (measure, scheme) → single quantum bounds per collected photon, shape (4,).
-    """
+    """Everything D21 shows."""
 
     curves: pd.DataFrame
     images: dict[tuple[str, float], FloatArray]
@@ -108,26 +94,7 @@ def paper_config(
     attenuation: float | None = None,
     optics: Mapping[str, Any] | None = None,
 ) -> Config:
-    """Set up D21's microscope.
-
-    Parameters
-    ----------
-    scheme : str
-        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
-    convention : {"exact", "dong2021"}
-        Whose integrals, prefactors and z derivative.
-    z_nm, focus_nm : float
-        Height and focus [nm].
-    attenuation : float, optional
-        Default that of Figs. 2 and 3.
-    optics : mapping, optional
-        Further keys of ``[optics]``.
-
-    Returns
-    -------
-    Config
-        One frame, known background.
-    """
+    """Set up D21's microscope."""
     authors = convention == "dong2021"
     if attenuation is None:
         attenuation = ATTENUATIONS[scheme][0]
@@ -150,17 +117,7 @@ def paper_config(
 
 @dataclass(frozen=True)
 class Point:
-    """Bounds of one set-up, per photon.
-
-    Attributes
-    ----------
-    single, joint : ndarray, shape (4,)
-        Over x, y, z [nm] and relative mass.
-    phase : float
-        Phase between the on-axis scattered field and the reference [rad]; NaN in dark field.
-    snr : float
-        On-axis pixel's signal over its noise, D21's SNR.
-    """
+    """Bounds of one set-up, per photon."""
 
     single: FloatArray
     joint: FloatArray
@@ -169,40 +126,14 @@ class Point:
 
 
 def photons_of_authors(scheme: str, attenuation: float | None = None) -> float:
-    """Scattered photons on the field at z = focus = 0, the authors' normalisation.
-
-    Parameters
-    ----------
-    scheme : str
-        Scheme.
-    attenuation : float, optional
-        As in `paper_config`.
-
-    Returns
-    -------
-    float
-        For one background photon per pixel (dark field: one collected photon).
-    """
+    """Scattered photons on the field at z = focus = 0, the authors' normalisation."""
     return plan(
         paper_config(scheme, "dong2021", z_nm=0.0, focus_nm=0.0, attenuation=attenuation)
     ).on_camera
 
 
 def point(config: Config, photons: float | None) -> Point:
-    """Bounds of one set-up, normalised as the figures are.
-
-    Parameters
-    ----------
-    config : Config
-        From `paper_config`.
-    photons : float or None
-        Divide by these, the authors' way; None for the collected photons.
-
-    Returns
-    -------
-    Point
-        Per photon.
-    """
+    """Bounds of one set-up, normalised as the figures are."""
     return _point(plan(config), photons)
 
 
@@ -227,18 +158,7 @@ def _on_axis(experiment: Experiment, root: float) -> tuple[float, float]:
 
 
 def reproduce(*, progress: Progress = silent) -> Reproduction:
-    """Compute every panel and Table 1.
-
-    Parameters
-    ----------
-    progress : Progress, optional
-        Told after each curve.
-
-    Returns
-    -------
-    Reproduction
-        Curves, images, table.
-    """
+    """Compute every panel and Table 1."""
     jobs: list[tuple[tuple[str, ...], str, Convention, float | None]] = []
     conventions: tuple[Convention, ...] = ("dong2021", "exact")
     for convention in conventions:
@@ -330,15 +250,7 @@ def _model(scheme: str, emission: str = "dong2021") -> ForwardModel:
 
 
 def table1() -> pd.DataFrame:
-    """Make Table 1: quantum bounds per collected photon, five ways.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns ``quantity``, ``unit``, ``printed``, ``authors`` (D21's formulas with its program's
-        rectangle rule), ``dong2021`` (the same formulas integrated exactly), ``exact`` (physics.md,
-        section 5) and ``reciprocal`` (exact, energy-conserving emission).
-    """
+    """Make Table 1: quantum bounds per collected photon, five ways."""
     ways = {
         "authors": {s: rectangle_rule_bounds(s) for s in ("iscat", "cobri")},
         "dong2021": {s: _single(_model(s), "dong2021") for s in ("iscat", "cobri")},
@@ -370,15 +282,7 @@ def rectangle_rule_bounds(scheme: str) -> FloatArray:
     100 × 100 points of ``linspace(0, α)`` and ``linspace(0, 2π)``, all of equal weight, so that
     φ = 0 counts twice.
 
-    Parameters
-    ----------
-    scheme : str
-        ``"iscat"`` or ``"cobri"``.
-
-    Returns
-    -------
-    ndarray, shape (4,)
-        x, y, z [nm] and relative mass.
+    Shapes: result (4,).
     """
     model = _model(scheme)
     optics = model.optics

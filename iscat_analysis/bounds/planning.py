@@ -39,23 +39,7 @@ MAX_FRAMES = 1e12
 
 @dataclass(frozen=True)
 class Best:
-    """The setting with the smallest bound.
-
-    Attributes
-    ----------
-    axis, parameter : str
-        What was varied, and for what.
-    value : float
-        The best setting.
-    here : float
-        The configured one.
-    bound, bound_here : float
-        Joint bound at both, for all frames [nm or kDa]; NaN where unidentifiable.
-    note : str
-        What was held fixed.
-    scan : Scan
-        The coarse search.
-    """
+    """The setting with the smallest bound."""
 
     axis: str
     parameter: str
@@ -74,30 +58,7 @@ def optimize(
     *,
     progress: Progress = silent,
 ) -> Best:
-    """Find the focus or the attenuation that makes one bound smallest.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment.
-    axis : {"focus", "attenuation"}
-        What to vary.  The light on the particle is held; attenuations at which a pixel would exceed
-        ``camera.well_depth_e`` are left out.
-    target : {"mass", "z", "x", "y"}
-        Whose joint bound is to be small.
-    progress : Progress, optional
-        Told after each point of the coarse search.
-
-    Returns
-    -------
-    Best
-        The best setting beside the configured one.
-
-    Raises
-    ------
-    ConfigError
-        The target is unknown or not free in this mode, or no setting works.
-    """
+    """Find the focus or the attenuation that makes one bound smallest."""
     if axis not in ("focus", "attenuation"):
         raise ConfigError(f"`optimize` = {axis}: choose focus or attenuation")
     parameter = _parameter(config, target)
@@ -143,40 +104,14 @@ def optimize(
 
 @dataclass(frozen=True)
 class Goal:
-    """A precision to be reached.
-
-    Attributes
-    ----------
-    parameter : str
-        As in `PARAMETERS`.
-    value : float
-        Standard deviation [nm or kDa].
-    """
+    """A precision to be reached."""
 
     parameter: str
     value: float
 
 
 def parse_target(text: str, config: Config) -> Goal:
-    """Read what follows ``--target``.
-
-    Parameters
-    ----------
-    text : str
-        ``"mass=5kDa"``, ``"z=2nm"``, or without the unit.
-    config : Config
-        Its mode says which parameters are free.
-
-    Returns
-    -------
-    Goal
-        What is wanted.
-
-    Raises
-    ------
-    ConfigError
-        The syntax, the unit or the parameter is wrong.
-    """
+    """Read what follows ``--target``."""
     match = re.fullmatch(r"\s*(\w+)\s*=\s*([0-9.eE+-]+)\s*([A-Za-zµ]*)\s*", text)
     if match is None:
         raise ConfigError(f"`target` = {text}: write it as mass=5kDa or z=2nm")
@@ -197,19 +132,7 @@ def parse_target(text: str, config: Config) -> Goal:
 
 @dataclass(frozen=True)
 class Effort:
-    """What a precision costs.
-
-    Attributes
-    ----------
-    background : str
-        How the background is known.
-    n_before, n_after : float
-        Frames; infinite where no number of frames reaches the goal.
-    seconds : float or None
-        Both together at ``camera.frame_rate_hz``, where that is known.
-    collected : float
-        Collected scattered photons.
-    """
+    """What a precision costs."""
 
     background: str
     n_before: float
@@ -219,26 +142,7 @@ class Effort:
 
 
 def effort(config: Config, goal: Goal) -> list[Effort]:
-    """How many frames and photons a precision takes.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment; its frames are replaced.
-    goal : Goal
-        The precision.
-
-    Returns
-    -------
-    list of Effort
-        With the configured background frames, with as many before as after, and with a known
-        background.
-
-    Raises
-    ------
-    ConfigError
-        The parameter is unidentifiable here.
-    """
+    """How many frames and photons a precision takes."""
     before = config.bounds.n_before
     finite = config.optics.scheme != "darkfield" or config.background.level_e is not None
     ways: list[tuple[str, Callable[[int], int]]] = []
@@ -281,17 +185,7 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
 
 @dataclass(frozen=True)
 class Cost:
-    """One line of a budget.
-
-    Attributes
-    ----------
-    cause : str
-        What costs precision.
-    factor : float
-        By how much it multiplies the standard deviation.
-    bound : float
-        The bound after it [nm or kDa].
-    """
+    """One line of a budget."""
 
     cause: str
     factor: float
@@ -299,28 +193,7 @@ class Cost:
 
 
 def budget(config: Config, parameter: str) -> list[Cost]:
-    """Where the precision goes, from the light's own bound to this experiment's.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment.
-    parameter : str
-        As in `PARAMETERS`, free in this mode.
-
-    Returns
-    -------
-    list of Cost
-        The quantum bound (factor 1), then shot noise (this microscope and field with pixels of no
-        size, background known, the other parameters too), crosstalk with the other free
-        parameters, pixelation, finite background, read noise.  The product of the factors times
-        the first bound is the last, which is the joint bound of `bounds_report`.
-
-    Raises
-    ------
-    ConfigError
-        As in `plan`.
-    """
+    """Where the precision goes, from the light's own bound to this experiment's."""
     free = FREE_PARAMETERS[config.fit.mode]
     at = PARAMETERS.index(parameter)
     quiet = _with(config, camera={"read_noise_e": 0.0}, bounds={"n_before": 0})
@@ -380,25 +253,7 @@ def _bound(config: Config, goal: Goal) -> float:
 
 
 def parse_names(text: str | None, config: Config) -> list[str] | None:
-    """Read several parameters, as after ``--for``.
-
-    Parameters
-    ----------
-    text : str or None
-        ``"z,mass"``; None for all that are free.
-    config : Config
-        Its mode says which parameters are free.
-
-    Returns
-    -------
-    list of str or None
-        As in `PARAMETERS`.
-
-    Raises
-    ------
-    ConfigError
-        A parameter is unknown or not free.
-    """
+    """Read several parameters, as after ``--for``."""
     return None if text is None else [_parameter(config, name.strip()) for name in text.split(",")]
 
 

@@ -46,37 +46,7 @@ SEARCHED_NM = 3500.0
 
 @dataclass(frozen=True)
 class PupilOptimum:
-    """The best pupil that was found; build it with `optimize_pupil`.
-
-    Attributes
-    ----------
-    config : Config
-        The experiment with it: its optics, the background that they leave, and, where there was a
-        calibration, which belongs to other optics, a density that makes the particle scatter as
-        strongly.  `plan` of it gives the numbers below.
-    chosen : tuple of str
-        Parameters whose bounds were made small.
-    settings : dict of str to (float, float)
-        Key of ``[optics]`` → as configured, best.
-    sigma, sigma_configured, sigma_holevo, sigma_quantum : dict of str to float
-        Joint Cramér–Rao bounds of the chosen parameters with the best pupil and as configured;
-        what the measurement of the Holevo bound reaches together; each one's own quantum bound
-        [nm, kDa].
-    sum, sum_configured : float
-        F of both; NaN where a chosen parameter is unidentifiable.
-    holevo : float
-        C_H, below which no F can be.
-    share_quiet : float
-        C_H/F of the best pupil for a known background and a camera without read noise.
-    transmitted : float
-        Share of the collected light that passes the best pupil.
-    peak_e : float
-        Brightest pixel of it in a frame [e].
-    descents : tuple of float
-        C_H/F at the end of every descent, best first, in the field that was searched.
-    evaluations : int
-        Pupils that were tried.
-    """
+    """The best pupil that was found; build it with `optimize_pupil`."""
 
     config: Config
     chosen: tuple[str, ...]
@@ -147,34 +117,7 @@ def optimize_pupil(
     seed: int = 0,
     progress: Progress = silent,
 ) -> PupilOptimum:
-    """Search the pupil with the smallest joint bound of the chosen parameters.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment.  ``bounds.photons_per_pixel`` and ``optics.attenuation`` fix the light on
-        the particle, ``camera`` its well and noise, ``fit.mode`` what is estimated together.
-    chosen : sequence of str, optional
-        Some of the mode's free parameters, as in `PARAMETERS`; default all of them.
-    free : sequence of str, optional
-        What may change, of `KNOBS`; default everything.
-    starts : int
-        Valleys that are descended into, with a mask and without.
-    seed : int
-        Of the sample.
-    progress : Progress, optional
-        Told after each descent.
-
-    Returns
-    -------
-    PupilOptimum
-        The best, beside the configured one.
-
-    Raises
-    ------
-    ConfigError
-        There is no reference or no model of the light, a name is unknown, or no pupil works.
-    """
+    """Search the pupil with the smallest joint bound of the chosen parameters."""
     chosen = _chosen(config, chosen)
     free = _free(config, free)
     scale = calibrated_scale(config)

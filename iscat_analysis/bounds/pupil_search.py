@@ -60,23 +60,7 @@ _WAVES = 20.0  # a unit of a Zernike term is the wavelength over this
 
 @dataclass
 class Search:
-    """F of pupils, and the descent into one valley.
-
-    Attributes
-    ----------
-    config : Config
-        The experiment.
-    scale : MassScale or None
-        Of the calibration.
-    chosen : tuple of str
-        Parameters whose bounds are summed.
-    free : tuple of str
-        What may change, of `KNOBS`.
-    evaluations : int
-        Pupils so far.
-    keys : tuple of str
-        What may change, as keys of ``[optics]``.
-    """
+    """F of pupils, and the descent into one valley."""
 
     config: Config
     scale: MassScale | None
@@ -215,20 +199,7 @@ class Search:
 
 
 def setting(optics: Optics, key: str) -> float:
-    """Give the value of a key of the optics, or of a Zernike term.
-
-    Parameters
-    ----------
-    optics : Optics
-        The pupil.
-    key : str
-        One of those in `KNOBS`.
-
-    Returns
-    -------
-    float
-        In the unit of the key; 0 for a term that is absent.
-    """
+    """Give the value of a key of the optics, or of a Zernike term."""
     if key in Optics.model_fields:
         return float(getattr(optics, key))
     return optics.aberrations_nm.get(key, 0.0)
@@ -243,15 +214,7 @@ def _rounded(key: str, value: float) -> float:
 def sigmas(experiment: Experiment) -> tuple[FloatArray, FloatArray]:
     """Give the joint bounds over the mode's free parameters, and each one's quantum bound.
 
-    Parameters
-    ----------
-    experiment : Experiment
-        From `plan`.
-
-    Returns
-    -------
-    joint, quantum : ndarray, shape (4,)
-        In the order of `PARAMETERS`.
+    Shapes: `joint, quantum` (4,).
     """
     free = FREE_PARAMETERS[experiment.config.fit.mode]
     whole = experiment.bounds(PARAMETERS)

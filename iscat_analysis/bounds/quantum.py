@@ -54,29 +54,7 @@ def quantum_information(
 ) -> ComplexArray:
     """Quantum Fisher information of one scattered photon.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Optics; its quadrature and `axial` do not matter, since moving light refocuses nothing.
-    z_nm : float
-        Height of the particle [nm]; only evanescent waves depend on it.
-    measure : {"exact", "dong2021"}
-        Weight of the directions: |A|² sinθ, or D21's |sinθ √cosθ A|² with n_s dropped from the
-        axial phase where the light passes the particle first, as in D21's program
-        (physics.md, section 7, points 3 and 4).
-    light : {"collected", "transmitted"}
-        Which photons: all that the pupil collects, or those that mask and analyser let through.
-
-    Returns
-    -------
-    complex ndarray, shape (4, 4)
-        Q over (x [nm], y [nm], z [nm], ln m), Hermitian.  Its real part is the quantum Fisher
-        matrix, its imaginary part the mean commutator.
-
-    Raises
-    ------
-    ConfigError
-        The height is negative.
+    Shapes: result (4, 4).
     """
     if model.is_measured:
         raise ConfigError(
@@ -108,20 +86,7 @@ def quantum_information(
 
 
 def transmitted_over_collected(model: ForwardModel, z_nm: float) -> float:
-    """Share of the collected light that mask and analyser let through.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Optics.
-    z_nm : float
-        Height of the particle [nm].
-
-    Returns
-    -------
-    float
-        Between 0 and 1; an attenuation above 1 behind a mask may exceed it.
-    """
+    """Share of the collected light that mask and analyser let through."""
     return float(
         _photons(model, z_nm, "exact", "transmitted")[1].sum()
         / _photons(model, z_nm, "exact", "collected")[1].sum()
@@ -133,18 +98,6 @@ def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
 
     Dark field has no reference, so that the global phase is a nuisance: K_zz becomes
     4 (⟨|κ|²⟩ − ⟨Re κ⟩²), the variance of the axial wavenumber where nothing is evanescent.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Optics.
-    z_nm : float
-        Height of the particle [nm].
-
-    Returns
-    -------
-    float
-        Standard deviation for one collected photon [nm].
     """
     opening, photons = _photons(model, z_nm, "exact", "collected")
     density, kappa = photons.sum(1) / photons.sum(), opening.pupil.axial
@@ -157,15 +110,7 @@ def z_nm_phase_free(model: ForwardModel, z_nm: float) -> float:
 def quantum_bounds(information: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """Single and joint quantum bounds.
 
-    Parameters
-    ----------
-    information : complex ndarray, shape (4, 4)
-        From `quantum_information`, times the number of photons where wanted.
-
-    Returns
-    -------
-    single, joint : ndarray, shape (4,)
-        1/√K_jj and √[(K⁻¹)_jj] over (x, y, z [nm], relative mass).
+    Shapes: `information` (4, 4), `single, joint` (4,).
     """
     real = information.real
     scale = 1 / np.sqrt(np.diag(real))
@@ -176,16 +121,7 @@ def quantum_bounds(information: ComplexArray) -> tuple[FloatArray, FloatArray]:
 def incompatible_pairs(information: ComplexArray) -> dict[tuple[str, str], float]:
     """Pairs of parameters that no single measurement can saturate.
 
-    Parameters
-    ----------
-    information : complex ndarray, shape (4, 4)
-        From `quantum_information`.
-
-    Returns
-    -------
-    dict
-        (name, name) → |Im Q_ij|/√(Q_ii Q_jj), between 0 and 1: 1 for a conjugate pair such as the
-        phase and amplitude of a wave, whose bounds cost √2 each to approach together.
+    Shapes: `information` (4, 4).
     """
     scale = 1 / np.sqrt(np.diag(information.real))
     curl = np.abs(information.imag) * np.outer(scale, scale)

@@ -37,21 +37,7 @@ MAX_POINTS = 100_000
 
 @dataclass(frozen=True)
 class Axis:
-    """Something that can be varied.
-
-    Attributes
-    ----------
-    name : str
-        What the user types.
-    label : str
-        For figures, with the unit.
-    value : callable
-        Config → its present value.
-    change : callable
-        (Config, value) → the sections to change.
-    rebuilds : bool
-        Whether the forward model depends on it.
-    """
+    """Something that can be varied."""
 
     name: str
     label: str
@@ -135,19 +121,7 @@ AXES = {
 
 @dataclass(frozen=True)
 class Scan:
-    """Bounds along one axis.
-
-    Attributes
-    ----------
-    name, label : str
-        The axis.
-    here : float
-        Where the configuration stands on it.
-    free : tuple of str
-        Free parameters of the joint bound.
-    table : pandas.DataFrame
-        One row per value, the axis first, then bounds [nm, kDa] and photon numbers.
-    """
+    """Bounds along one axis."""
 
     name: str
     label: str
@@ -159,22 +133,7 @@ class Scan:
 def parse_scan(text: str) -> tuple[Axis, FloatArray]:
     """Read what follows ``--scan``.
 
-    Parameters
-    ----------
-    text : str
-        ``"z=0:2000:50"`` (start, stop included, step) or ``"attenuation=1,0.3,0.1"``.
-
-    Returns
-    -------
-    axis : Axis
-        What varies.
-    values : ndarray, shape (n,)
-        Its values.
-
-    Raises
-    ------
-    ConfigError
-        The syntax is wrong, or there is no such axis.
+    Shapes: `values` (n,).
     """
     name, equals, numbers = text.partition("=")
     name = name.strip().lower()
@@ -213,27 +172,7 @@ def parse_scan(text: str) -> tuple[Axis, FloatArray]:
 
 
 def changed(config: Config, axis: Axis, value: float) -> Config:
-    """Move a configuration along an axis.
-
-    Parameters
-    ----------
-    config : Config
-        Where it stands.
-    axis : Axis
-        What changes.
-    value : float
-        To what.
-
-    Returns
-    -------
-    Config
-        Validated.
-
-    Raises
-    ------
-    ConfigError
-        The value is impossible.
-    """
+    """Move a configuration along an axis."""
     changes = axis.change(config, float(value))
     try:
         return config.model_copy(
@@ -253,26 +192,7 @@ def changed(config: Config, axis: Axis, value: float) -> Config:
 def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress = silent) -> Scan:
     """Bounds along one axis, on `compute.workers` threads.
 
-    Parameters
-    ----------
-    config : Config
-        The experiment.
-    axis : Axis
-        From `parse_scan`, or `AXES`.
-    values : ndarray, shape (n,)
-        Its values.
-    progress : Progress, optional
-        Told now and then.
-
-    Returns
-    -------
-    Scan
-        Bounds for all frames, in nm and kDa.
-
-    Raises
-    ------
-    ConfigError
-        A value is impossible, or `plan` refuses.
+    Shapes: `values` (n,).
     """
     free = FREE_PARAMETERS[config.fit.mode]
     scale = calibrated_scale(config)
@@ -304,18 +224,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
 
 
 def calibrated_scale(config: Config) -> MassScale | None:
-    """Mass scale that a calibration fixes at the configured optics.
-
-    Parameters
-    ----------
-    config : Config
-        The experiment.
-
-    Returns
-    -------
-    MassScale or None
-        None without a calibration.
-    """
+    """Mass scale that a calibration fixes at the configured optics."""
     return plan(config).model.scale if config.calibration is not None else None
 
 

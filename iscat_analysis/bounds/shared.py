@@ -29,19 +29,7 @@ def joint_information(
 ) -> FloatArray:
     """Fisher information of one particle about the microscope and about itself.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of measured or expected counts; its expected information is used.
-    theta : ndarray, shape (5,)
-        Where: x, y, z [nm], amplitude, level.
-    names : sequence of str
-        Parameters of the optics, as in `ForwardModel.joint_gradient`.
-
-    Returns
-    -------
-    ndarray, shape (len(names) + 5, len(names) + 5)
-        Order: `names`, x, y, z [1/nm²], amplitude, level.
+    Shapes: `theta` (5,), result (len(names).
     """
     x, y, z, amplitude, level = (float(value) for value in theta)
     model, grid = likelihood.model, likelihood.grid
@@ -62,17 +50,7 @@ def joint_information(
 def eliminated(information: FloatArray, shared: int) -> FloatArray:
     """Information about the first parameters once all others are fitted: the Schur complement.
 
-    Parameters
-    ----------
-    information : ndarray, shape (n, n)
-        Of all.
-    shared : int
-        How many remain.
-
-    Returns
-    -------
-    ndarray, shape (shared, shared)
-        I_pp − I_pθ I_θθ⁻¹ I_θp.
+    Shapes: `information` (n, n), result (shared, shared).
     """
     cross = information[:shared, shared:]
     return np.asarray(information[:shared, :shared] + cross @ imitation(information, shared))
@@ -81,17 +59,7 @@ def eliminated(information: FloatArray, shared: int) -> FloatArray:
 def imitation(information: FloatArray, shared: int) -> FloatArray:
     """How the last parameters move, per unit error of the first ones.
 
-    Parameters
-    ----------
-    information : ndarray, shape (n, n)
-        Of all, the shared ones first.
-    shared : int
-        How many are shared.
-
-    Returns
-    -------
-    ndarray, shape (n − shared, shared)
-        D = −I_θθ⁻¹ I_θp.
+    Shapes: `information` (n, n), result (n − shared, shared).
     """
     block = information[shared:, shared:]
     scale = 1 / np.sqrt(np.diag(block))
@@ -111,24 +79,7 @@ def displacement(
 ) -> FloatArray:
     """How the estimates of a particle move with the microscope that is assumed.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of measured or expected counts.
-    theta : ndarray, shape (5,)
-        Where: x, y, z [nm], amplitude, level.
-    names : sequence of str
-        Parameters of the optics.
-    free : sequence of str
-        What is fitted of the particle, of `PARAMETERS`.
-    level : bool
-        Whether the level of the light is fitted as well.
-
-    Returns
-    -------
-    ndarray, shape (len(free), len(names))
-        D [nm or kDa per unit of each parameter].  Where a calibration ties mass to contrast, the
-        mass is that of the estimated contrast, which moves less than the amplitude does.
+    Shapes: `theta` (5,), result (len(free).
     """
     whole = joint_information(likelihood, theta, names)
     count = len(names)
@@ -145,19 +96,7 @@ def displacement(
 def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> FloatArray:
     """Change of the mass that a calibration gives an amplitude, with the microscope.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        The microscope.
-    amplitude : float
-        Of the scattered field.
-    names : sequence of str
-        Parameters of the optics.
-
-    Returns
-    -------
-    ndarray, shape (len(names),)
-        ∂(peak contrast)/∂p over the line's gradient [kDa per unit]; 0 without a calibration.
+    Shapes: result (len(names).
     """
     line = model.scale.calibration
     if line is None or not names:
@@ -171,25 +110,7 @@ def peak_gradient(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Peak contrast, and how it changes with the particle and with the microscope.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        The microscope.
-    z_nm : float
-        Height of the particle [nm].
-    amplitude : float
-        Of the scattered field.
-    names : sequence of str
-        Parameters of the optics.
-
-    Returns
-    -------
-    contrast : float
-        Signed.
-    own : ndarray, shape (4,)
-        ∂/∂(x, y, z, amplitude); along x and y nothing, at a peak.
-    shared : ndarray, shape (len(names),)
-        Per unit of each parameter.
+    Shapes: `own` (4,), `shared` (len(names).
     """
     spot = model.optics.wavelength_nm / model.optics.na
     x, y, half = 0.0, 0.0, min(PEAK_REACH * spot, model.reach_nm - spot) / math.sqrt(2)
@@ -210,17 +131,7 @@ def peak_gradient(
 def shared_sigma(moves: FloatArray, covariance: FloatArray) -> FloatArray:
     """Give the standard deviations that an uncertain microscope puts into all particles alike.
 
-    Parameters
-    ----------
-    moves : ndarray, shape (k, n)
-        D, from `displacement`.
-    covariance : ndarray, shape (n, n)
-        Σ of the microscope's parameters.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Roots of the diagonal of D Σ Dᵀ.
+    Shapes: `moves` (k, n), `covariance` (n, n), result (k,).
     """
     variance = np.einsum("ki,ij,kj->k", moves, covariance, moves)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

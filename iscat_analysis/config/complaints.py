@@ -16,20 +16,7 @@ _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
 
 def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
-    """Put one of pydantic's errors into words.
-
-    Parameters
-    ----------
-    item : mapping
-        One of `pydantic.ValidationError.errors()`.
-    called : mapping of str to str
-        What to call a key, where it has another name for the user.
-
-    Returns
-    -------
-    str
-        Half a sentence that names the key.
-    """
+    """Put one of pydantic's errors into words."""
     unknown = item["type"] == "extra_forbidden"
     named = len(item["loc"]) - 1 if unknown else len(item["loc"])  # an unknown key may be "str"
     location = [
@@ -58,20 +45,7 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
 
 
 def complaints(items: Iterable[Mapping[str, Any]], called: Mapping[str, str]) -> Iterator[str]:
-    """Put pydantic's errors into words.
-
-    Parameters
-    ----------
-    items : iterable of mapping
-        From `pydantic.ValidationError.errors()`.
-    called : mapping of str to str
-        As in `complaint`.
-
-    Yields
-    ------
-    str
-        As from `complaint`; that a number is no text, where a number is possible, is left out.
-    """
+    """Put pydantic's errors into words."""
     items = tuple(items)
     for item in items:
         others = (other for other in items if other is not item)
@@ -98,18 +72,7 @@ def _nearest(word: str, location: list[str]) -> str:
 
 
 def known_keys(location: list[str]) -> list[str]:
-    """List the keys of a section.
-
-    Parameters
-    ----------
-    location : list of str
-        Where it lies in the configuration; empty for the sections themselves.
-
-    Returns
-    -------
-    list of str
-        Their names.
-    """
+    """List the keys of a section."""
     model: type[Section] = Config
     for part in location:
         if part.isdigit():
@@ -123,18 +86,7 @@ def known_keys(location: list[str]) -> list[str]:
 
 
 def section_name(model: type) -> tuple[str, ...]:
-    """Name the section that a class describes.
-
-    Parameters
-    ----------
-    model : type
-        Of a section.
-
-    Returns
-    -------
-    tuple of str
-        Its name in a configuration; empty where it has none.
-    """
+    """Name the section that a class describes."""
     for name, field in Config.model_fields.items():
         if model in (field.annotation, *get_args(field.annotation)):
             return (name,)
@@ -142,18 +94,7 @@ def section_name(model: type) -> tuple[str, ...]:
 
 
 def model_of(annotation: Any) -> type[Section]:
-    """Give the section of an annotation that may be None.
-
-    Parameters
-    ----------
-    annotation : Any
-        As in ``Calibration | None``.
-
-    Returns
-    -------
-    type
-        The class of the section.
-    """
+    """Give the section of an annotation that may be None."""
     model: type[Section] = next(a for a in get_args(annotation) if a is not type(None))
     return model
 

@@ -19,17 +19,7 @@ from iscat_analysis.errors import ConfigError
 
 @dataclass(frozen=True)
 class OpticsFile:
-    """What ``iscat calibrate optics`` measured of a microscope.
-
-    Attributes
-    ----------
-    optics : dict
-        Keys of the section ``[optics]`` and their values.
-    uncertainty : dict
-        The table ``[uncertainty]``: standard errors, by key.
-    covariance : dict
-        The table ``[covariance]``: of the parameters that were fitted together.
-    """
+    """What ``iscat calibrate optics`` measured of a microscope."""
 
     optics: dict[str, Any]
     uncertainty: dict[str, Any]
@@ -37,23 +27,7 @@ class OpticsFile:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a configuration file without validating it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    dict
-        Sections of keys; relative paths in it are relative to the file's folder.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be read, or is not TOML.
-    """
+    """Read a configuration file without validating it."""
     try:
         text = path.read_text(encoding="utf-8-sig")
         values = tomllib.loads(text)
@@ -68,24 +42,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_optics_file(path: Path) -> OpticsFile:
-    """Read the optics that were measured from a movie.
-
-    Parameters
-    ----------
-    path : Path
-        TOML with a table ``[optics]``, and the tables ``[uncertainty]`` and ``[covariance]`` where
-        they are known.
-
-    Returns
-    -------
-    OpticsFile
-        The values are validated where they are used.
-
-    Raises
-    ------
-    ConfigError
-        It cannot be read, or has no table ``[optics]``.
-    """
+    """Read the optics that were measured from a movie."""
     values = read_toml(path)
     tables = {name: values.pop(name, {}) for name in ("optics", "uncertainty", "covariance")}
     checksum = values.get("template", {}).get("sha256")
@@ -225,18 +182,7 @@ def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
 
 
 def with_absolute_paths(config: Config) -> Config:
-    """Name files so that a process that runs in another folder finds them.
-
-    Parameters
-    ----------
-    config : Config
-        Its relative paths are relative to the current folder.
-
-    Returns
-    -------
-    Config
-        The same files by their absolute paths.
-    """
+    """Name files so that a process that runs in another folder finds them."""
     changed = {}
     for section, keys in _PATH_KEYS.items():
         table = getattr(config, section)

@@ -118,25 +118,7 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
 
 
 def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:
-    """Validate a nested mapping, as `tomllib` returns it.
-
-    Parameters
-    ----------
-    values : mapping
-        Sections of keys.
-    where : str
-        What messages call it.
-
-    Returns
-    -------
-    Config
-        Validated.
-
-    Raises
-    ------
-    ConfigError
-        One line that names each offending key.
-    """
+    """Validate a nested mapping, as `tomllib` returns it."""
     return _validated(_nested(values), [], where, {})
 
 

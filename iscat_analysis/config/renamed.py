@@ -14,13 +14,7 @@ OLD_VALUES: dict[tuple[str, str], dict[str, str]] = {
 
 
 def rename(values: dict[str, Any]) -> None:
-    """Replace old values in place, and say so in a `FutureWarning`.
-
-    Parameters
-    ----------
-    values : dict
-        Sections of keys, not validated yet.
-    """
+    """Replace old values in place, and say so in a `FutureWarning`."""
     _name_all_frames(values)
     for (section, key), names in OLD_VALUES.items():
         table = values.get(section)

@@ -67,20 +67,7 @@ _UNITS_NM = {"micrometres": 1e3, "millimetres": 1e6, "metres": 1e9, "ångström"
 
 
 def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
-    """Say which unit an impossible length was probably written in.
-
-    Parameters
-    ----------
-    value : float
-        As it was given.
-    low_nm, high_nm : float
-        Smallest and largest length that is possible [nm].
-
-    Returns
-    -------
-    str
-        A clause that names the unit and the length in nanometres; empty where no unit fits.
-    """
+    """Say which unit an impossible length was probably written in."""
     for unit, nanometres in _UNITS_NM.items():
         converted = value * nanometres
         if low_nm <= abs(converted) <= high_nm:
@@ -89,23 +76,7 @@ def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
 
 
 def plausible_pixel(size_nm: float) -> float:
-    """Return a pixel size, unless no microscope has it.
-
-    Parameters
-    ----------
-    size_nm : float
-        In the sample plane [nm].
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        It lies outside `PIXEL_NM`.
-    """
+    """Return a pixel size, unless no microscope has it."""
     low, high = PIXEL_NM
     if not low <= size_nm <= high:
         raise ValueError(
@@ -116,18 +87,7 @@ def plausible_pixel(size_nm: float) -> float:
 
 
 def length(low_nm: float, high_nm: float) -> AfterValidator:
-    """Accept lengths whose magnitude lies in a range, and guess the unit of the others.
-
-    Parameters
-    ----------
-    low_nm, high_nm : float
-        The range [nm].
-
-    Returns
-    -------
-    pydantic.AfterValidator
-        For an `Annotated` type.
-    """
+    """Accept lengths whose magnitude lies in a range, and guess the unit of the others."""
 
     def check(value: float) -> float:
         if low_nm <= abs(value) <= high_nm:
@@ -140,23 +100,7 @@ def length(low_nm: float, high_nm: float) -> AfterValidator:
 
 
 def refractive_index(index: float) -> float:
-    """Return a refractive index, unless nothing that is transparent has it.
-
-    Parameters
-    ----------
-    index : float
-        Of light.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ValueError
-        It lies outside `INDICES`.
-    """
+    """Return a refractive index, unless nothing that is transparent has it."""
     low, high = INDICES
     if not low <= index <= high:
         raise ValueError(

@@ -31,21 +31,7 @@ _OPTICS = (
 
 @dataclass(frozen=True)
 class Day:
-    """What the calibrations of a day found.
-
-    Attributes
-    ----------
-    settings : mapping of str to Any
-        Keys of the configuration that they set.
-    outcomes : mapping of str to Outcome
-        Of flats and of calibrants whose first analysis failed, by the movie's name.
-    camera, optics, mass : str
-        Where each comes from, for people.
-    failed : tuple of (str, str)
-        Calibrations that could not be made, each with its reason.
-    standards_kda : tuple of float
-        Standards that the line of the masses goes through [kDa].
-    """
+    """What the calibrations of a day found."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     outcomes: Mapping[str, Outcome] = field(default_factory=dict)
@@ -57,20 +43,7 @@ class Day:
 
 
 def calibrate_day(plan: Plan, runner: Runner) -> Day:
-    """Make the calibrations of a day, as far as they are not made yet.
-
-    Parameters
-    ----------
-    plan : Plan
-        What is to be done.
-    runner : Runner
-        Does it.
-
-    Returns
-    -------
-    Day
-        What every movie is analysed with.
-    """
+    """Make the calibrations of a day, as far as they are not made yet."""
     settings: dict[str, Any] = {}
     outcomes: dict[str, Outcome] = {}
     failed: list[tuple[str, str]] = []

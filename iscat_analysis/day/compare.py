@@ -43,16 +43,6 @@ def match_species(species: pd.DataFrame) -> pd.DataFrame:
 
     The two nearest groups are joined, again and again, as long as they are within `SAME_MASS` or
     three standard errors, and hold no two species of one movie.
-
-    Parameters
-    ----------
-    species : pandas.DataFrame
-        Columns movie, mass_kda, mass_se, outlier.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The same with the column kind: 1, 2, … by rising mass, 0 for outliers.
     """
     real = species[~species["outlier"]].sort_values(["mass_kda", "movie"])
     masses = real["mass_kda"].to_numpy(float)
@@ -96,19 +86,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class Means:
-    """Means of samples, with errors that hold the scatter between their movies.
-
-    Attributes
-    ----------
-    value, se : ndarray, shape (samples,)
-        Weighted mean and standard error.
-    movies : ndarray, shape (samples,)
-        How many.
-    scatter : float
-        τ, between movies of one sample; NaN without replicates.
-    freedom : float
-        Degrees of freedom of the errors; infinite where they are counting errors alone.
-    """
+    """Means of samples, with errors that hold the scatter between their movies."""
 
     value: FloatArray
     se: FloatArray
@@ -120,18 +98,7 @@ class Means:
 def sample_means(values: FloatArray, errors: FloatArray, sample: Sequence[int]) -> Means:
     """Average the movies of each sample.
 
-    Parameters
-    ----------
-    values, errors : ndarray, shape (n,)
-        Of each movie, and standard errors; an error of zero is not known, and the movie is left
-        out.
-    sample : sequence of int
-        The sample of each movie, 0, 1, ….
-
-    Returns
-    -------
-    Means
-        NaN for a sample without movies.
+    Shapes: `values, errors` (n,).
     """
     known = np.isfinite(values) & np.isfinite(errors) & (errors > 0)
     groups = np.asarray(sample)
@@ -167,22 +134,7 @@ def sample_means(values: FloatArray, errors: FloatArray, sample: Sequence[int]) 
 
 
 def shifts(species: pd.DataFrame, reference: str) -> pd.DataFrame:
-    """Compare every kind of species between the samples.
-
-    Parameters
-    ----------
-    species : pandas.DataFrame
-        With kind, sample, condition, mass_kda, mass_se, share and its interval; one row per
-        species and movie.
-    reference : str
-        The sample that the others are compared with.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `SHIFT_COLUMNS`, for mass and share; masses are compared without the error of
-        the mass scale, which movies of one day share.
-    """
+    """Compare every kind of species between the samples."""
     found: list[pd.DataFrame] = []
     width = (species["share_high"] - species["share_low"]) / (2 * _Z95)
     species = species.assign(share_se=width)
@@ -240,15 +192,7 @@ def _compared(table: pd.DataFrame, means: Means, reference: str) -> pd.DataFrame
 def holm(p_values: FloatArray) -> FloatArray:
     """Correct p-values for their number (Holm, Scand. J. Stat. 6, 65, 1979).
 
-    Parameters
-    ----------
-    p_values : ndarray, shape (n,)
-        NaN where nothing is compared.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The smallest family-wise level at which each is rejected; NaN where it was.
+    Shapes: `p_values` (n,), result (n,).
     """
     corrected = np.full(p_values.shape, math.nan)
     known = np.flatnonzero(np.isfinite(p_values))

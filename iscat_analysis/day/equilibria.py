@@ -31,15 +31,7 @@ holds, masses of the species, remarks, and why there is no K_D."""
 
 @dataclass(frozen=True)
 class Reaction:
-    """The reaction whose K_D is fitted.
-
-    Attributes
-    ----------
-    model : {"dimer", "ab"}
-        2 M ⇌ D or A + B ⇌ AB.
-    masses_kda : tuple of float or None
-        About the mass of the monomer, or of A and B [kDa].
-    """
+    """The reaction whose K_D is fitted."""
 
     model: Model
     masses_kda: tuple[float, ...] | None = None
@@ -47,21 +39,7 @@ class Reaction:
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """The movies of one condition.
-
-    Attributes
-    ----------
-    condition : str
-        As in the table.
-    movies : int
-        With enough events.
-    binding : Binding or None
-        What they say of K_D.
-    remarks : tuple of str
-        What the user should know, one sentence each.
-    why : str
-        Why they say nothing.
-    """
+    """The movies of one condition."""
 
     condition: str
     movies: int
@@ -71,25 +49,7 @@ class Series:
 
 
 def reaction_of(kd: Model | None, kd_masses_kda: Sequence[float] | None) -> Reaction | None:
-    """Check what K_D is asked for.
-
-    Parameters
-    ----------
-    kd : {"dimer", "ab"} or None
-        The reaction.
-    kd_masses_kda : sequence of float or None
-        About the mass of the monomer, or of A and B [kDa].
-
-    Returns
-    -------
-    Reaction or None
-        None where none is asked for.
-
-    Raises
-    ------
-    ConfigError
-        There is no such reaction, or the masses are not its.
-    """
+    """Check what K_D is asked for."""
     if kd is None:
         if kd_masses_kda is not None:
             raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
@@ -99,20 +59,7 @@ def reaction_of(kd: Model | None, kd_masses_kda: Sequence[float] | None) -> Reac
 
 
 def find_equilibria(found: Sequence[Found], reaction: Reaction) -> list[Series]:
-    """Fit an equilibrium constant to each condition with samples of several concentrations.
-
-    Parameters
-    ----------
-    found : sequence of Found
-        What the movies gave, in the order of the table.
-    reaction : Reaction
-        Which reaction.
-
-    Returns
-    -------
-    list of Series
-        In the order of the table; one without a name where no condition is a series.
-    """
+    """Fit an equilibrium constant to each condition with samples of several concentrations."""
     columns = CONCENTRATIONS[reaction.model]
     conditions: dict[str, list[Found]] = {}
     for each in found:
@@ -130,20 +77,7 @@ def find_equilibria(found: Sequence[Found], reaction: Reaction) -> list[Series]:
 
 
 def kd_table(series: Sequence[Series], reaction: Reaction) -> pd.DataFrame:
-    """Lay out ``kd.csv``.
-
-    Parameters
-    ----------
-    series : sequence of Series
-        From `find_equilibria`.
-    reaction : Reaction
-        Of which they are.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `KD_COLUMNS`.
-    """
+    """Lay out ``kd.csv``."""
     rows = []
     for each in series:
         row = {
@@ -163,18 +97,7 @@ def kd_table(series: Sequence[Series], reaction: Reaction) -> pd.DataFrame:
 
 
 def kd_name(condition: str) -> str:
-    """Name an equilibrium constant.
-
-    Parameters
-    ----------
-    condition : str
-        Of its series; may be empty.
-
-    Returns
-    -------
-    str
-        As in ``"K_D of pH 7"``.
-    """
+    """Name an equilibrium constant."""
     return f"K_D of {condition}" if condition else "K_D"
 
 

@@ -52,25 +52,7 @@ _MASSES = ("mass_kda", "status", "p_value")
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one movie gave.
-
-    Attributes
-    ----------
-    movie : Movie
-        It and its row.
-    outcome : Outcome
-        What became of it.
-    folder : Path
-        Of its result.
-    summary : mapping of str to Any
-        Its ``summary.json``; empty where there is no result.
-    masses_kda : ndarray, shape (n,)
-        Of its events, or tracks, that are ok [kDa]; negative for those that leave.
-    p_values : ndarray, shape (n,)
-        Of its events, poor fits included.
-    config : Config or None
-        As it was analysed.
-    """
+    """What one movie gave."""
 
     movie: Movie
     outcome: Outcome
@@ -116,22 +98,7 @@ class Found:
 
 
 def read_movie(movie: Movie, outcome: Outcome, folder: Path) -> Found:
-    """Read what the tables and figures need of a result.
-
-    Parameters
-    ----------
-    movie : Movie
-        Whose it is.
-    outcome : Outcome
-        What became of it.
-    folder : Path
-        The result.
-
-    Returns
-    -------
-    Found
-        Without numbers where there is no result.
-    """
+    """Read what the tables and figures need of a result."""
     nothing = np.empty(0)
     if outcome.state != "done" or movie.row.role == "flat":
         return Found(movie, outcome, folder, {}, nothing, nothing, None)
@@ -153,18 +120,7 @@ def read_movie(movie: Movie, outcome: Outcome, folder: Path) -> Found:
 
 
 def species_table(found: Sequence[Found]) -> pd.DataFrame:
-    """Put the species of all movies into one table.
-
-    Parameters
-    ----------
-    found : sequence of Found
-        In the order of the table.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `SPECIES_COLUMNS` but `kind`, which `match_species` gives.
-    """
+    """Put the species of all movies into one table."""
     rows = []
     for each in found:
         described = each.summary.get("distribution") or {}
@@ -208,24 +164,7 @@ def _shares(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
 
 
 def movie_table(plan: Plan, day: Day, found: Sequence[Found], out: Path) -> pd.DataFrame:
-    """Put what is to be said of every movie into one table.
-
-    Parameters
-    ----------
-    plan : Plan
-        What was to be done.
-    day : Day
-        The calibrations.
-    found : sequence of Found
-        In the order of the table.
-    out : Path
-        Folder of the batch, which links are relative to.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `MOVIE_COLUMNS`, then those of the user's own.
-    """
+    """Put what is to be said of every movie into one table."""
     rows = []
     for each in found:
         row = {
@@ -280,20 +219,7 @@ def _numbers(each: Found, day: Day, out: Path) -> dict[str, Any]:
 
 
 def poisson_rate(count: float | None, seconds: float) -> tuple[float, float, float]:
-    """Give a rate with its 95 % Poisson interval (Garwood, Biometrika 28, 437, 1936).
-
-    Parameters
-    ----------
-    count : float or None
-        What was counted.
-    seconds : float
-        In what time, of any unit.
-
-    Returns
-    -------
-    rate, low, high : float
-        NaN where either is not known.
-    """
+    """Give a rate with its 95 % Poisson interval (Garwood, Biometrika 28, 437, 1936)."""
     if count is None or not (math.isfinite(count) and math.isfinite(seconds)):
         return math.nan, math.nan, math.nan
     low = float(gammaincinv(count, 0.025)) if count > 0 else 0.0
@@ -309,22 +235,7 @@ def _typed(column: pd.Series[Any]) -> pd.Series[Any]:
 
 
 def write_events(found: Sequence[Found], further: pd.DataFrame, path: Path) -> int:
-    """Write the events of all movies into one file, one movie at a time.
-
-    Parameters
-    ----------
-    found : sequence of Found
-        In the order of the table.
-    further : pandas.DataFrame
-        The user's own columns, one row per movie in the same order.
-    path : Path
-        A Parquet file; the columns of ``fits.parquet`` come after those of the sample.
-
-    Returns
-    -------
-    int
-        Events in it.
-    """
+    """Write the events of all movies into one file, one movie at a time."""
     done = [k for k, each in enumerate(found) if each.summary]
     names: dict[str, pa.DataType] = {}
     for k in done:

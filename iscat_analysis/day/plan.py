@@ -15,15 +15,7 @@ from iscat_analysis.movie.addresses import beside, split_address
 
 @dataclass(frozen=True)
 class Movie:
-    """One movie and where its results go.
-
-    Attributes
-    ----------
-    name : str
-        Of its result, with slashes where the movie lies in folders beside the table.
-    row : Row
-        What the table says of it.
-    """
+    """One movie and where its results go."""
 
     name: str
     row: Row
@@ -31,19 +23,7 @@ class Movie:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done.
-
-    Attributes
-    ----------
-    table : Table
-        As it was read.
-    config : Config
-        Of the day, before its calibrations.
-    flats, calibrants, movies : tuple of Movie
-        By name; `movies` is everything with particles, the calibrants included.
-    standards : tuple of (float, float)
-        Masses in the calibrants and their standard errors [kDa].
-    """
+    """What is to be done."""
 
     table: Table
     config: Config
@@ -56,28 +36,7 @@ class Plan:
 def make_plan(
     table: Table, config: Config, standards: tuple[tuple[float, float], ...] = ()
 ) -> Plan:
-    """Lay out the work of a day.
-
-    Parameters
-    ----------
-    table : Table
-        From `read_table`.
-    config : Config
-        Of the day.
-    standards : tuple of (float, float)
-        Masses in the calibrants, beside those that the table names [kDa].
-
-    Returns
-    -------
-    Plan
-        Independent of the order of the rows.
-
-    Raises
-    ------
-    ConfigError
-        A row sets a key that does not exist or to what is impossible, or standards are given where
-        there is no calibrant.
-    """
+    """Lay out the work of a day."""
     for row in table.rows:
         try:
             configured(config, {}, row)
@@ -105,41 +64,13 @@ def make_plan(
 
 
 def configured(config: Config, day: Mapping[str, Any], row: Row) -> Config:
-    """Give the configuration of one movie: the day's calibrations, then what its row says.
-
-    Parameters
-    ----------
-    config : Config
-        Of the day.
-    day : mapping of str to Any
-        Keys that calibrations of the day set.
-    row : Row
-        Of the movie.
-
-    Returns
-    -------
-    Config
-        Validated.
-    """
+    """Give the configuration of one movie: the day's calibrations, then what its row says."""
     calibrated = configure(config, settings=day) if day else config
     return configure(calibrated, settings=row.settings) if row.settings else calibrated
 
 
 def part_of(movies: tuple[Movie, ...], only: tuple[int, int] | None) -> tuple[Movie, ...]:
-    """Give one of several equal parts of the movies.
-
-    Parameters
-    ----------
-    movies : tuple of Movie
-        By name.
-    only : (int, int), optional
-        Which part, from 1, of how many; all without it.
-
-    Returns
-    -------
-    tuple of Movie
-        Every N-th movie.
-    """
+    """Give one of several equal parts of the movies."""
     return movies if only is None else movies[only[0] - 1 :: only[1]]
 
 

@@ -40,23 +40,7 @@ def publish_day(
     failed: Sequence[tuple[str, str]],
     out: Path,
 ) -> None:
-    """Write everything that is said of all movies together; each file is there whole or not at all.
-
-    Parameters
-    ----------
-    plan : Plan
-        What was to be done.
-    day : Day
-        The calibrations.
-    found : sequence of Found
-        In the order of the table.
-    reaction : Reaction or None
-        Whose equilibrium constants are asked for.
-    failed : sequence of (str, str)
-        What could not be analysed, each with its reason.
-    out : Path
-        Folder of the batch.
-    """
+    """Write the tables and the page of all movies; each file is written whole or not at all."""
     movies = movie_table(plan, day, found, out)
     species = match_species(species_table(found))[list(SPECIES_COLUMNS)]
     shifted = shifts(species[species["role"] != "calibrant"], reference_of(found))
@@ -158,18 +142,7 @@ def _curve(each: Found, group: str) -> Curve:
 
 
 def reference_of(found: Sequence[Found]) -> str:
-    """Name the sample that the others are compared with: the first of the table.
-
-    Parameters
-    ----------
-    found : sequence of Found
-        In the order of the table.
-
-    Returns
-    -------
-    str
-        Of a movie with the role sample that has species; empty where there is none.
-    """
+    """Name the sample that the others are compared with: the first of the table."""
     for each in found:
         if each.movie.row.role == "sample" and (each.summary.get("distribution") or {}).get(
             "species"

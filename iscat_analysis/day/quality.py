@@ -37,20 +37,7 @@ NEAR_STANDARD = 0.05
 
 
 def noise_of(summary: Mapping[str, Any]) -> tuple[float | None, int | None]:
-    """Find the noise at the length of the movie's windows.
-
-    Parameters
-    ----------
-    summary : mapping
-        ``summary.json``.
-
-    Returns
-    -------
-    variance_over_shot : float or None
-        Over that of the photoelectrons; None where it was not measured.
-    frames : int or None
-        Averaged, the longest that is not longer than the windows.
-    """
+    """Find the noise at the length of the movie's windows."""
     noise = summary.get("landing") or summary.get("background") or {}
     frames, values = noise.get("noise_frames"), noise.get("noise_variance_over_shot")
     known = [(n, v) for n, v in zip(frames or (), values or (), strict=True) if v is not None]
@@ -69,25 +56,7 @@ def judge(
 ) -> dict[str, Any]:
     """Judge one movie.
 
-    Parameters
-    ----------
-    movie : Movie
-        Whose result it is.
-    summary : mapping
-        ``summary.json``.
-    config : Config or None
-        As it was analysed.
-    masses_kda : ndarray, shape (n,)
-        Of its events [kDa].
-    p_values : ndarray, shape (n,)
-        Of its events.
-    day : Day
-        The calibrations.
-
-    Returns
-    -------
-    dict
-        Columns of ``movies.csv``; ``cautions`` joins what is told by semicolons.
+    Shapes: `masses_kda` (n,), `p_values` (n,).
     """
     cautions: list[str] = []
     noise, frames = noise_of(summary)

@@ -24,19 +24,7 @@ State = Literal["done", "failed", "missing"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
-
-    Attributes
-    ----------
-    state : str
-        ``"done"``, ``"failed"``, or ``"missing"``: not yet run as it is now asked for.
-    why : str
-        One line that says what went wrong.
-    ran : bool
-        Whether it was run now.
-    record : mapping of str to Any
-        What is kept of it.
-    """
+    """What became of a job."""
 
     state: State
     why: str = ""
@@ -46,27 +34,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Runner:
-    """Runs jobs that are not finished yet.
-
-    Attributes
-    ----------
-    out : Path
-        Folder of the batch.
-    records : Records
-        What is finished.
-    dry : bool
-        Run nothing, and say what is missing.
-    progress : Progress
-        Told how far the stages of a movie are.
-    notify : callable
-        Told in one line what was done.
-    command : str
-        The command line, for the reports.
-    place : Place
-        Where movies are analysed.
-    retry : bool
-        Try again what failed, though nothing has changed.
-    """
+    """Runs jobs that are not finished yet."""
 
     out: Path
     records: Records
@@ -85,27 +53,7 @@ class Runner:
         result: Path,
         work: Callable[[], Mapping[str, Any]],
     ) -> Outcome:
-        """Do a job unless it is done.
-
-        Parameters
-        ----------
-        name : str
-            Of its record.
-        key : str
-            Hash of what it is asked for.
-        inputs : mapping of str to Path
-            Files that it reads, by name.
-        result : Path
-            A file that is there once it is done.
-        work : callable
-            Does it, and gives what is to be kept in its record; a fingerprint of every input is
-            added.
-
-        Returns
-        -------
-        Outcome
-            Of the job.
-        """
+        """Do a job unless it is done."""
         with self.records.held(name, self.notify):
             record = self.records.read(name)
             files = record.get("inputs", {})
@@ -145,24 +93,7 @@ class Runner:
             return Outcome(state, why, ran=True, record=record)
 
     def analyse(self, name: str, movie: Path, config: Config, folder: Path) -> Outcome:
-        """Fit a movie unless that is done.
-
-        Parameters
-        ----------
-        name : str
-            Of its record.
-        movie : Path
-            The file.
-        config : Config
-            As it is to be analysed.
-        folder : Path
-            For the result.
-
-        Returns
-        -------
-        Outcome
-            Its record has `shape` of the movie and the number of `events`.
-        """
+        """Fit a movie unless that is done."""
 
         def work() -> dict[str, Any]:
             return self.place.call(
@@ -189,35 +120,7 @@ def analyse_movie(
     *,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Fit a movie of a batch, wherever that is.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the batch.
-    name : str
-        Of the job.
-    movie : (Path, str)
-        The file, and what `iscat_analysis.day.state.seen` says of it where the batch runs.
-    config : Config
-        As it is to be analysed, with absolute paths.
-    folder : Path
-        For the result.
-    command : str
-        For the report.
-    progress : Progress
-        Told how far it is.
-
-    Returns
-    -------
-    dict
-        For the job's record.
-
-    Raises
-    ------
-    DataError
-        The movie cannot be analysed, or movie or folder are not there as the batch sees them.
-    """
+    """Fit a movie of a batch, wherever that is."""
     path, known = movie
     if not (out / STATE).is_dir():
         raise not_shared(out)

@@ -34,30 +34,13 @@ _MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
 
 
 class Records:
-    """Records and locks of one batch.
-
-    Parameters
-    ----------
-    out : Path
-        Folder of the batch.
-    """
+    """Records and locks of one batch."""
 
     def __init__(self, out: Path) -> None:
         self._folder = out / STATE
 
     def read(self, name: str) -> dict[str, Any]:
-        """Give the record of a job.
-
-        Parameters
-        ----------
-        name : str
-            Of the job.
-
-        Returns
-        -------
-        dict
-            Empty where there is none, or it cannot be read.
-        """
+        """Give the record of a job."""
         try:
             found = json.loads(self._path(name).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -65,27 +48,13 @@ class Records:
         return found if isinstance(found, dict) else {}
 
     def write(self, name: str, values: Mapping[str, Any]) -> None:
-        """Keep the record of a job, whole or not at all.
-
-        Parameters
-        ----------
-        name : str
-            Of the job.
-        values : mapping
-            Plain values.
-        """
+        """Keep the record of a job, whole or not at all."""
         path = self._path(name)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, json.dumps(dict(values), indent=1, sort_keys=True) + "\n")
 
     def drop(self, name: str) -> None:
-        """Forget a job, before its result is changed.
-
-        Parameters
-        ----------
-        name : str
-            Of the job.
-        """
+        """Forget a job, before its result is changed."""
         self._path(name).unlink(missing_ok=True)
 
     def forget_failed(self) -> None:
@@ -97,19 +66,7 @@ class Records:
 
     @contextmanager
     def held(self, name: str, notify: Callable[[str], None]) -> Iterator[None]:
-        """Wait until no other run does a job, and keep others from it.
-
-        Parameters
-        ----------
-        name : str
-            Of the job.
-        notify : callable
-            Told where it takes long.
-
-        Yields
-        ------
-        None
-        """
+        """Wait until no other run does a job, and keep others from it."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -149,18 +106,7 @@ else:
 
 
 def claim_folder(out: Path) -> None:
-    """Make the folder of a batch, and refuse one that holds something else.
-
-    Parameters
-    ----------
-    out : Path
-        May hold an earlier batch.
-
-    Raises
-    ------
-    DataError
-        It is a file, holds something else, or cannot be made.
-    """
+    """Make the folder of a batch, and refuse one that holds something else."""
     state = out / STATE
     try:
         held = sorted(p.name for p in out.iterdir()) if out.is_dir() else []
@@ -177,34 +123,13 @@ def claim_folder(out: Path) -> None:
 
 
 def write_whole(path: Path, content: str) -> None:
-    """Write a text file that is there whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-        Replaced once everything is written.
-    content : str
-        In UTF-8.
-    """
+    """Write a text file that is there whole or not at all."""
     with whole_file(path) as partial:
         partial.write_text(content, encoding="utf-8")
 
 
 def key_of(config: Config, *further: Any) -> str:
-    """Hash what an analysis is asked for.
-
-    Parameters
-    ----------
-    config : Config
-        Workers and memory do not count: they change no result.
-    *further : Any
-        Plain values that count as well.
-
-    Returns
-    -------
-    str
-        In hexadecimal.
-    """
+    """Hash what an analysis is asked for."""
     compute = type(config.compute)(seed=config.compute.seed)
     settings = config.model_copy(update={"compute": compute})
     maps = [sha256_of(Path(v)) for n in _MAPS if isinstance(v := getattr(config.camera, n), str)]
@@ -212,35 +137,13 @@ def key_of(config: Config, *further: Any) -> str:
 
 
 def hash_of(*parts: Any) -> str:
-    """Hash what a job is asked for, and the version that does it.
-
-    Parameters
-    ----------
-    *parts : Any
-        Plain values.
-
-    Returns
-    -------
-    str
-        In hexadecimal.
-    """
+    """Hash what a job is asked for, and the version that does it."""
     text = json.dumps([version("iscat-analysis"), *parts])
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def sha256_of(path: Path) -> str:
-    """Hash a file, or a movie as `Stack.sha256` does.
-
-    Parameters
-    ----------
-    path : Path
-        The file, or the address of a movie.
-
-    Returns
-    -------
-    str
-        In hexadecimal; empty where it cannot be read, which whoever opens it will say.
-    """
+    """Hash a file, or a movie as `Stack.sha256` does."""
     try:
         return sha256_of_files(files_of(path), split_address(path)[1])
     except (DataError, OSError):
@@ -248,20 +151,7 @@ def sha256_of(path: Path) -> str:
 
 
 def saw(record: Mapping[str, Any], path: Path) -> bool:
-    """Tell whether a movie is the one that a record is of.
-
-    Parameters
-    ----------
-    record : mapping
-        With `fingerprint` and `sha256`.
-    path : Path
-        The movie.
-
-    Returns
-    -------
-    bool
-        By its size, time and ends; where these differ, by its SHA-256.
-    """
+    """Tell whether a movie is the one that a record is of."""
     try:
         if record.get("fingerprint") == _fingerprint(path):
             return True
@@ -271,18 +161,7 @@ def saw(record: Mapping[str, Any], path: Path) -> bool:
 
 
 def seen(path: Path) -> str:
-    """Hash a movie's size, time and ends; empty where it cannot be read.
-
-    Parameters
-    ----------
-    path : Path
-        The movie.
-
-    Returns
-    -------
-    str
-        In hexadecimal.
-    """
+    """Hash a movie's size, time and ends; empty where it cannot be read."""
     try:
         return _fingerprint(path)
     except OSError:

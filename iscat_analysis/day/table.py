@@ -43,29 +43,7 @@ Records = list[tuple[str, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class Row:
-    """One movie of the table.
-
-    Attributes
-    ----------
-    where : str
-        What messages call it, as in ``"line 5"``.
-    path : Path
-        Address of the movie, absolute.
-    given : str
-        The path as it was written.
-    sample, condition, replicate : str
-        Of the table; the sample is the movie's name where it is not given.
-    concentration_nm : float
-        Concentration [nmol/l]; NaN where it is not given.
-    role : str
-        One of `ROLES`.
-    standards : tuple of (float, float)
-        Masses in a calibrant and their standard errors [kDa].
-    settings : mapping or tuple of str
-        Keys of the configuration for this movie, as `configure` takes them.
-    further : mapping of str to Any
-        Every other column.
-    """
+    """One movie of the table."""
 
     where: str
     path: Path
@@ -82,19 +60,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """All rows, and the folder that their paths are relative to.
-
-    Attributes
-    ----------
-    source : Path
-        The file or the folder.
-    root : Path
-        Folder that the paths are relative to, absolute.
-    rows : tuple of Row
-        In the order of the table.
-    absent : tuple of str
-        Paths of rows that are left out, because there is no such movie yet.
-    """
+    """All rows, and the folder that their paths are relative to."""
 
     source: Path
     root: Path
@@ -108,24 +74,7 @@ class Table:
 
 
 def read_table(source: Path) -> Table:
-    """Read the table of a day.
-
-    Parameters
-    ----------
-    source : Path
-        ``.toml`` with ``[[movies]]``; a folder, whose movies are samples named by their files; or
-        CSV with a heading, separated by commas, semicolons or tabs.
-
-    Returns
-    -------
-    Table
-        Checked: every movie is there, and none twice.
-
-    Raises
-    ------
-    ConfigError
-        One line that names file, row and column of whatever is wrong.
-    """
+    """Read the table of a day."""
     if source.is_dir():
         found = find_movies(source)
         if not found:
@@ -138,25 +87,7 @@ def read_table(source: Path) -> Table:
 
 
 def read_growing(folder: Path, movies: Sequence[Path]) -> Table:
-    """Read the table of a folder that is still being filled.
-
-    Parameters
-    ----------
-    folder : Path
-        It may hold one of `TABLES`, which says what its movies are.
-    movies : sequence of Path
-        That are in the folder; those that the table does not name are samples.
-
-    Returns
-    -------
-    Table
-        Movies that are there, and the paths of those in the table that are not.
-
-    Raises
-    ------
-    ConfigError
-        The table is wrong, as in `read_table`, or there are two.
-    """
+    """Read the table of a folder that is still being filled."""
     tables = [folder / name for name in TABLES if (folder / name).is_file()]
     if len(tables) > 1:
         raise ConfigError(f"{folder}: holds {' and '.join(TABLES)}; leave one table of the movies")
@@ -222,24 +153,7 @@ def _is_there(address: Path) -> bool:
 
 
 def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:
-    """Read the masses of standards.
-
-    Parameters
-    ----------
-    text : str or sequence of float
-        As in ``"66,146:1.5,480"``, separated by commas, semicolons or spaces; a number after a
-        colon is the standard error, otherwise 1 %.
-
-    Returns
-    -------
-    tuple of (float, float)
-        Mass and standard error of each [kDa].
-
-    Raises
-    ------
-    ValueError
-        Something in it is not a mass.
-    """
+    """Read the masses of standards."""
     if not isinstance(text, (str, list, tuple)):
         raise ValueError(f"{text!r} is no list of masses; write it as 66,146,480")
     parts = text.replace(";", " ").replace(",", " ").split() if isinstance(text, str) else text

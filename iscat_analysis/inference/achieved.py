@@ -35,35 +35,7 @@ _FEWEST_COUNTS = 200
 
 @dataclass(frozen=True)
 class Achieved:
-    """Measured spread of one parameter over its bound.
-
-    Attributes
-    ----------
-    over_crb : float
-        The ratio.
-    ci95 : (float, float)
-        Its 95 % interval.
-    events : int
-        Events whose frames were compared.
-    whole : bool
-        Whether the noise was seen at the full length of the windows, at empty places; otherwise at
-        an eighth to a half of it.
-    significance : float
-        ln of the ratio in its standard errors.
-    frames : tuple of float
-        Frames averaged; where estimates are of single frames, those from each to the middle of the
-        background.
-    by_frames : tuple of float
-        Spread of such averages over their bound, within the events' own frames; of single frames,
-        at empty places.
-    by_frames_se : tuple of float
-        Its standard errors.
-    empty : tuple of float
-        The same at empty places: parts, eighths, quarters and halves of a window, the whole; of
-        single frames, successive ones, and all against the background; empty where there are none.
-    single : bool
-        Whether estimates are of single frames.
-    """
+    """Measured spread of one parameter over its bound."""
 
     over_crb: float
     ci95: tuple[float, float]
@@ -122,28 +94,13 @@ def pooled(
 ) -> Achieved | None:
     """Pool the repeats of one parameter.
 
-    Parameters
-    ----------
-    own : ndarray, shape (events, 1 + len(LENGTHS), 2)
-        Squares over expected variance, and how many; from `repeats_of`.
-    empty, empty_counts : ndarray, shape (contrasts, tiles), optional
-        Of `EmptySpread`, this parameter's.
-    shared : float
-        Of `EmptySpread`, this parameter's.
-    distances : tuple of float, optional
-        Of `EmptySpread`, where estimates are of single frames; `own` is then that of their frames
-        elsewhere, and says nothing that `empty` does not.
-
-    Returns
-    -------
-    Achieved or None
-        None without events.
-
     Notes
     -----
     The interval is Student's, on the logarithm, its variance that between events and between tiles
     of the field with what these have in common, which noise of neighbours does not make too small;
     at least that of χ².
+
+    Shapes: `own` (events, 1 + len(LENGTHS), `empty, empty_counts` (contrasts, tiles).
     """
     own = own[own[:, 0, 1] > 0]
     if not len(own):

@@ -91,27 +91,7 @@ _Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
 
 @dataclass(frozen=True)
 class Cause:
-    """What the residuals of several fits look like.
-
-    Attributes
-    ----------
-    name : str
-        The part of the microscope.
-    share : float
-        Of χ² in excess that it explains, to first order.
-    step : float or None
-        What would have to be added to its one parameter, to first order.
-    unit : str
-        Of `step`.
-    events : int
-        Fits that were looked at.
-    learned : bool
-        Whether the optics can be learned from such a movie.
-    other_steps : tuple of float
-        What might have to be added instead, as far as these pictures tell.
-    rivals : tuple of (str, float, str)
-        Other parts of the microscope that explain as much, with the step and unit of each.
-    """
+    """What the residuals of several fits look like."""
 
     name: str
     share: float
@@ -155,20 +135,7 @@ class Cause:
 def likely_cause(
     config: Config, fits: Sequence[tuple[Likelihood, FloatArray, BoolArray]]
 ) -> Cause | None:
-    """Name the part of the microscope whose change looks most like what fits left over.
-
-    Parameters
-    ----------
-    config : Config
-        The microscope as it is configured.
-    fits : sequence of (Likelihood, ndarray, ndarray of bool)
-        Of each particle its likelihood, θ where that is largest, and which of θ were free.
-
-    Returns
-    -------
-    Cause or None
-        None without fits, or where nothing explains `WORTH_NAMING`.
-    """
+    """Name the part of the microscope whose change looks most like what fits left over."""
     if not fits or config.optics.convention != "exact":
         return None
     left = [_Left.of(*fit) for fit in fits]

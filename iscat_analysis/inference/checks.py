@@ -25,25 +25,7 @@ LARGEST = 1e15
 
 
 def array_of(name: str, value: ArrayLike) -> NDArray[Any]:
-    """Turn an argument into an array of whatever type it is.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : array_like
-        Anything regular.
-
-    Returns
-    -------
-    ndarray
-        The same.
-
-    Raises
-    ------
-    DataError
-        Its rows have different lengths.
-    """
+    """Turn an argument into an array of whatever type it is."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -51,26 +33,7 @@ def array_of(name: str, value: ArrayLike) -> NDArray[Any]:
 
 
 def real_array(name: str, value: ArrayLike) -> FloatArray:
-    """Turn an argument into 64-bit floats.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : array_like
-        Integers or floats of any width; integers are converted before anything is added to them,
-        so that nothing wraps.
-
-    Returns
-    -------
-    ndarray of float64
-        Contiguous, of the same shape.
-
-    Raises
-    ------
-    DataError
-        It does not hold real numbers, or not at all of its places.
-    """
+    """Turn an argument into 64-bit floats."""
     if type(value) is np.ndarray and value.dtype == np.float64 and value.flags.c_contiguous:
         return value
     array = array_of(name, value)
@@ -85,27 +48,7 @@ def real_array(name: str, value: ArrayLike) -> FloatArray:
 
 
 def vector_of(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Check the shape of parameters.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : array_like
-        Parameters; NaN and infinities are left for the caller to judge.
-    shape : tuple of int
-        Needed; −1 where any length will do.
-
-    Returns
-    -------
-    ndarray of float64
-        Contiguous, of that shape.
-
-    Raises
-    ------
-    DataError
-        It has another shape or does not hold real numbers.
-    """
+    """Check the shape of parameters."""
     array = real_array(name, value)
     if array.shape == shape:
         return array
@@ -127,33 +70,7 @@ def pixels_of(
     scalar: bool = False,
     least: float | None = None,
 ) -> FloatArray:
-    """Check a number for each pixel.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : array_like
-        One number for each pixel.
-    shape : tuple of int
-        Of the pixels.
-    masked : ndarray of bool, shape `shape`
-        Pixels whose value does not matter; it becomes 0 unless it is finite.
-    scalar : bool
-        Whether one number for all pixels will do.
-    least : float, optional
-        Smallest value allowed.
-
-    Returns
-    -------
-    ndarray of float64, shape `shape`
-        Finite throughout.
-
-    Raises
-    ------
-    DataError
-        It has another shape, does not hold real numbers, or is not finite where not masked.
-    """
+    """Check a number for each pixel."""
     array = real_array(name, value)
     if array.ndim == 0 and scalar:
         array = np.full(shape, float(array))
@@ -174,27 +91,7 @@ def pixels_of(
 
 
 def mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:
-    """Check a mask.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : array_like of bool, or None
-        True where a pixel must not be used; None masks nothing.
-    shape : tuple of int
-        Of the pixels.
-
-    Returns
-    -------
-    ndarray of bool, shape `shape`
-        The mask.
-
-    Raises
-    ------
-    DataError
-        It has another shape or is not of truth values.
-    """
+    """Check a mask."""
     if value is None:
         return np.zeros(shape, dtype=np.bool_)
     array = np.asarray(value)
@@ -215,35 +112,7 @@ def number_in(
     whole: bool = False,
     what: str = "",
 ) -> float:
-    """Check a single number.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : Any
-        The number.
-    least : float, optional
-        Smallest that is possible.
-    above : float, optional
-        In place of `least`: what it must exceed.
-    most : float
-        Largest that is possible.
-    whole : bool
-        Whether it counts something.
-    what : str
-        What it is a number of, for the message; default a number.
-
-    Returns
-    -------
-    float
-        The number.
-
-    Raises
-    ------
-    ConfigError
-        It is not such a number.
-    """
+    """Check a single number."""
     try:
         array = real_array(name, value)
     except DataError:
@@ -262,89 +131,27 @@ def number_in(
 
 
 def truth_in(name: str, value: Any) -> bool:
-    """Check an answer to yes or no.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : Any
-        The answer.
-
-    Returns
-    -------
-    bool
-        The answer.
-
-    Raises
-    ------
-    ConfigError
-        It is neither True nor False.
-    """
+    """Check an answer to yes or no."""
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"{name} = {shown(value)}: give True or False")
     return bool(value)
 
 
 def choice_in(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Check that a word is one of those that have a meaning.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : Any
-        The word.
-    choices : sequence of str
-        Which there are.
-
-    Raises
-    ------
-    ConfigError
-        It is none of them.
-    """
+    """Check that a word is one of those that have a meaning."""
     if not isinstance(value, str) or value not in choices:
         raise ConfigError(f"{name} = {shown(value)}: choose one of {', '.join(choices)}")
 
 
 def path_in(name: str, value: Any) -> Path:
-    """Check the path of a file or a folder.
-
-    Parameters
-    ----------
-    name : str
-        What messages call it.
-    value : Any
-        The path.
-
-    Returns
-    -------
-    Path
-        The path.
-
-    Raises
-    ------
-    ConfigError
-        It is neither text nor a path.
-    """
+    """Check the path of a file or a folder."""
     if not isinstance(value, (str, Path)):
         raise ConfigError(f"{name} = {shown(value)}: give a path")
     return Path(value)
 
 
 def shown(value: Any) -> str:
-    """Write a value of any type into a message, in one line and not at length.
-
-    Parameters
-    ----------
-    value : Any
-        What was given.
-
-    Returns
-    -------
-    str
-        Its beginning and its end.
-    """
+    """Write a value of any type into a message, in one line and not at length."""
     if isinstance(value, float):
         return f"{value:g}"
     return " ".join(reprlib.repr(value).split())

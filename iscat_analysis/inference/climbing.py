@@ -30,24 +30,7 @@ _DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
 def climb(
     field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
 ) -> tuple[Rows, Ground, BoolArray]:
-    """Fit rows and background to the maximum of their likelihood, without a step that lowers it.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        To begin with.
-    rows : Rows
-        Starts.
-    follow_power : bool
-        Whether the power is fitted as well.
-
-    Returns
-    -------
-    rows, ground, converged
-        As from `iscat_analysis.inference.settling.settle`.
-    """
+    """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""
     counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
     damping, best, kept = _DAMPING, -np.inf, (rows, ground)
     for _ in range(_MOST_STEPS):
@@ -81,23 +64,7 @@ def _uphill(
 
 
 def log_likelihood(field: MovingField, ground: Ground, rows: Rows) -> float:
-    """Give the log-likelihood of rows over the background that is most likely under them.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        Its power counts.
-    rows : Rows
-        Particles, which are drawn anew.
-
-    Returns
-    -------
-    float
-        That of the multinomial in each pixel, but for what does not depend on particles; read noise
-        counts as light.
-    """
+    """Give the log-likelihood of rows over the background that is most likely under them."""
     total, power = field.draw(ground, rows, coarse=False), ground.power
 
     def block(first: int) -> FloatArray:

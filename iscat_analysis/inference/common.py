@@ -49,20 +49,7 @@ _MOST_STEPS = 400
 
 @dataclass(frozen=True)
 class CommonAmplitudes:
-    """Amplitudes that are common to the frames of each track.
-
-    Attributes
-    ----------
-    amplitude : ndarray, shape (tracks,)
-        Where the likelihood has its maximum, its bias of order 1/N taken off; NaN where no frame
-        counts.
-    variance : ndarray, shape (tracks,)
-        Its variance, with what the background takes.
-    known : ndarray, shape (tracks,)
-        The same over a background that is known.
-    frames : ndarray, shape (tracks,)
-        How many frames would weigh as much, were they alike: (Σ J_t)²/Σ J_t².
-    """
+    """Amplitudes that are common to the frames of each track."""
 
     amplitude: FloatArray
     variance: FloatArray
@@ -73,22 +60,7 @@ class CommonAmplitudes:
 def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> FloatArray:
     """Say what the background adds to the errors of the rows.
 
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        The background.
-    rows : Rows
-        Particles, at their estimates.
-    judged : Judged
-        Of these rows; the field has fitted nothing since.
-
-    Returns
-    -------
-    ndarray, shape (n, 4, 4)
-        Covariance of (x, y, z, a) of each row besides that over a known background; infinite on the
-        diagonal where nothing is known, 0 where not free.
+    Shapes: result (n, 4, 4).
     """
     index = np.flatnonzero(field.free[:4])
     covariance = np.zeros((len(rows.frame), 4, 4))
@@ -164,17 +136,7 @@ def _orthonormal(images: FloatArray, basis: FloatArray) -> FloatArray:
 def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
     """Give the variances that matrices of information leave.
 
-    Parameters
-    ----------
-    information : ndarray, shape (n, 4, 4)
-        In (x, y, z, a).
-    index : ndarray of int
-        Free parameters.
-
-    Returns
-    -------
-    ndarray, shape (n, 4)
-        NaN where not free, or where a matrix is not positive definite.
+    Shapes: `information` (n, 4, 4), result (n, 4).
     """
     out = np.full(information.shape[:2], np.nan)
     scaled, scale = _scaled(information, index)
@@ -213,26 +175,7 @@ def common_amplitudes(
 ) -> CommonAmplitudes:
     """Fit one amplitude to all frames of each track, with the background that is most likely then.
 
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        Under the rows.
-    rows : Rows
-        Particles, at their estimates.
-    judged : Judged
-        Of these rows; the field has fitted nothing since.
-    counted : ndarray of bool, shape (n,)
-        Rows that count; the others follow with all their parameters.
-
-    Returns
-    -------
-    CommonAmplitudes
-        The mean of generalised least squares over the rows, whose errors hang together through
-        their background.  Their informations are those at the common amplitude: those at the
-        estimates go with the noise of these where a picture is not linear in its amplitude, and
-        the mean would be off.
+    Shapes: `counted` (n,).
     """
     index = np.flatnonzero(field.free[:4])
     tracks = _tracks(rows, judged, index)

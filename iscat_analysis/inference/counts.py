@@ -34,38 +34,7 @@ def counts_likelihood(
 ) -> Likelihood:
     """Likelihood of a region's counts.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Gives the signal.
-    grid : PixelGrid
-        The region's pixels.
-    before_e, after_e : array_like, shape (ny, nx)
-        Photoelectrons summed before and after [e].
-    power_ratio : float
-        Light after over light before.
-    background : float
-        `KNOWN`, `MEAN` or `MEDIAN`: what the background before is.
-    use_conditional : bool
-        Divide the background out exactly; for interferometric images and a background of counts.
-    scale_e : float, optional
-        Dark field: photoelectrons per pixel for unit signal, summed over the frames after.
-    others : ndarray, shape (ny, nx), optional
-        Signal of other particles, which is part of this one's background.
-    read_variance_before_e2, read_variance_after_e2 : array_like
-        Read-noise variance of the sums [e²].
-    masked : ndarray of bool, shape (ny, nx), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    Likelihood
-        Conditional where asked for, Poisson otherwise.
-
-    Raises
-    ------
-    DataError
-        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    Shapes: `before_e, after_e` (ny, nx), `others` (ny, nx), `masked` (ny, nx).
     """
     signal = np.zeros(grid.shape) if others is None else others
     if use_conditional:

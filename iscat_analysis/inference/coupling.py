@@ -18,19 +18,7 @@ from iscat_analysis.records import FloatArray
 
 
 class Coupling:
-    """Some rows and the pixels of their squares.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        Background.
-    slopes : Slopes
-        Of all rows, as judged; the field has fitted nothing since.
-    rows : ndarray of int, shape (n,)
-        Numbers of those that belong together.
-    """
+    """Some rows and the pixels of their squares."""
 
     def __init__(
         self, field: MovingField, ground: Ground, slopes: Slopes, rows: NDArray[np.int64]
@@ -55,10 +43,7 @@ class Coupling:
     def own(self) -> FloatArray:
         """Give what the light takes from each row by itself, G N⁻¹ Gᵀ.
 
-        Returns
-        -------
-        ndarray, shape (n, free, free)
-            Information.
+        Shapes: result (n, free, free).
         """
         free = self._slopes.values.shape[1]
         out = np.zeros((len(self._rows), free, free))
@@ -71,15 +56,7 @@ class Coupling:
     def sent(self, by: FloatArray) -> FloatArray:
         """Give what the light would take up of changes of the rows, N⁻½ Σ Gᵀ by.
 
-        Parameters
-        ----------
-        by : ndarray, shape (n, b, free)
-            Several sets of changes.
-
-        Returns
-        -------
-        ndarray, shape (b, pixels)
-            Images.
+        Shapes: `by` (n, b, free), result (b, pixels).
         """
         out = np.zeros((by.shape[1], *self._weight.shape))
         send(self._slopes, self._rows, self._squares, by, out, np.empty(self._room))
@@ -88,19 +65,8 @@ class Coupling:
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Let rows follow images, and give what they feel and what they send back.
 
-        Parameters
-        ----------
-        covariance : ndarray, shape (n, free, free)
-            Of each row, by which it follows: its inverse information.
-        images : ndarray, shape (b, pixels)
-            Changes of the light.
-
-        Returns
-        -------
-        felt : ndarray, shape (n, b, free)
-            G N⁻½ v.
-        back : ndarray, shape (b, pixels)
-            N⁻½ Σ Gᵀ covariance G N⁻½ v.
+        Shapes: `covariance` (n, free, free), `images` (b, pixels), `felt` (n, b, free), `back` (b,
+        pixels).
         """
         seen = np.multiply(images.reshape(-1, *self._weight.shape), self._sigma, order="C")
         felt = np.zeros((len(self._rows), len(images), covariance.shape[1]))

@@ -14,52 +14,18 @@ from iscat_analysis.records import FloatArray
 
 @dataclass(frozen=True)
 class Exposures:
-    """Counts, and what they stand for.
-
-    Attributes
-    ----------
-    counts : ndarray of uint16 or float32, shape (t, y, x)
-        Counts.
-    gain : float
-        Photoelectrons for each of them [e].
-    offset : float
-        Counts in the dark.
-    """
+    """Counts, and what they stand for."""
 
     counts: Counts
     gain: float = 1.0
     offset: float = 0.0
 
     def electrons(self, *where: slice | int) -> NDArray[np.float32]:
-        """Give the photoelectrons of some frames.
-
-        Parameters
-        ----------
-        where : slice or int
-            Frames, and rows of them; all columns.
-
-        Returns
-        -------
-        ndarray of float32
-            A new array [e].
-        """
+        """Give the photoelectrons of some frames."""
         out = np.asarray(np.subtract(self.counts[where], self.offset, dtype=np.float32))
         out *= np.float32(self.gain)
         return out
 
     def in_electrons(self, sums: Any, of: int) -> FloatArray:
-        """Convert sums of counts.
-
-        Parameters
-        ----------
-        sums : array_like
-            Sums.
-        of : int
-            How many counts each adds up.
-
-        Returns
-        -------
-        ndarray
-            Photoelectrons [e].
-        """
+        """Convert sums of counts."""
         return np.asarray(self.gain * (sums - of * self.offset))

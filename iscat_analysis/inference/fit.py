@@ -68,18 +68,7 @@ _NOTHING_KNOWN = np.zeros((5, 5))  # information where nothing was looked at
 
 
 def window_nm(pixel_nm: float) -> float:
-    """How far x and y may move from the start of a fit.
-
-    Parameters
-    ----------
-    pixel_nm : float
-        Pixel side [nm].
-
-    Returns
-    -------
-    float
-        Distance [nm].
-    """
+    """How far x and y may move from the start of a fit."""
     return max(_WINDOW_NM, 3 * pixel_nm)
 
 
@@ -91,27 +80,7 @@ def search_box(
     *,
     level: bool = False,
 ) -> Box:
-    """Bounds of the search around a start.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Its grid limits x and y.
-    start : Candidate
-        Where the search begins.
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    z_range_nm : (float, float)
-        Bounds of z where it is free [nm].
-    level : bool
-        Also fit a common background level.
-
-    Returns
-    -------
-    Box
-        Where z is free the amplitude keeps one sign: a change of sign is half a fringe.  What is
-        not free has no width, wherever it lies.
-    """
+    """Bounds of the search around a start."""
     return _box_around(likelihood, start_theta(likelihood, start), mode, z_range_nm, level)
 
 
@@ -155,30 +124,7 @@ def fit_particle(
     level: bool,
     correct_bias: bool = True,
 ) -> FitResult:
-    """Fit one particle.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of the particle's region.
-    start : Candidate
-        Where the search begins; in mode ``"localize"`` its mass is the fixed one.
-    mode : str
-        ``"mass"``, ``"localize"``, ``"joint"`` or ``"track"``.
-    z_range_nm : (float, float)
-        Bounds of z where it is free [nm]; elsewhere z is the start's.
-    level : bool
-        Whether a common level of the light is fitted too, as a nuisance: True in windows that
-        slide, False where the power is known from the whole field.
-    correct_bias : bool
-        Take the bias of order 1/N off the estimate.  False leaves the bare maximum, to show what
-        the correction does.
-
-    Returns
-    -------
-    FitResult
-        Estimate, uncertainty, goodness of fit and verdict.
-    """
+    """Fit one particle."""
     begin = start_theta(likelihood, start)
     box = _box_around(likelihood, begin, mode, z_range_nm, level)
     optima, all_followed = _optima(likelihood, begin, box)
@@ -238,20 +184,6 @@ def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
 
     Where the level is a nuisance it is fitted without the particle too: a region that became
     brighter as a whole is no evidence of a particle in it.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    best : Optimum
-        Where it has its maximum.
-    box : Box
-        What was free there, and within which bounds.
-
-    Returns
-    -------
-    float
-        At least 0.
     """
     nothing = 0.0  # log-likelihoods count from no particle and no change of the level
     if box.free[LEVEL]:
@@ -267,17 +199,7 @@ def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
 def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
     """Give a candidate's θ.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Its grid and mass scale are used.
-    start : Candidate
-        The candidate.
-
-    Returns
-    -------
-    ndarray, shape (5,)
-        θ.
+    Shapes: result (5,).
     """
     pixel = likelihood.grid.pixel_nm
     amplitude = likelihood.model.scale.amplitude(start.mass_kda)

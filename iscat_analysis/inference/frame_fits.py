@@ -25,19 +25,7 @@ IntArray = NDArray[np.int64]
 def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
     """Make room for the kernels of rows.
 
-    Parameters
-    ----------
-    field : Field
-        Sides of squares.
-    near : Pictures
-        What is fitted.
-    free : ndarray of bool, shape (5,)
-        Free parameters.
-
-    Returns
-    -------
-    Room
-        For one thread.
+    Shapes: `free` (5,).
     """
     index, area = np.flatnonzero(free[:4]), field.side**2
     return Room(
@@ -63,22 +51,7 @@ def draw_rows(
 ) -> None:  # fmt: skip
     """Bring frames first…last − 1 of the canvas to the rows as they are.
 
-    Parameters
-    ----------
-    field : Field
-        The pixels.
-    near, far : Pictures
-        Of the fitted squares, and of what is drawn around them.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    first, last : int
-        Frames.
-    theta : ndarray, shape (rows, 5)
-        The rows.
-    group : ndarray of int, shape (rows,)
-        Number of each row's picture.
-    canvas : Canvas
-        Drawn on.
+    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,).
     """
     draw_frames(
         field, near, far, starts, first, last, theta, group, canvas, _profile(near, 1),
@@ -94,28 +67,7 @@ def fit_rows(
 ) -> None:  # fmt: skip
     """Fit the rows of frames first…last − 1, each `sweeps` times.
 
-    Parameters
-    ----------
-    light : Light
-        The movie.
-    field, near, search : Field, Pictures, Search
-        Pixels, pictures to fit, and what is fitted.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    first, last : int
-        Frames.
-    sweeps : int
-        How often; 0 sums only.
-    theta : ndarray, shape (rows, 5)
-        Starts; overwritten with the estimates.
-    group : ndarray of int, shape (rows,)
-        Number of each row's picture.
-    canvas : Canvas
-        On which `draw_rows` has drawn the starts.
-    slopes : Slopes
-        As in `iscat_analysis._kernels.moving.fit_frames`.
-    outcome, information, gain, expected, sums : ndarray
-        As there.
+    Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,).
     """
     place = np.array([first, 0, starts[first], 0, 0, 0, 0])
     room = room_for(field, near, search.free)

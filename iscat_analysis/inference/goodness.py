@@ -56,28 +56,11 @@ def goodness_of_fit(
 ) -> tuple[float, float]:
     """Judge one fit.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    theta : ndarray, shape (5,)
-        The estimate.
-    free : ndarray of bool, shape (5,)
-        Which parameters were fitted.
-    derivatives : ndarray, shape (ny, ROWS, nx), optional
-        Of the signal at θ, where they are known already.
-
-    Returns
-    -------
-    chi2_reduced : float
-        χ² over its degrees of freedom; NaN without any.
-    p_value : float
-        Probability that good data look worse in any of the three tests; NaN without degrees of
-        freedom.
-
     Notes
     -----
     Z. Šidák, J. Am. Stat. Assoc. 62, 626 (1967).
+
+    Shapes: `theta` (5,), `free` (5,), `derivatives` (ny, ROWS, nx).
     """
     chi2, p_values = three_tests(likelihood, theta, free, derivatives)
     if math.isnan(p_values[0]):
@@ -93,32 +76,14 @@ def three_tests(
 ) -> tuple[float, tuple[float, float, float]]:
     """Test one fit for the scatter of its residuals, for structure in them, and for outliers.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        As in `goodness_of_fit`.
-    theta : ndarray, shape (5,)
-        As in `goodness_of_fit`.
-    free : ndarray of bool, shape (5,)
-        As in `goodness_of_fit`.
-    derivatives : ndarray, shape (ny, ROWS, nx), optional
-        As in `goodness_of_fit`.
-
-    Returns
-    -------
-    chi2_reduced : float
-        χ² over its degrees of freedom; NaN without any.
-    p_values : (float, float, float)
-        Of Pearson's χ², two-sided; of smooth changes of the image around the particle; of the least
-        likely pixel among as many as there are.  Each is uniform on good data; all are NaN without
-        degrees of freedom.
-
     Notes
     -----
     The squared residual of a count of excess kurtosis κ has variance 2 + κ; χ² follows a gamma law
     with that variance.  A smooth mode B multiplies the expected counts by 1 + ε B.  Its score, made
     independent of the fitted directions, is compared with its information (C. R. Rao, Proc. Camb.
     Phil. Soc. 44, 50, 1948).
+
+    Shapes: `theta` (5,), `free` (5,), `derivatives` (ny, ROWS, nx).
     """
     rows = likelihood.derivatives(theta) if derivatives is None else derivatives
     free = np.asarray(free, dtype=np.bool_)

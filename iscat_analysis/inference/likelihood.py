@@ -50,21 +50,7 @@ LARGEST_LEVEL = 50.0
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where a maximisation ended.
-
-    Attributes
-    ----------
-    theta : ndarray, shape (5,)
-        Estimate.
-    log_likelihood : float
-        There.
-    passes : int
-        Passes over the data.
-    converged : bool
-        Whether the remaining step is negligible.
-    fisher : ndarray, shape (5, 5)
-        Expected information one step before.
-    """
+    """Where a maximisation ended."""
 
     theta: FloatArray
     log_likelihood: float
@@ -75,24 +61,7 @@ class Optimum:
 
 @dataclass(frozen=True)
 class Likelihood:
-    """One region's counts under one noise model; build it with the functions of this module.
-
-    Attributes
-    ----------
-    model : ForwardModel
-        Gives the signal.
-    grid : PixelGrid
-        The region's pixels.
-    kind : int
-        CONDITIONAL or POISSON.
-    data : ndarray, shape (4, ny, nx)
-        Per-pixel constants; see `iscat_analysis._kernels.scoring`.  A masked pixel holds zeros.
-
-    Raises
-    ------
-    DataError
-        The constants are not finite numbers, one set for each pixel of the grid.
-    """
+    """One region's counts under one noise model; build it with the functions of this module."""
 
     model: ForwardModel
     grid: PixelGrid
@@ -130,20 +99,7 @@ class Likelihood:
     def values(self, thetas: FloatArray) -> FloatArray:
         """Log-likelihood at many parameter vectors.
 
-        Parameters
-        ----------
-        thetas : ndarray, shape (n, 5)
-            Parameters.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            Relative to no particle; −∞ outside the support.
-
-        Raises
-        ------
-        DataError
-            The array has another shape or does not hold real numbers.
+        Shapes: `thetas` (n, 5), result (n,).
         """
         points = vector_of("thetas", thetas, (-1, 5))
         inside = self.supports(points)
@@ -162,16 +118,7 @@ class Likelihood:
     def supports(self, thetas: FloatArray) -> BoolArray:
         """Tell where the model is known.
 
-        Parameters
-        ----------
-        thetas : ndarray, shape (n, 5)
-            Parameters.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-            False for heights outside the model's `z_range_nm`, for places with a pixel of the grid
-            beyond its `reach_nm`, and for values that are not finite.
+        Shapes: `thetas` (n, 5), result (n,).
         """
         inside: BoolArray = supported(thetas, *self._support)
         return inside
@@ -179,24 +126,7 @@ class Likelihood:
     def score_fisher(self, theta: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         """Log-likelihood, its gradient and the expected information.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (5,)
-            Parameters.
-
-        Returns
-        -------
-        value : float
-            Log-likelihood; −∞ outside the support.
-        score : ndarray, shape (5,)
-            Gradient; NaN outside the support.
-        fisher : ndarray, shape (5, 5)
-            Fisher information (physics.md, section 4); NaN outside the support.
-
-        Raises
-        ------
-        DataError
-            θ has another shape or does not hold real numbers.
+        Shapes: `theta` (5,), `score` (5,), `fisher` (5, 5).
         """
         point = vector_of("theta", theta, (5,))
         if not self.supports(point[None])[0]:
@@ -219,32 +149,7 @@ class Likelihood:
     ) -> Optimum:
         """Maximise by damped Fisher scoring inside a box.
 
-        Parameters
-        ----------
-        start, lower, upper : ndarray, shape (5,)
-            Start and box.
-        free : ndarray of bool, shape (5,)
-            Which parameters move.
-        tolerance : float
-            Expected gain in log-likelihood of the last step taken; 2e-4 is a step of 0.02 standard
-            deviations, after which less than 0.005 remain.
-        passes : int
-            Passes over the data at most.
-        least : float
-            Log-likelihood below which the maximum is of no interest; a search that cannot reach it
-            ends early, unconverged.
-
-        Returns
-        -------
-        Optimum
-            The estimate.
-
-        Raises
-        ------
-        DataError
-            An array has another shape or does not hold real numbers.
-        ConfigError
-            The start lies outside the box, or the box or the start outside the support.
+        Shapes: `start, lower, upper` (5,), `free` (5,).
         """
         theta = vector_of("start", start, (5,)).copy()
         lower, upper = vector_of("lower", lower, (5,)), vector_of("upper", upper, (5,))
@@ -273,24 +178,7 @@ class Likelihood:
     ) -> tuple[FloatArray, FloatArray]:
         """Log-likelihood along z at fixed x, y, with the amplitude refitted at each height.
 
-        Parameters
-        ----------
-        heights : ndarray, shape (n,)
-            Heights [nm].
-        theta : ndarray, shape (5,)
-            The other parameters, and the amplitude to start from.
-        amplitude_range : (float, float) or None
-            Bounds of the amplitude; None holds it fixed.
-
-        Returns
-        -------
-        values, amplitudes : ndarray, shape (n,)
-            Log-likelihood and amplitude at each height; −∞ and NaN outside the support.
-
-        Raises
-        ------
-        DataError
-            An array has another shape or does not hold real numbers.
+        Shapes: `heights` (n,), `theta` (5,), `values, amplitudes` (n,).
         """
         heights, point = vector_of("heights", heights, (-1,)), vector_of("theta", theta, (5,))
         points = np.empty((heights.size, 5))
@@ -313,23 +201,7 @@ class Likelihood:
     def derivatives(self, theta: FloatArray, free: BoolArray | None = None) -> FloatArray:
         """Signal and its first and second derivatives.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (5,)
-            Parameters, in the support.
-        free : ndarray of bool, shape (5,), optional
-            What was fitted, where that is what they are for: those in z then may be 0 if it was
-            not, and if it was the profile at z is interpolated.
-
-        Returns
-        -------
-        ndarray, shape (ny, ROWS, nx)
-            See `iscat_analysis._kernels.hessian.signal_hessian`.
-
-        Raises
-        ------
-        ConfigError
-            θ lies outside the support.
+        Shapes: `theta` (5,), `free` (5,), result (ny, ROWS, nx).
         """
         height = "exact" if free is None else "between" if free[2] else "fixed"
         return self.model.derivative_rows(self.grid, self._supported(theta), height)
@@ -337,20 +209,7 @@ class Likelihood:
     def observed_information(self, theta: FloatArray) -> FloatArray:
         """Negative Hessian of the log-likelihood.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (5,)
-            Parameters.
-
-        Returns
-        -------
-        ndarray, shape (5, 5)
-            Observed information.
-
-        Raises
-        ------
-        ConfigError
-            θ lies outside the support.
+        Shapes: `theta` (5,), result (5, 5).
         """
         rows, info = self.derivatives(theta), np.empty((5, 5))
         observed_information(self.kind, self.data, math.exp(theta[LEVEL]), rows, info)
@@ -359,20 +218,7 @@ class Likelihood:
     def residuals(self, theta: FloatArray) -> FloatArray:
         """Give data minus model in standard deviations.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (5,)
-            Parameters.
-
-        Returns
-        -------
-        ndarray, shape (ny, nx)
-            Pearson residuals, NaN where masked.
-
-        Raises
-        ------
-        ConfigError
-            θ lies outside the support.
+        Shapes: `theta` (5,), result (ny, nx).
         """
         s = self.signal(theta)
         level = np.exp(theta[LEVEL])
@@ -403,15 +249,7 @@ class Likelihood:
     def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
         """Fisher information of each pixel about its own signal.
 
-        Parameters
-        ----------
-        signal : ndarray, shape (ny, nx), optional
-            Where it is evaluated; without it, at no particle.
-
-        Returns
-        -------
-        ndarray, shape (ny, nx)
-            Inverse variance of `measured_signal`; 0 where masked.
+        Shapes: `signal` (ny, nx), result (ny, nx).
         """
         s = np.zeros(self.grid.shape) if signal is None else signal
         _, c1, c2, c3 = self.data

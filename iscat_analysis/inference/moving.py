@@ -70,31 +70,7 @@ _BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is s
 
 
 class MovingField:
-    """A movie in memory, and the pictures of what moves in it.
-
-    Parameters
-    ----------
-    exposures : Exposures
-        The frames.
-    read_e2 : ndarray, shape (y, x)
-        Variance of the read noise of a frame [e²].
-    used : ndarray of bool, shape (y, x)
-        Pixels that may be used.
-    near, far : ForwardModel
-        Models of a sharp picture, for the fitted square and for that which is drawn.
-    pixel_nm : float
-        Side of a pixel [nm].
-    roi_px : int
-        Side of the fitted square [pixels].
-    z_range_nm : tuple of float or None
-        Where z is searched; None where it is fixed at the model's height [nm].
-    largest : float
-        Largest amplitude that is searched.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames; the result does not depend on its size.
-    saturated : ndarray of bool, shape (y, x), optional
-        Pixels that were too bright in some frame, which are not used.
-    """
+    """A movie in memory, and the pictures of what moves in it."""
 
     def __init__(
         self,
@@ -191,14 +167,7 @@ class MovingField:
         return len(self.exposures.counts)
 
     def renew(self, block: Callable[[int, int], NDArray[Any]]) -> None:
-        """Put other frames in the place of these.
-
-        Parameters
-        ----------
-        block : callable
-            Takes the first of some frames and that after their last, and gives them as they are
-            stored, shape (t, y, x).
-        """
+        """Put other frames in the place of these."""
 
         def put(first: int) -> None:
             last = min(first + BLOCK, self.frames)
@@ -212,10 +181,7 @@ class MovingField:
     def set_blurs(self, variances_nm2: FloatArray) -> None:
         """Make the pictures that `Rows.group` numbers.
 
-        Parameters
-        ----------
-        variances_nm2 : ndarray, shape (groups,)
-            Variance of a path about its mean [nm²].
+        Shapes: `variances_nm2` (groups,).
         """
         self._pictures = self._book.of(variances_nm2)
         self._canvas = None
@@ -228,25 +194,7 @@ class MovingField:
         Rows that overlap follow one another in the end, but those of smaller squares, some of which
         are only tried.  How all of them follow their background is kept for `where_turns_end`.
 
-        Parameters
-        ----------
-        ground : Ground
-            The light to fit over.
-        rows : Rows
-            Starts.
-        sweeps : int
-            Fits of each row, with the others of its frame in place; 0 leaves them as they are.
-        coarse : bool
-            Fit a smaller square and draw less of the rings.
-
-        Returns
-        -------
-        rows : Rows
-            Estimates.
-        ground : Ground
-            The most likely one under them.
-        converged : ndarray of bool, shape (n,)
-            Which fits did.
+        Shapes: `converged` (n,).
         """
         light = self._light(ground)
         near, far = self._pictures_for(coarse=coarse)
@@ -290,34 +238,14 @@ class MovingField:
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
         """Give the step of the background whose first turn, with the last fit, is `move`.
 
-        Parameters
-        ----------
-        move : ndarray, shape (y, x)
-            Change of the logarithm of the background.
-        damping : float
-            As in `Response.step`.
-
-        Returns
-        -------
-        ndarray, shape (y, x)
-            As from `Response.step`.
+        Shapes: `move` (y, x), result (y, x).
         """
         return self._response.step(move, self.total_e, self.used, damping)
 
     def followed(self, rows: Rows, step: FloatArray) -> Rows:
         """Let the rows of the last fit follow a step of the background, to first order.
 
-        Parameters
-        ----------
-        rows : Rows
-            From `fit`.
-        step : ndarray, shape (y, x)
-            Change of the logarithm of the background.
-
-        Returns
-        -------
-        Rows
-            Where the next fit would find them.
+        Shapes: `step` (y, x).
         """
         search = self._search
         walls = search.lower, search.upper
@@ -331,19 +259,7 @@ class MovingField:
     def draw(self, ground: Ground, rows: Rows, *, coarse: bool = True) -> NDArray[np.float32]:
         """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
 
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles.
-        coarse : bool
-            As in `fit`.
-
-        Returns
-        -------
-        ndarray of float32, shape (t, y, x)
-            Signal of all rows of each frame, until the next fit.
+        Shapes: result (t, y, x).
         """
         self.draw_anew()  # rings that stayed where rows were before are not good enough
         self.fit(ground, rows, sweeps=0, coarse=coarse)
@@ -352,19 +268,7 @@ class MovingField:
     def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
         """Give the counts of some frames minus what is expected.
 
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles.
-        first, last : int
-            Frames.
-
-        Returns
-        -------
-        ndarray of float32, shape (last - first, y, x)
-            Photoelectrons [e]; 0 in pixels that are not used.
+        Shapes: result (last - first, y, x).
         """
         if self._canvas is not None and self._canvas.rows is rows and self._canvas.coarse:
             signal = self._canvas.canvas.total[first:last]
@@ -380,21 +284,7 @@ class MovingField:
     ) -> None:  # fmt: skip
         """Put squares around rows on top of each other, with all rows taken off.
 
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles.
-        which : ndarray of int, shape (n,)
-            The rows.
-        corner : ndarray of int, shape (n, 2)
-            Row and column of the first pixel of each square, which may lie outside the field.
-        owner : ndarray of int, shape (n,)
-            To which of the sums each adds.
-        out : ndarray, shape (m, 3, side, side)
-            Counts minus what is expected, light without particles [e], and variance of the read
-            noise [e²] are added to it; nothing in pixels that are not used.
+        Shapes: `which` (n,), `corner` (n, 2), `owner` (n,), `out` (m, 3, side, side).
         """
         total, light = self.draw(ground, rows), self._light(ground)
 
@@ -416,20 +306,7 @@ class MovingField:
         return canvas.total
 
     def judge(self, ground: Ground, rows: Rows) -> Judged:
-        """Say what the likelihood knows of every row.
-
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            Particles, at their estimates.
-
-        Returns
-        -------
-        Judged
-            Information, bias, goodness of fit.
-        """
+        """Say what the likelihood knows of every row."""
         n = len(rows.frame)
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
@@ -453,18 +330,7 @@ class MovingField:
         return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
 
     def sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
-        """Run blocks of frames and add what they give, in their order.
-
-        Parameters
-        ----------
-        block : callable
-            Takes the first of `BLOCK` frames.
-
-        Returns
-        -------
-        ndarray
-            The sum, in double precision.
-        """
+        """Run blocks of frames and add what they give, in their order."""
         parts = list(self._pool.map(block, range(0, self.frames, BLOCK)))
         total = parts[0].astype(np.float64)
         for part in parts[1:]:
@@ -478,15 +344,7 @@ class MovingField:
     def holds(self, theta: FloatArray) -> BoolArray:
         """Tell which particles are in the field.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (..., 5)
-            Of rows.
-
-        Returns
-        -------
-        ndarray of bool, shape (...)
-            Whether the centre of each lies on a pixel.
+        Shapes: `theta` (..., 5), result (...).
         """
         rows, columns = self.used.shape
         places = theta[..., :2] / self.pixel_nm
@@ -496,21 +354,7 @@ class MovingField:
     def refit(self, ground: Ground, rows: Rows, *, sweeps: int) -> tuple[Rows, BoolArray]:
         """Fit all particles of a few frames, the smaller square of each.
 
-        Parameters
-        ----------
-        ground : Ground
-            Background.
-        rows : Rows
-            All particles of these frames.
-        sweeps : int
-            How often each, with the others in place.
-
-        Returns
-        -------
-        rows : Rows
-            Estimates.
-        converged : ndarray of bool, shape (n,)
-            Which fits did.
+        Shapes: `converged` (n,).
         """
         light = self._light(ground)
         near, far = self._pictures_for(coarse=True)
@@ -538,15 +382,7 @@ class MovingField:
     def on_wall(self, rows: Rows) -> BoolArray:
         """Tell which rows ended on a wall of the search.
 
-        Parameters
-        ----------
-        rows : Rows
-            Particles, at their estimates.
-
-        Returns
-        -------
-        ndarray of bool, shape (n,)
-            Whether a free parameter lies on one.
+        Shapes: result (n,).
         """
         search = self._search
         near = (rows.theta <= search.lower + 1e-6) | (rows.theta >= search.upper - 1e-6)

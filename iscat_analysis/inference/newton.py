@@ -32,25 +32,7 @@ T = TypeVar("T")
 
 
 class Response:
-    """How rows follow the background, those that overlap together.
-
-    Parameters
-    ----------
-    slopes : Slopes
-        Of the last fit.
-    starts : ndarray of int, shape (t + 1,)
-        First row of each frame.
-    light : Light
-        The movie.
-    totals : ndarray of float32, shape (t, y, x)
-        Signal of all rows of each frame.
-    information : ndarray, shape (rows, k, k)
-        On the free parameters of each row alone.
-    pool : ThreadPoolExecutor
-        Runs parts of the clusters; the results do not depend on its size.
-    joint : bool
-        Whether `together` is asked for.
-    """
+    """How rows follow the background, those that overlap together."""
 
     def __init__(
         self,
@@ -103,22 +85,7 @@ class Response:
         move − δ + N⁻¹ Σ Gᵀ F⁻¹ G δ.  It vanishes where M δ = N move; the conjugate gradients that
         solve it see M only by what it does to an image.
 
-        Parameters
-        ----------
-        move : ndarray, shape (y, x)
-            What one turn changes of the logarithm of the background.
-        total : ndarray, shape (y, x)
-            N, photoelectrons of all frames.
-        used : ndarray of bool, shape (y, x)
-            Pixels that may be used.
-        damping : float
-            What is added to M, in units of N: how far a step may go where the rows take up nearly
-            all that the background determines, as those of a particle that hardly moves.
-
-        Returns
-        -------
-        ndarray, shape (y, x)
-            Change of the logarithm of the background.
+        Shapes: `move` (y, x), `total` (y, x), `used` (y, x), result (y, x).
         """
         counts, room = np.where(used, total, 0.0), np.empty_like(self._slopes.units)
 
@@ -158,21 +125,7 @@ class Response:
     ) -> FloatArray:
         """Let rows follow a step of the background, to first order.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (rows, 5)
-            Of the last fit.
-        step : ndarray, shape (y, x)
-            Change of the logarithm of the background.
-        free : ndarray of bool, shape (5,)
-            Fitted parameters.
-        walls : (ndarray, ndarray)
-            Bounds of the parameters, shape (5,) each.
-
-        Returns
-        -------
-        ndarray, shape (rows, 5)
-            Where the next fit would find them.
+        Shapes: `theta` (rows, 5), `step` (y, x), `free` (5,), result (rows, 5).
         """
         steps, nowhere = np.empty_like(self._slopes.units), np.empty((0, 0))
         self._share(
@@ -192,15 +145,7 @@ class Response:
 
         Each was fitted with the others as they were then; those that came after it have moved.
 
-        Parameters
-        ----------
-        theta, free, walls
-            As in `followed`.
-
-        Returns
-        -------
-        ndarray, shape (rows, 5)
-            Where fits of all of them together would end.
+        Shapes: result (rows, 5).
         """
         out, index = theta.copy(), np.flatnonzero(free[:4])
         count = np.diff(self._clusters.edges)

@@ -45,31 +45,7 @@ def conditional(
 ) -> Likelihood:
     """Binomial likelihood of counts before and after landing.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Gives the contrast.
-    grid : PixelGrid
-        The pixels.
-    before_e, after_e : ndarray, shape (ny, nx)
-        Photoelectrons summed before and after.
-    power_ratio : ndarray or float
-        ρ; as an array it may carry the contrast of neighbouring particles as a factor 1 + C.
-    read_variance_before_e2, read_variance_after_e2 : ndarray or float
-        Read-noise variance of the sums [e²]; it lowers each pixel's weight by the share it takes
-        of the variance of d − np.
-    masked : ndarray of bool, shape (ny, nx), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    Likelihood
-        Of kind CONDITIONAL.
-
-    Raises
-    ------
-    DataError
-        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    Shapes: `before_e, after_e` (ny, nx), `masked` (ny, nx).
     """
     masked = mask_of("masked", masked, grid.shape)
     before = pixels_of("before_e", before_e, grid.shape, masked)
@@ -113,33 +89,7 @@ def poisson(
 ) -> Likelihood:
     """Poisson likelihood with expectation background + scale·signal.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Gives the signal.
-    grid : PixelGrid
-        The pixels.
-    counts_e : ndarray, shape (ny, nx)
-        Photoelectrons.
-    background_e : ndarray or float
-        Expected without the particle [e].
-    scale_e : ndarray or float
-        Photoelectrons for unit signal: the background itself in the interferometric schemes, N·s
-        in dark field.
-    extra_variance_e2 : ndarray or float
-        Read noise and the variance of a measured background [e²].
-    masked : ndarray of bool, shape (ny, nx), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    Likelihood
-        Of kind POISSON.
-
-    Raises
-    ------
-    DataError
-        An array does not fit the grid, or an unmasked pixel holds no finite number.
+    Shapes: `counts_e` (ny, nx), `masked` (ny, nx).
     """
     masked = mask_of("masked", masked, grid.shape)
     counts = pixels_of("counts_e", counts_e, grid.shape, masked)
@@ -173,25 +123,7 @@ def asimov_conditional(
 ) -> Likelihood:
     """Conditional likelihood of the expected counts; its Fisher matrix is the bound's.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Gives the contrast.
-    grid : PixelGrid
-        The pixels.
-    theta : ndarray, shape (5,)
-        Truth.
-    background_e : ndarray or float
-        Expected background per frame [e].
-    n_before, n_after : int
-        Frames.
-    read_variance_e2 : ndarray or float
-        Read-noise variance per frame [e²].
-
-    Returns
-    -------
-    Likelihood
-        Of kind CONDITIONAL, with the read-noise weight taken at the truth.
+    Shapes: `theta` (5,).
     """
     signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
     before = np.broadcast_to(n_before * np.asarray(background_e, dtype=float), grid.shape)
@@ -215,21 +147,7 @@ def asimov_poisson(
 ) -> Likelihood:
     """Poisson likelihood of the expected counts; its Fisher matrix is the bound's.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Gives the signal.
-    grid : PixelGrid
-        The pixels.
-    theta : ndarray, shape (5,)
-        Truth.
-    background_e, scale_e, extra_variance_e2 : ndarray or float
-        As in `poisson`, summed over the frames.
-
-    Returns
-    -------
-    Likelihood
-        Of kind POISSON.
+    Shapes: `theta` (5,).
     """
     signal = model.amplitude_image(grid, *(float(value) for value in theta[:4]))
     counts = background_e + scale_e * signal
@@ -237,20 +155,7 @@ def asimov_poisson(
 
 
 def parts_of(free: Collection[str], *, posteriors: bool) -> tuple[str, ...]:
-    """Name the kernels that some fits need and others do not.
-
-    Parameters
-    ----------
-    free : collection of str
-        What is fitted, of `iscat_analysis.records.PARAMETERS`.
-    posteriors : bool
-        Whether posteriors are sampled.
-
-    Returns
-    -------
-    tuple of str
-        Some of ``"heights"``, ``"posteriors"``.
-    """
+    """Name the kernels that some fits need and others do not."""
     needed = {"heights": "z_nm" in free, "posteriors": posteriors}
     return tuple(part for part, is_needed in needed.items() if is_needed)
 
@@ -258,17 +163,7 @@ def parts_of(free: Collection[str], *, posteriors: bool) -> tuple[str, ...]:
 def compile_kernels(
     model: ForwardModel, parts: Collection[str], *, backwards: bool = False
 ) -> None:
-    """Run the kernels of fits once on a few pixels, so that later calls find them compiled.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Any.
-    parts : collection of str
-        As from `parts_of`; others are left out.
-    backwards : bool
-        In the other order: two processes that begin at the two ends take half of it off each other.
-    """
+    """Run the kernels of fits once on a few pixels, so that later calls find them compiled."""
     grid = PixelGrid.region((0, 3), (0, 3), 10.0)
     counts = np.full(grid.shape, 100.0)
     likelihood = poisson(model, grid, counts, counts, counts)

@@ -16,19 +16,7 @@ from iscat_analysis.records import FloatArray
 
 
 class PictureBook:
-    """Makes the pictures of particles with any blur.
-
-    Parameters
-    ----------
-    near, far : ForwardModel
-        Models of a sharp picture, for the fitted square and for that which is drawn.
-    pixel_nm : float
-        Side of a pixel [nm].
-    near_px, far_px : float
-        How far from a particle its picture is fitted and drawn at a fixed height [pixels].
-    z_range_nm : tuple of float or None
-        Range of the tables along z; None for the model's height alone [nm].
-    """
+    """Makes the pictures of particles with any blur."""
 
     def __init__(
         self,
@@ -47,15 +35,7 @@ class PictureBook:
     def of(self, variances_nm2: FloatArray) -> tuple[Pictures, Pictures]:
         """Make the pictures of some blurs.
 
-        Parameters
-        ----------
-        variances_nm2 : ndarray, shape (groups,)
-            Variance of a path about its mean [nm²].
-
-        Returns
-        -------
-        near, far : Pictures
-            To fit, and to draw.
+        Shapes: `variances_nm2` (groups,).
         """
         if self._z_range is not None:
             return (

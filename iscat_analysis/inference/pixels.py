@@ -22,23 +22,8 @@ def pixel_terms(
     Each pixel's law has one natural coordinate η: the logarithm of the odds of a count to come
     after the step (CONDITIONAL), or the expected counts (POISSON).
 
-    Parameters
-    ----------
-    kind : int
-        CONDITIONAL or POISSON.
-    data : ndarray, shape (4, ny, nx)
-        As in `Likelihood.data`; zeros where masked.
-    signal : ndarray, shape (ny, nx)
-        Contrast.
-    level : float
-        Logarithm of the background level.
-
-    Returns
-    -------
-    value : float
-        Log-likelihood relative to no particle.
-    score, information, by_signal, by_level : ndarray, shape (ny, nx)
-        Derivative with respect to η and its expected information; ∂η/∂signal and ∂η/∂level.
+    Shapes: `data` (4, ny, nx), `signal` (ny, nx), `score, information, by_signal, by_level` (ny,
+    nx).
     """
     c0, c1, c2, c3 = data
     bright, nothing = 1 + signal, np.zeros(signal.shape)

@@ -48,35 +48,7 @@ def sample_posterior(
     prior: Prior | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> PosteriorResult:
-    """Sample the posterior of a fitted particle.
-
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    fit : FitResult
-        Its maximum, box and covariance.
-    walkers : int
-        Members of the ensemble.
-    steps : int
-        Steps of each, burn-in included; up to `EXTENSIONS` times as many where the chain asks.
-    seed : int
-        Same seed, same samples.
-    prior : Prior, optional
-        Normal distributions of free parameters; flat without.
-    stopped : callable
-        Asked at every step whether to give up; a chain in another thread hears no Ctrl-C.
-
-    Returns
-    -------
-    PosteriorResult
-        Samples in nm and kDa, diagnostics and verdict.
-
-    Raises
-    ------
-    concurrent.futures.CancelledError
-        It was stopped.
-    """
+    """Sample the posterior of a fitted particle."""
     import emcee  # takes a third of a second, and only chains need it
 
     index = np.flatnonzero(fit.box.free)

@@ -30,40 +30,14 @@ def precision(
 ) -> tuple[bool, FloatArray, FloatArray, FloatArray]:
     """Errors and bias of a maximum of the likelihood.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    theta : ndarray, shape (5,)
-        Where it has its maximum.
-    fisher : ndarray, shape (5, 5)
-        Expected information there or nearby, which gives the observed one its scale.
-    free : ndarray of bool, shape (5,)
-        What was fitted.
-    derivatives : ndarray, shape (ny, ROWS, nx)
-        Of the signal at θ, from `Likelihood.derivatives`.
-    walls : ndarray of bool, shape (5,), optional
-        What of it lies on a wall and has no bias.
-    slope : float
-        Units of the amplitude's error for one of the amplitude.
-
-    Returns
-    -------
-    known : bool
-        Whether the observed information is positive; where it is not, all that follows is NaN.
-    sigma : ndarray, shape (4,)
-        Standard deviations of x, y, z and the amplitude; NaN where not free.
-    covariance : ndarray, shape (n, n)
-        Of the n free ones among these.
-    bias : ndarray, shape (5,)
-        Expected estimate minus truth, to order 1/N, in units of θ; 0 where not free, NaN where the
-        Fisher information is singular.
-
     Notes
     -----
     For counts of an exponential family with natural parameter η(θ) and variance V(η), the bias is
     −½ F⁻¹ Σ ∂η [V′ tr(F⁻¹ ∂η ∂ηᵀ) + V tr(F⁻¹ ∂²η)], the sum over pixels: D. R. Cox and E. J. Snell,
     J. R. Stat. Soc. B 30, 248 (1968), in the form of M. J. Box, ibid. 33, 171 (1971).
+
+    Shapes: `theta` (5,), `fisher` (5, 5), `free` (5,), `derivatives` (ny, ROWS, nx), `walls` (5,),
+    `sigma` (4,), `covariance` (n, n), `bias` (5,).
     """
     n = int(np.count_nonzero(free[:4]))
     sigma, covariance, bias = np.empty(4), np.empty((n, n)), np.empty(5)

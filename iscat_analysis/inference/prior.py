@@ -29,30 +29,14 @@ _MASS = PARAMETERS.index("mass_kda")
 
 @dataclass(frozen=True)
 class Prior:
-    """Independent normal distributions of some parameters; flat in the others.
-
-    Attributes
-    ----------
-    normal : mapping of str to (float, float)
-        Name as in `PARAMETERS` → mean and standard deviation [nm, kDa].
-    """
+    """Independent normal distributions of some parameters; flat in the others."""
 
     normal: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def log_density(self, thetas: FloatArray, scale: MassScale) -> FloatArray:
         """Logarithm of the density, up to a constant.
 
-        Parameters
-        ----------
-        thetas : ndarray, shape (n, 5)
-            x, y, z [nm], amplitude, level.
-        scale : MassScale
-            Mass ↔ amplitude.
-
-        Returns
-        -------
-        ndarray, shape (n,)
-            For a density per unit of amplitude, as the sampler needs it.
+        Shapes: `thetas` (n, 5), result (n,).
         """
         total = np.zeros(len(thetas))
         for name, (mean, width) in self.normal.items():
@@ -65,18 +49,7 @@ class Prior:
         return total
 
     def steps(self, scale: MassScale) -> dict[int, tuple[float, float]]:
-        """Give mean and standard deviation in θ: of the amplitude in place of the mass.
-
-        Parameters
-        ----------
-        scale : MassScale
-            Mass ↔ amplitude.
-
-        Returns
-        -------
-        dict of int to (float, float)
-            By index in θ.
-        """
+        """Give mean and standard deviation in θ: of the amplitude in place of the mass."""
         found = {}
         for name, (mean, width) in self.normal.items():
             index = PARAMETERS.index(name)
@@ -90,26 +63,11 @@ class Prior:
 def van_trees(information: FloatArray, prior: FloatArray) -> FloatArray:
     """Bound on the error of any estimator, biased ones too, when there is prior knowledge.
 
-    Parameters
-    ----------
-    information : ndarray, shape (k, k)
-        Fisher information of the data, averaged over the prior.
-    prior : ndarray, shape (k, k)
-        Information of the prior, the mean of −∂² ln π; the inverse covariance of a normal one.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Root-mean-square error at least.
-
-    Raises
-    ------
-    ConfigError
-        Data and prior together leave a direction undetermined.
-
     Notes
     -----
     H. L. Van Trees, *Detection, Estimation, and Modulation Theory* I (1968), section 2.4.
+
+    Shapes: `information` (k, k), `prior` (k, k), result (k,).
     """
     total = np.asarray(information, dtype=float) + np.asarray(prior, dtype=float)
     values, vectors = np.linalg.eigh(total)
@@ -124,26 +82,7 @@ def posterior_bound(
 ) -> FloatArray:
     """Van Trees bound of one particle whose mass or height has a normal prior.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of its frames.
-    theta : ndarray, shape (5,)
-        Where the parameters without a prior are taken.
-    index : ndarray of int, shape (k,)
-        Free parameters in θ.
-    prior : Prior
-        Of some of them.
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        Root-mean-square error at least, over particles of that prior [nm, kDa; level as in θ].
-
-    Raises
-    ------
-    ConfigError
-        Data and prior together leave a direction undetermined.
+    Shapes: `theta` (5,), `index` (k,), result (k,).
     """
     scale = likelihood.model.scale
     normal = {k: v for k, v in prior.steps(scale).items() if k in index}

@@ -32,17 +32,7 @@ LOWEST = 2.0
 def extent(roughness: FloatArray, size: float) -> float:
     """Measure an area or a volume by the gradient of the field in it.
 
-    Parameters
-    ----------
-    roughness : ndarray, shape (n, n)
-        Covariance of the gradient of the field, of unit variance [nm⁻²].
-    size : float
-        Area or volume [nmⁿ].
-
-    Returns
-    -------
-    float
-        √det Λ times `size`.
+    Shapes: `roughness` (n, n).
     """
     return size * math.sqrt(max(float(np.linalg.det(roughness)), 0.0))
 
@@ -51,21 +41,6 @@ def expected_maxima(
     u: float, area: float, volume: float = 0.0, *, correlation: float = 0.0
 ) -> float:
     """Count the maxima of noise above a level.
-
-    Parameters
-    ----------
-    u : float
-        The level.
-    area, volume : float
-        From `extent`; the volume where the height above the coverslip is searched too.
-    correlation : float
-        Of the noise of this search with that of the next one, where what exceeds the level in both
-        counts once.
-
-    Returns
-    -------
-    float
-        Expected number.
 
     Notes
     -----
@@ -91,20 +66,6 @@ def companions(u: float, ring: FloatArray, cell: float) -> float:
     Where the field is correlated by r < 0 with that at a maximum of height v = u + 1/u, its mean is
     −|r| v, and it passes −u more often there.  Once the maximum is fitted and taken off, it does
     no more.
-
-    Parameters
-    ----------
-    u : float
-        The level.
-    ring : ndarray
-        Correlation of the field with itself, at every distance in a grid.
-    cell : float
-        `extent` of one cell of that grid.
-
-    Returns
-    -------
-    float
-        Expected number for each maximum above the level.
     """
     near = ring[ring < 0]
     spread = np.sqrt(1 - near**2)
@@ -119,20 +80,7 @@ def companions(u: float, ring: FloatArray, cell: float) -> float:
 
 @dataclass(frozen=True)
 class Excursions:
-    """How often noise exceeds a level in one search.
-
-    Attributes
-    ----------
-    area, volume : float
-        From `extent`.
-    correlation : float
-        As in `expected_maxima`.
-    ring : ndarray or None
-        As in `companions`, where maxima of both signs count and the higher of two is taken off
-        before the other is looked at.
-    cell : float
-        As in `companions`.
-    """
+    """How often noise exceeds a level in one search."""
 
     area: float
     volume: float = 0.0
@@ -173,22 +121,5 @@ def height_reached(
     correlation: float = 0.0,
     lowest: float = LOWEST,
 ) -> float:
-    """Find the level above which noise has a given expected number of maxima.
-
-    Parameters
-    ----------
-    alarms : float
-        That number.
-    area, volume : float
-        From `extent`.
-    correlation : float
-        As in `expected_maxima`.
-    lowest : float
-        The answer where noise has fewer maxima even there.
-
-    Returns
-    -------
-    float
-        The level, not below `lowest`.
-    """
+    """Find the level above which noise has a given expected number of maxima."""
     return Excursions(area, volume, correlation).level(alarms, lowest=lowest)

@@ -22,18 +22,7 @@ AWAY = 3.0
 def reaches_far(likelihood: Likelihood, sigma: FloatArray) -> bool:
     """Whether places are so uncertain that the curvature may not tell their errors.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    sigma : ndarray, shape (4,)
-        Errors by its curvature; NaN where not free.
-
-    Returns
-    -------
-    bool
-        True where `AWAY` errors of x, y or z are more than a quarter of λ/(2 n), the finest period
-        of a picture.
+    Shapes: `sigma` (4,).
     """
     quarter = likelihood.model.fringe_nm / 4
     return any(AWAY * error > quarter for error in sigma[:3].tolist())
@@ -48,25 +37,7 @@ def reach(
     place is moved to either side, while the other parameters follow it as they are correlated with
     it; the larger of the errors of both sides counts, and that of the curvature where it is larger.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    best : Optimum
-        Where it has its maximum.
-    box : Box
-        Where it was searched.
-    sigma : ndarray, shape (4,)
-        Errors by the curvature; NaN where not free.
-    steps : ndarray, shape (n, 5)
-        Change of θ with one error of each of the n places that are free.
-
-    Returns
-    -------
-    sigma : ndarray, shape (4,)
-        At least the errors that were given.
-    higher : ndarray of shape (5,), or None
-        θ of one of those places where the likelihood is above that of `best`.
+    Shapes: `sigma` (4,), `steps` (n, 5), `higher` (5,).
     """
     away = AWAY * np.concatenate([-steps, steps])
     around = np.minimum(np.maximum(best.theta + away, box.lower), box.upper)

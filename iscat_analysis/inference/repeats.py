@@ -33,15 +33,7 @@ LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 7
 
 @dataclass(frozen=True)
 class Response:
-    """What one photoelectron more in a pixel does to the estimates.
-
-    Attributes
-    ----------
-    before, after : ndarray, shape (n, ny, nx)
-        Of the counts before and after, for each free parameter of the particle, in the units of θ.
-    variance : ndarray, shape (n,)
-        Cramér–Rao bound of each, squared.
-    """
+    """What one photoelectron more in a pixel does to the estimates."""
 
     before: FloatArray
     after: FloatArray
@@ -50,19 +42,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Series:
-    """Errors that single frames of one window contribute to the estimates.
-
-    Attributes
-    ----------
-    values : ndarray, shape (n, t)
-        Photoelectrons weighted with the response.
-    power : ndarray, shape (t,)
-        Light of each frame, relative.
-    shot : ndarray, shape (n,)
-        Variance of `values` that the model expects per unit of power.
-    read : ndarray, shape (n,)
-        The same of read noise, per frame.
-    """
+    """Errors that single frames of one window contribute to the estimates."""
 
     values: FloatArray
     power: FloatArray
@@ -79,27 +59,11 @@ def response_of(
 ) -> Response | None:
     """Linearise an estimate in the counts it was made of.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    theta : ndarray, shape (5,)
-        Where it has its maximum.
-    free : ndarray of bool, shape (5,)
-        What was fitted.
-    before_e : ndarray, shape (ny, nx)
-        Photoelectrons before, which the likelihood knows as a background [e].
-    power_ratio : float
-        Light after over light before.
-
-    Returns
-    -------
-    Response or None
-        None where the information is singular.
-
     Notes
     -----
     θ̂ − θ = F⁻¹ Σ ∂η (counts − expected), to first order: the score is linear in the counts.
+
+    Shapes: `theta` (5,), `free` (5,), `before_e` (ny, nx).
     """
     x, y, z, amplitude, _ = (float(value) for value in theta)
     signal, first = likelihood.model.amplitude_gradient(likelihood.grid, x, y, z, amplitude)
@@ -150,25 +114,8 @@ def series_of(
 ) -> Series:
     """Weigh the counts of every frame with a response.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, ny, nx)
-        Stored counts.
-    weights : ndarray, shape (n, ny, nx)
-        `Response.before` or `Response.after`.
-    power : ndarray, shape (t,)
-        Light of each frame, relative; 0 for frames that are left out.
-    gain, offset : float or ndarray, shape (ny, nx)
-        Of the camera [e per count, counts].
-    mean_e : ndarray, shape (ny, nx)
-        Expected photoelectrons per unit of power [e].
-    read_variance_e2 : ndarray, shape (ny, nx)
-        Read noise of one frame [e²].
-
-    Returns
-    -------
-    Series
-        Of the frames that are used.
+    Shapes: `counts` (t, ny, nx), `weights` (n, ny, nx), `power` (t,), `gain, offset` (ny, nx),
+    `mean_e` (ny, nx), `read_variance_e2` (ny, nx).
     """
     lit = power > 0
     flat = weights.reshape(len(weights), -1)
@@ -186,16 +133,7 @@ def series_of(
 def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
     """Gather what the windows of one event say of the spread of its estimates.
 
-    Parameters
-    ----------
-    windows : tuple of Series
-        Before and after; one alone where the background is known.
-
-    Returns
-    -------
-    ndarray, shape (1 + len(LENGTHS), n + 1)
-        Squares over what the model expects, and in the last column how many: between `PARTS` parts,
-        then between neighbouring averages of `LENGTHS` frames.
+    Shapes: result (1 + len(LENGTHS).
     """
     out = np.zeros((1 + len(LENGTHS), len(windows[0].values) + 1))
     for series in windows:

@@ -17,23 +17,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Rows:
-    """Particles in frames, in the order of the frames.
-
-    Attributes
-    ----------
-    frame : ndarray of int, shape (n,)
-        Frame, not decreasing.
-    track : ndarray of int, shape (n,)
-        Whose it is; -1 where that is not known yet.
-    theta : ndarray, shape (n, 5)
-        x, y, z [nm], amplitude, 0.
-    group : ndarray of int, shape (n,)
-        Number of the blur.
-    fisher : ndarray, shape (n, 4, 4)
-        Expected information in (x, y, z, a) that the last fit of each found; NaN before the first.
-    snr : ndarray, shape (n,)
-        Signal-to-noise ratio √(2 Δℓ) of that fit, the others of its frame in place.
-    """
+    """Particles in frames, in the order of the frames."""
 
     frame: IntArray
     track: IntArray
@@ -71,18 +55,7 @@ class Rows:
         return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
 
     def recalling(self, old: Rows) -> Rows:
-        """Give rows that are the same in others what these know of their fits.
-
-        Parameters
-        ----------
-        old : Rows
-            In the order of frames and tracks.
-
-        Returns
-        -------
-        Rows
-            Where neither the track nor θ has changed, with their informations.
-        """
+        """Give rows that are the same in others what these know of their fits."""
         many = int(max(self.track.max(initial=0), old.track.max(initial=0))) + 1
         keys, sought = old.frame * many + old.track, self.frame * many + self.track
         where = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
@@ -103,15 +76,7 @@ class Rows:
     def pairs_within(self, limit_nm: float) -> IntArray:
         """Give the pairs of rows of a frame that are no farther apart than a limit.
 
-        Parameters
-        ----------
-        limit_nm : float
-            Distance [nm].
-
-        Returns
-        -------
-        ndarray of int, shape (pairs, 2)
-            Rows, each pair once.
+        Shapes: result (pairs, 2).
         """
         apart = (2 * limit_nm + 1) * self.frame  # no two frames lie within the limit of each other
         places = np.column_stack([self.theta[:, :2], apart])
@@ -121,15 +86,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class Ground:
-    """The light without the particles.
-
-    Attributes
-    ----------
-    level : ndarray, shape (y, x)
-        Photoelectrons in a frame of power 1 [e].
-    power : ndarray, shape (t,)
-        Power of each frame, 1 on average.
-    """
+    """The light without the particles."""
 
     level: FloatArray
     power: FloatArray
@@ -137,32 +94,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Judged:
-    """What the likelihood says of each row.
-
-    Attributes
-    ----------
-    fisher : ndarray, shape (n, 4, 4)
-        Expected information in (x, y, z, a).
-    observed : ndarray, shape (n, 4, 4)
-        Observed information of the free parameters, NaN elsewhere.
-    bias : ndarray, shape (n, 4)
-        Bias of order 1/N of θ, 0 where not free.
-    gain : ndarray, shape (n,)
-        Log-likelihood over that without the particle.
-    chi2 : ndarray, shape (n,)
-        Pearson's.
-    pixels : ndarray, shape (n,)
-        How many.
-    worst : ndarray, shape (n,)
-        Largest residual [standard deviations].
-    level : ndarray, shape (n,)
-        Mean light of the square [e].
-    growth : ndarray, shape (n,)
-        ∂ ln F/∂ ln a of the information F on the amplitude a: near 0 where the picture is linear in
-        it, 2 where it is quadratic.
-    slopes : Slopes
-        What each row changes of the light of its pixels; overwritten by the next fit of the field.
-    """
+    """What the likelihood says of each row."""
 
     fisher: FloatArray
     observed: FloatArray
@@ -189,17 +121,7 @@ class Judged:
     ) -> Judged:
         """Make it of what `iscat_analysis._kernels.judging.judge_frames` fills.
 
-        Parameters
-        ----------
-        fisher, turned, ways, bias, numbers, slopes
-            As there.
-        free : ndarray of bool, shape (4,)
-            Free parameters.
-
-        Returns
-        -------
-        Judged
-            With the observed information and the bias where second derivatives were taken.
+        Shapes: `free` (4,).
         """
         n, index = len(fisher), np.flatnonzero(free)
         part = np.ix_(np.arange(n), index, np.arange(index.size))

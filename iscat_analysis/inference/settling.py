@@ -31,20 +31,7 @@ _POWER_SETTLED = 1e-7
 
 
 def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
-    """Median of frames, each over its power; of a long movie, of some that are spread over it.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    follow_power : bool
-        Whether the power changes from frame to frame.
-
-    Returns
-    -------
-    Ground
-        Wrong where a particle was in more than a fraction of the frames.
-    """
+    """Median of frames, each over its power; of a long movie, of some that are spread over it."""
     power = np.ones(field.frames)
     if follow_power:
         power = field.frame_totals / field.frame_totals.mean()
@@ -70,32 +57,7 @@ def settle(
     turns: int = MOST_TURNS,
     coarse: bool = False,
 ) -> tuple[Rows, Ground, BoolArray]:
-    """Fit rows and background in turn, to the maximum of their likelihood.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        To begin with.
-    rows : Rows
-        Starts.
-    follow_power, follow_level : bool
-        Whether the power and the level are fitted, or stay.
-    turns : int
-        At most.
-    coarse : bool
-        As in `MovingField.fit`.
-
-    Returns
-    -------
-    rows : Rows
-        Estimates.
-    ground : Ground
-        Under them.
-    converged : ndarray of bool
-        Which fits did.
-    """
+    """Fit rows and background in turn, to the maximum of their likelihood."""
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
     settled, foreseen, roughly = _SETTLED, _FORESEEN, _ROUGHLY
     if field.frames < _SHORT:

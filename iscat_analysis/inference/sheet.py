@@ -13,17 +13,7 @@ from iscat_analysis.inference.rows import Rows
 
 @dataclass(frozen=True)
 class Sheet:
-    """A canvas and the rows that are on it.
-
-    Attributes
-    ----------
-    rows : Rows
-        As they were fitted last.
-    canvas : Canvas
-        Of all frames.
-    coarse : bool
-        Whether it holds the smaller squares.
-    """
+    """A canvas and the rows that are on it."""
 
     rows: Rows
     canvas: Canvas
@@ -46,17 +36,7 @@ class Sheet:
 def blank(room: NDArray[np.float32], rows: Rows) -> Canvas:
     """Make a canvas with nothing drawn on it yet.
 
-    Parameters
-    ----------
-    room : ndarray of float32, shape (t, y, x)
-        Where its frames will be; what is there counts for nothing.
-    rows : Rows
-        Particles that will be drawn.
-
-    Returns
-    -------
-    Canvas
-        All of whose frames are to be drawn.
+    Shapes: `room` (t, y, x).
     """
     nothing = np.zeros(len(room), dtype=bool)
     return Canvas(room, np.zeros_like(rows.theta), np.zeros_like(rows.theta), nothing)

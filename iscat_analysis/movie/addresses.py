@@ -16,37 +16,13 @@ _SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
 
 
 def split_address(address: Path) -> tuple[Path, str]:
-    """Tell the file from the part of it.
-
-    Parameters
-    ----------
-    address : Path
-        As the user gives it.
-
-    Returns
-    -------
-    path : Path
-        The file.
-    part : str
-        What is named of it; empty where it is all.
-    """
+    """Tell the file from the part of it."""
     head, mark, part = str(address).partition(MARK)
     return (Path(head), part) if mark and not address.exists() else (address, "")
 
 
 def layout(part: str) -> tuple[int | None, int, int, str] | None:
-    """Read shape and type of plain numbers.
-
-    Parameters
-    ----------
-    part : str
-        ``"frames x rows x columns,type"``, without spaces around x; the frames may be left out.
-
-    Returns
-    -------
-    tuple or None
-        Frames, rows, columns and the name of the type; None where it is something else.
-    """
+    """Read shape and type of plain numbers."""
     match = _SHAPE.fullmatch(part.strip())
     if match is None:
         return None
@@ -55,25 +31,7 @@ def layout(part: str) -> tuple[int | None, int, int, str] | None:
 
 
 def beside(address: Path, suffix: str) -> Path:
-    """Name what is written about a movie, next to it.
-
-    Parameters
-    ----------
-    address : Path
-        Of the movie.
-    suffix : str
-        With its dot.
-
-    Returns
-    -------
-    Path
-        The movie's, with another suffix; the name of a dataset stays in it.
-
-    Raises
-    ------
-    DataError
-        It is the root of all folders, which has no name.
-    """
+    """Name what is written about a movie, next to it."""
     path, part = split_address(address)
     if path.name in ("", ".."):  # the folder one is in, or the one above, has its name elsewhere
         path = path.resolve()

@@ -60,39 +60,7 @@ def measure_windows(
     check: Check = _unchecked,
     progress: Progress = silent,
 ) -> Windows:
-    """Sum the frames before and after landing.
-
-    Parameters
-    ----------
-    stack : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    before : (int, int) or None
-        Half-open range of pre-binding frames; None where the background is known.
-    after : (int, int)
-        Half-open range of frames with the particles.
-    median : bool
-        Take the median of the frames before, scaled to their sum, in place of their sum.
-    level_e : float, optional
-        Known background per pixel and frame [e], where `before` is None.
-    power_normalization : bool
-        Estimate ρ from the data; otherwise it is the ratio of the frame counts.
-    check : callable
-        Called with each block of counts and the number of its first frame; raises `DataError`.
-    progress : Progress
-        Told how many frames are done.
-
-    Returns
-    -------
-    Windows
-        The sums, with ρ estimated robustly against the particles.
-
-    Raises
-    ------
-    DataError
-        The movie is shorter than the ranges ask, or the ranges overlap.
-    """
+    """Sum the frames before and after landing."""
     _check_ranges(stack, before, after)
     n_after = after[1] - after[0]
     total = n_after + (before[1] - before[0] if before else 0)
@@ -133,21 +101,7 @@ def measure_windows(
 def add_frames(windows: Windows, camera: Camera, counts: NDArray[Any], first: int) -> Windows:
     """Replace the frames after landing by others.
 
-    Parameters
-    ----------
-    windows : Windows
-        Keeps its frames before.
-    camera : Camera
-        Counts → photoelectrons.
-    counts : ndarray, shape (t, y, x)
-        The new frames after [counts].
-    first : int
-        Number of the first of them.
-
-    Returns
-    -------
-    Windows
-        With ρ the ratio of the frame counts; see `start_power`.
+    Shapes: `counts` (t, y, x).
     """
     n = len(counts)
     electrons = camera.to_electrons(counts)
@@ -166,38 +120,14 @@ def add_frames(windows: Windows, camera: Camera, counts: NDArray[Any], first: in
 
 
 def start_power(windows: Windows) -> Windows:
-    """Estimate ρ from the pixels that no particle has changed noticeably.
-
-    Parameters
-    ----------
-    windows : Windows
-        The sums.
-
-    Returns
-    -------
-    Windows
-        With ρ from a clipped ratio; `refine_power` improves it once the particles are known.
-    """
+    """Estimate ρ from the pixels that no particle has changed noticeably."""
     return replace(windows, power_ratio=_robust_ratio(windows))
 
 
 def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> Windows:
     """Estimate ρ again with the fitted particles accounted for.
 
-    Parameters
-    ----------
-    windows : Windows
-        The sums.
-    explained : ndarray, shape (y, x)
-        Fitted contrast of all particles; with an additive background, their photoelectrons.
-    additive : bool
-        Whether the particles add to the background (dark field) or multiply it.
-
-    Returns
-    -------
-    Windows
-        With ρ = Σ after / Σ before·(1 + C) over the pixels in use: the maximum-likelihood estimate.
-        Pixels in which particles outshine an additive background say nothing of it.
+    Shapes: `explained` (y, x).
     """
     used = ~windows.masked
     if additive:
@@ -220,23 +150,11 @@ def smooth_background(
     Weights made of a pixel's own fluctuating background favour the pixels that happened to be dark
     before, and those seem to have brightened.
 
-    Parameters
-    ----------
-    before_e : ndarray, shape (y, x)
-        Summed background [e].
-    variance_e2 : ndarray, shape (y, x)
-        Variance of its noise besides its shot noise [e²].
-    masked : ndarray of bool, shape (y, x)
-        Pixels whose counts say nothing.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Local mean, and beside it the structure that exceeds the noise twice, ≥ 0.
-
     Notes
     -----
     The adaptive filter of J. S. Lee, IEEE Trans. Pattern Anal. 2, 165 (1980).
+
+    Shapes: `before_e` (y, x), `variance_e2` (y, x), `masked` (y, x), result (y, x).
     """
     used = (~masked).astype(np.float64)
     share = np.maximum(uniform_filter(used, _NEIGHBOURHOOD, mode="nearest"), 1e-3)
@@ -323,17 +241,7 @@ def _median(
 def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
     """Dead and hot pixels: far from their neighbours' median, and not by noise.
 
-    Parameters
-    ----------
-    before_e : ndarray, shape (y, x)
-        Summed photoelectrons [e].
-    read_variance_e2 : ndarray, shape (y, x)
-        Read-noise variance of the sums [e²].
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        The pixels to leave out.
+    Shapes: `before_e` (y, x), `read_variance_e2` (y, x), result (y, x).
     """
     # a median lies between the lowest and the highest of its neighbours, which are found sooner
     lowest, highest = (

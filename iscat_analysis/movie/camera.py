@@ -35,21 +35,7 @@ _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A calibrated camera; `camera_from_config` makes it.
-
-    Attributes
-    ----------
-    gain_e_per_adu : float or ndarray, shape (y, x)
-        Photoelectrons per count [e/count].
-    offset_adu : float or ndarray, shape (y, x)
-        Counts in the dark [counts].
-    read_noise_e : float or ndarray, shape (y, x)
-        Standard deviation per frame [e].
-    well_depth_e : float or None
-        Full well [e]; None where unknown.
-    full_scale_adu : float or None
-        Largest number the stored type can hold [counts]; None for floats.
-    """
+    """A calibrated camera; `camera_from_config` makes it."""
 
     gain_e_per_adu: float | FloatArray = 1.0
     offset_adu: float | FloatArray = 0.0
@@ -60,15 +46,7 @@ class Camera:
     def to_electrons(self, counts: NDArray[Any]) -> FloatArray:
         """Convert counts to photoelectrons.
 
-        Parameters
-        ----------
-        counts : ndarray, shape (..., y, x)
-            As stored [counts].
-
-        Returns
-        -------
-        ndarray of float64, shape (..., y, x)
-            (counts − offset)·gain [e].
+        Shapes: `counts` (..., y, x), result (..., y, x).
         """
         electrons = np.array(counts, dtype=np.float64)
         electrons -= self.offset_adu
@@ -78,15 +56,7 @@ class Camera:
     def to_counts(self, electrons: NDArray[Any]) -> FloatArray:
         """Convert photoelectrons to counts, the inverse of `to_electrons`.
 
-        Parameters
-        ----------
-        electrons : ndarray, shape (..., y, x)
-            Photoelectrons [e].
-
-        Returns
-        -------
-        ndarray of float64, shape (..., y, x)
-            electrons/gain + offset [counts], not rounded.
+        Shapes: `electrons` (..., y, x), result (..., y, x).
         """
         counts = np.array(electrons, dtype=np.float64)
         counts /= self.gain_e_per_adu
@@ -96,16 +66,7 @@ class Camera:
     def saturated(self, counts: NDArray[Any]) -> BoolArray:
         """Find the pixels that were too bright to be measured.
 
-        Parameters
-        ----------
-        counts : ndarray, shape (..., y, x)
-            As stored [counts].
-
-        Returns
-        -------
-        ndarray of bool, shape (..., y, x)
-            At or above the well depth, at the full scale of the stored type, or at that of a
-            converter of fewer bits, see `converter_ceiling`.
+        Shapes: `counts` (..., y, x), result (..., y, x).
         """
         full: BoolArray = np.zeros(counts.shape, dtype=np.bool_)
         top = counts.max(initial=0)  # which tells what need not be asked of every pixel
@@ -123,41 +84,13 @@ class Camera:
     def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:
         """Variance of the read noise of one frame.
 
-        Parameters
-        ----------
-        shape : (int, int)
-            Rows and columns.
-
-        Returns
-        -------
-        ndarray, shape (y, x)
-            σ_r² [e²].
+        Shapes: result (y, x).
         """
         return np.broadcast_to(np.square(self.read_noise_e, dtype=np.float64), shape).copy()
 
 
 def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
-    """Build the camera that a configuration describes, reading its maps.
-
-    Parameters
-    ----------
-    config : CameraConfig
-        The section ``[camera]``.
-    shape_yx : (int, int)
-        Rows and columns of the movie, which every map must have.
-    dtype : dtype
-        Type of the stored counts; the largest integer it holds is full scale.
-
-    Returns
-    -------
-    Camera
-        With a (y, x) map wherever the configuration names a file.
-
-    Raises
-    ------
-    DataError
-        A map cannot be read, has another shape, or holds values that are impossible.
-    """
+    """Build the camera that a configuration describes, reading its maps."""
     stored = np.dtype(dtype)
     full_scale = float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
     return Camera(
@@ -184,24 +117,7 @@ def _number_or_map(value: float | str, key: str, shape_yx: tuple[int, int]) -> f
 def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
     """Read an image with one number per pixel.
 
-    Parameters
-    ----------
-    path : Path
-        TIFF file.
-    key : str
-        The configuration key that named it, for messages.
-    shape_yx : (int, int)
-        Rows and columns it must have.
-
-    Returns
-    -------
-    ndarray of float64, shape (y, x)
-        Its values, all finite.
-
-    Raises
-    ------
-    DataError
-        It cannot be read, has another shape, or is not finite everywhere.
+    Shapes: result (y, x).
     """
     where = f"{path}: {key}"
     if not path.is_file():
@@ -244,25 +160,7 @@ def check_counts(
     A few pixels below the offset may be dead, and later stages mask them; a camera never counts
     below zero, so there one pixel is proof that the frames are not raw.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        As stored [counts].
-    first_frame : int
-        Number of the first of them in the movie.
-    name : str
-        What the message calls the movie.
-    camera : Camera, optional
-        Gives offset, read noise and saturation; without it, gain 1, offset 0, no read noise and the
-        full scale of the type.
-
-    Raises
-    ------
-    DataError
-        A frame holds NaN or infinity, is zero throughout or saturated throughout, or lies further
-        below the offset than six standard deviations of the read noise: in one pixel if the count
-        itself is negative, otherwise in more than 1 % of the pixels; or the frame is a ratio of
-        frames.
+    Shapes: `counts` (t, y, x).
     """
     if camera is None:
         integer = np.issubdtype(counts.dtype, np.integer)
@@ -321,20 +219,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
     """Refuse a frame that was divided by another: floats around 1, or around 0 as contrasts.
 
-    Parameters
-    ----------
-    frame : ndarray, shape (y, x)
-        As stored [counts].
-    where : str
-        What the message calls the frame.
-    camera : Camera
-        A gain that makes more than a few photoelectrons of a count of 1 says that the counts were
-        only scaled.
-
-    Raises
-    ------
-    DataError
-        It cannot be raw counts.
+    Shapes: `frame` (y, x).
     """
     if not np.issubdtype(frame.dtype, np.floating):
         return
@@ -357,17 +242,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     light does in some pixels of a frame and not in the others.  One that is saturated is at the
     very end of the range, where one that overflowed hardly ever is.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames, as stored [counts].
-    name : str
-        What the message calls the movie.
-
-    Raises
-    ------
-    DataError
-        More than one in ten thousand do.
+    Shapes: `counts` (t, y, x).
     """
     if not np.issubdtype(counts.dtype, np.unsignedinteger) or counts.dtype.itemsize > 2:
         return
@@ -394,19 +269,7 @@ def _lights_up(before: NDArray[Any], after: NDArray[Any]) -> bool:
 
 
 def converter_ceiling(counts: NDArray[Any]) -> float:
-    """Find the full scale of an analogue-to-digital converter of fewer bits than the stored type.
-
-    Parameters
-    ----------
-    counts : ndarray
-        As stored [counts]; whole numbers.
-
-    Returns
-    -------
-    float
-        The largest count, where it is 2ⁿ − 1 with n ≥ 8 and `CEILING_REPEATS` counts share it, as
-        no largest count of unclipped noise does; infinity otherwise.
-    """
+    """Find the full scale of a converter that has fewer bits than the stored type."""
     if not np.issubdtype(counts.dtype, np.integer) or not counts.size:
         return math.inf
     top = int(counts.max())

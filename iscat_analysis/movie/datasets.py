@@ -22,17 +22,7 @@ _SHOWN = 5  # in a message
 
 
 class DatasetFrames:
-    """The frames of a dataset; `open_hdf5` makes it.
-
-    Parameters
-    ----------
-    stored : StoredArray
-        Its numbers; axes of length 1 between frames and rows are left out.
-    reader : Hdf5Reader
-        Of the file; only its mapped bytes are kept.
-    notes : tuple of str
-        What a user should know.
-    """
+    """The frames of a dataset; `open_hdf5` makes it."""
 
     metadata = StackMetadata()
 
@@ -52,25 +42,7 @@ class DatasetFrames:
 
 
 def open_hdf5(path: Path, part: str) -> Frames:
-    """Open a movie in an HDF5 file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    part : str
-        Path of the dataset; empty for a Refeyn movie, or for the only dataset of frames.
-
-    Returns
-    -------
-    Frames
-        Every frame of it.
-
-    Raises
-    ------
-    DataError
-        There is no such dataset, there are several, or the file is damaged.
-    """
+    """Open a movie in an HDF5 file."""
     with closing(Hdf5Reader(path)) as reader:
         try:
             if not part and is_refeyn(reader):
@@ -94,19 +66,7 @@ def open_hdf5(path: Path, part: str) -> Frames:
 
 
 def is_one_movie(path: Path) -> bool:
-    """Tell whether an HDF5 file is a movie without anything being named in it.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    bool
-        Whether it is Refeyn's or holds a single dataset of frames; true of a damaged file, which
-        is refused where it is opened.
-    """
+    """Tell whether an HDF5 file is a movie without anything being named in it."""
     try:
         with closing(Hdf5Reader(path)) as reader, closing(reader.data):
             return is_refeyn(reader) or len(list(_movies(reader))) == 1

@@ -84,23 +84,6 @@ def time_axis(sizes: Mapping[str, int], path: Path) -> str | None:
     T, Q and I are time.  So is Z where T is not named, as many camera programs write, and C beyond
     the seven channels of an ImageJ composite: tifffile calls the frames of ImageJ and OME stacks
     channels when it is not told otherwise.
-
-    Parameters
-    ----------
-    sizes : mapping of str to int
-        Length of each axis that the file names besides y and x.
-    path : Path
-        What messages call the file.
-
-    Returns
-    -------
-    str or None
-        None where every axis has length 1.
-
-    Raises
-    ------
-    DataError
-        There are two such axes, or the only one cannot be time.
     """
     long = {axis: size for axis, size in sizes.items() if size > 1}
 
@@ -131,27 +114,7 @@ def time_axis(sizes: Mapping[str, int], path: Path) -> str | None:
 
 
 def described_frames(text: str, shape: tuple[int, ...], path: Path) -> Described | None:
-    """Read how many frames an ImageJ or tifffile description announces.
-
-    Parameters
-    ----------
-    text : str
-        The description.
-    shape : (int, int)
-        Rows and columns of the image that carries it [px].
-    path : Path
-        What messages call the file.
-
-    Returns
-    -------
-    Described or None
-        None where the description is of neither kind.
-
-    Raises
-    ------
-    DataError
-        More than one axis besides y and x.
-    """
+    """Read how many frames an ImageJ or tifffile description announces."""
     if text.startswith("ImageJ="):
         fields = _imagej_fields(text)
         sizes = {axis: _count(fields[key]) for key, axis in _IMAGEJ_AXES.items() if key in fields}
@@ -172,20 +135,7 @@ def described_frames(text: str, shape: tuple[int, ...], path: Path) -> Described
 
 
 def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
-    """Read ImageJ's pixel size and frame interval.
-
-    Parameters
-    ----------
-    text : str
-        The description.
-    resolution : (float, float, int) or None
-        The TIFF resolution tags: pixels per ImageJ's own unit.
-
-    Returns
-    -------
-    Hints
-        Silent where ImageJ was not calibrated.
-    """
+    """Read ImageJ's pixel size and frame interval."""
     fields = _imagej_fields(text)
     x_nm = y_nm = None
     unit = LENGTH_NM.get(fields.get("unit", "").lower())
@@ -201,18 +151,7 @@ def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
 
 
 def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Planned lengths of Micro-Manager's axes, as far as the summary of an acquisition names them.
-
-    Parameters
-    ----------
-    summary : mapping
-        May be empty.
-
-    Returns
-    -------
-    dict of str to int
-        Length of each axis.
-    """
+    """Planned lengths of Micro-Manager's axes that the summary of an acquisition names."""
     lengths = {axis: _mm_number(summary.get(key)) for key, axis in _MICRO_MANAGER_AXES.items()}
     return {axis: int(length) for axis, length in lengths.items() if length is not None}
 
@@ -220,23 +159,7 @@ def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
 def micro_manager_hints(
     first: object, last: object, n_frames: int, summary: Mapping[str, Any]
 ) -> Hints:
-    """Read Micro-Manager's metadata.
-
-    Parameters
-    ----------
-    first, last : object
-        Mappings that belong to the first and to the last frame; anything else is ignored.
-    n_frames : int
-        In the movie.
-    summary : mapping
-        Of the acquisition; may be empty.
-
-    Returns
-    -------
-    Hints
-        A pixel size of 0 is Micro-Manager's word for unknown, and an interval of 0, or one
-        shorter than the exposure, for "as fast as possible": then the time stamps decide.
-    """
+    """Read Micro-Manager's metadata."""
     begin, end = (found if isinstance(found, dict) else {} for found in (first, last))
 
     def find(name: str) -> float | None:
@@ -258,18 +181,7 @@ def micro_manager_hints(
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
-    """Read the TIFF resolution tags, where they could mean a microscope's pixels.
-
-    Parameters
-    ----------
-    resolution : (float, float, int) or None
-        Pixels per unit along x and y, and the unit.
-
-    Returns
-    -------
-    Hints
-        With a pixel size only between 5 nm and 5 µm.
-    """
+    """Read the TIFF resolution tags, where they could mean a microscope's pixels."""
     if resolution is None or resolution[2] not in _RESOLUTION_UNIT_NM:
         return Hints("tiff")
     unit = _RESOLUTION_UNIT_NM[resolution[2]]
@@ -278,20 +190,7 @@ def plain_hints(resolution: Resolution | None) -> Hints:
 
 
 def positive(value: object, factor: float = 1.0) -> float | None:
-    """Read a number that must be finite and above zero to mean anything.
-
-    Parameters
-    ----------
-    value : object
-        A number, or text that holds one.
-    factor : float
-        Converts the unit.
-
-    Returns
-    -------
-    float or None
-        The product; None where there is no such number.
-    """
+    """Read a number that must be finite and above zero to mean anything."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         return None
     try:
@@ -302,41 +201,12 @@ def positive(value: object, factor: float = 1.0) -> float | None:
 
 
 def inverse(value: float | None) -> float | None:
-    """Turn an interval into a rate, or back.
-
-    Parameters
-    ----------
-    value : float or None
-        Positive.
-
-    Returns
-    -------
-    float or None
-        Its inverse; None stays None.
-    """
+    """Turn an interval into a rate, or back."""
     return None if value is None else positive(1 / value)
 
 
 def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
-    """Take each value from the first kind of metadata that gives it.
-
-    Parameters
-    ----------
-    hints : sequence of Hints
-        Most trusted first.
-    path : Path
-        What messages call the file.
-
-    Returns
-    -------
-    StackMetadata
-        `source` joins the kinds that contributed with ``"+"``.
-
-    Raises
-    ------
-    DataError
-        The pixels are not square.
-    """
+    """Take each value from the first kind of metadata that gives it."""
     found: dict[str, float] = {}
     sources = []
     for hint in hints:

@@ -45,17 +45,7 @@ _PEAK = 8.0  # least peak of a phase correlation over the noise of one of random
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the fixed pattern was.
-
-    Attributes
-    ----------
-    frames : ndarray, shape (k,)
-        Mean frame of each block.
-    shift_px : ndarray, shape (k, 2)
-        How far the pattern has moved since the first block, along y and x.
-    error_px : ndarray, shape (k, 2)
-        Standard error of a block's shift against the block before it.
-    """
+    """Where the fixed pattern was."""
 
     frames: FloatArray
     shift_px: FloatArray
@@ -88,25 +78,8 @@ def follow_pattern(
 ) -> Trajectory | None:
     """Follow the fixed pattern from block to block.
 
-    Parameters
-    ----------
-    blocks_e : ndarray, shape (k, y, x)
-        Photoelectrons summed over blocks of frames.
-    power : ndarray, shape (k,)
-        Light of each; blocks without any are passed over.
-    frames : ndarray, shape (k,)
-        Mean frame of each.
-    usable : ndarray of bool, shape (y, x)
-        Pixels that are neither defective nor saturated.
-    read_variance_e2 : ndarray, shape (y, x)
-        Of one unit of power [e²].
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Trajectory or None
-        None where there is no pattern to follow: its gradient does not stand out from noise.
+    Shapes: `blocks_e` (k, y, x), `power` (k,), `frames` (k,), `usable` (y, x), `read_variance_e2`
+    (y, x).
     """
     lit = np.flatnonzero(power > 0)
     nearest = filling(usable)
@@ -185,11 +158,6 @@ class Mover:
 
     Exact for a pattern that the pixels resolve.  Beyond its edges an image is continued by its
     reflection; what that pretends is felt within `REACH_PX` of them.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
     """
 
     def __init__(self, shape: tuple[int, int]) -> None:
@@ -218,17 +186,7 @@ class Mover:
     def transfer(self, shift_px: FloatArray, weights: FloatArray) -> ComplexArray:
         """Give what multiplies a spectrum where the image is a weighted sum of moved ones.
 
-        Parameters
-        ----------
-        shift_px : ndarray, shape (n, 2)
-            Of each, along y and x.
-        weights : ndarray, shape (n,)
-            Of each.
-
-        Returns
-        -------
-        ndarray, shape (v, u)
-            Σ w exp(−2πi f·d).
+        Shapes: `shift_px` (n, 2), `weights` (n,), result (v, u).
         """
         y = np.exp(-2j * np.pi * shift_px[:, :1] * self._fy) * weights[:, None]
         x = np.exp(-2j * np.pi * shift_px[:, 1:] * self._fx)
@@ -239,15 +197,7 @@ class Mover:
 def derivatives(image: FloatArray) -> FloatArray:
     """Differentiate an image that fades at its edges.
 
-    Parameters
-    ----------
-    image : ndarray, shape (y, x)
-        The image.
-
-    Returns
-    -------
-    ndarray, shape (5, y, x)
-        By y, x, yy, yx and xx, per pixel; those of its Fourier series.
+    Shapes: `image` (y, x), result (5, y, x).
     """
     mover = Mover((image.shape[0], image.shape[1]))
     spectrum, (y, x) = mover.spectrum(image), mover.waves
@@ -257,17 +207,7 @@ def derivatives(image: FloatArray) -> FloatArray:
 def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
     """Pixels at which a moved pattern is known.
 
-    Parameters
-    ----------
-    usable : ndarray of bool, shape (y, x)
-        Pixels that are neither defective nor saturated.
-    moved_px : float
-        How far the pattern is moved at most.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Those of them that keep away from the edges and do not touch an unusable one.
+    Shapes: `usable` (y, x), result (y, x).
     """
     near = binary_dilation(~usable, iterations=2)
     border = REACH_PX + math.ceil(moved_px - _SETTLED_PX)
@@ -280,15 +220,7 @@ def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
 def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
     """Index that puts the nearest usable pixel's value in place of an unusable one's.
 
-    Parameters
-    ----------
-    usable : ndarray of bool, shape (y, x)
-        Pixels to keep.
-
-    Returns
-    -------
-    tuple of ndarray
-        Rows and columns: ``image[filling(usable)]`` is the image with its gaps closed.
+    Shapes: `usable` (y, x).
     """
     index = distance_transform_edt(~usable, return_distances=False, return_indices=True)
     return tuple(index)
@@ -297,17 +229,7 @@ def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
 def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
     """Give the light that stays where it is while the pattern moves.
 
-    Parameters
-    ----------
-    blocks_e : ndarray, shape (k, y, x)
-        Photoelectrons summed over blocks of frames.
-    usable : ndarray of bool, shape (y, x)
-        Pixels that are neither defective nor saturated.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Smooth, at most 1; 1 everywhere where there is no light.
+    Shapes: `blocks_e` (k, y, x), `usable` (y, x), result (y, x).
     """
     total = blocks_e.sum(axis=0, dtype=float)[filling(usable)]
     smooth = gaussian_filter(total, _STILL_PX)
@@ -320,16 +242,6 @@ def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
 def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, float]:
     """Shift of the fixed pattern between two mean images, by phase correlation.
 
-    Parameters
-    ----------
-    reference_e, later_e : ndarray, shape (y, x)
-        Mean images.
-
-    Returns
-    -------
-    dy_px, dx_px : float
-        How far the later pattern moved; NaN where there is no pattern to follow.
-
     Notes
     -----
     C. D. Kuglin and D. C. Hines, Proc. IEEE Conf. Cybernetics and Society, 163 (1975).  Below a
@@ -338,6 +250,8 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
     correlation is at some 5/√N: a peak that is no higher says nothing of a shift.  All
     frequencies count alike, so that two pixels that blink would make such a peak: they are left
     out.
+
+    Shapes: `reference_e, later_e` (y, x).
     """
     rows, columns = reference_e.shape
     taper = np.outer(np.hanning(rows), np.hanning(columns))

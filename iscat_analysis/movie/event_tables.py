@@ -70,17 +70,7 @@ _LARGEST_FRAME = 2**53
 
 @dataclass(frozen=True)
 class StoredCalibration:
-    """The calibration that a table carries.
-
-    Attributes
-    ----------
-    gradient_per_kda : float
-        Contrast per kDa, s; negative where landing darkens.
-    offset : float
-        Contrast o at zero mass.
-    standard_masses_kda, standard_contrasts : tuple of float
-        What it was fitted to; empty where the table does not say.
-    """
+    """The calibration that a table carries."""
 
     gradient_per_kda: float
     offset: float
@@ -88,18 +78,7 @@ class StoredCalibration:
     standard_contrasts: tuple[float, ...] = ()
 
     def mass_kda(self, contrast: FloatArray) -> FloatArray:
-        """Convert contrasts to masses.
-
-        Parameters
-        ----------
-        contrast : ndarray
-            Signed peak contrasts.
-
-        Returns
-        -------
-        ndarray
-            Masses of the same shape, negative for a particle that leaves [kDa].
-        """
+        """Convert contrasts to masses."""
         masses: FloatArray = (
             np.sign(-contrast) * (-np.abs(contrast) - self.offset) / self.gradient_per_kda
         )
@@ -113,25 +92,6 @@ def read_events(path: Path) -> pd.DataFrame:
     ``calibrated_values`` with ``calibration``; also inside ``.mpr`` movies) or CSV
     (``eventsFitted.csv``; ``contrasts`` or ``masses_kDa`` are enough).  Picasso's: HDF5 with
     ``locs``, if these have a column ``mass_kda``, as those of ``iscat export`` do.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row per event: frame (int; NaN without), x_px, y_px, contrast, mass_kda [kDa], negative
-        for a particle that leaves; NaN where the file has no value; then those of
-        `FURTHER_COLUMNS` that it has.  Masses that are not stored are
-        computed from the stored calibration.  ``attrs["calibration"]`` is that calibration as a
-        mapping (the fields of `StoredCalibration`), or None; `stored_calibration` turns it back.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read, is not such a table, or its columns disagree.
     """
     path = Path(path)
     try:
@@ -149,18 +109,7 @@ def read_events(path: Path) -> pd.DataFrame:
 
 
 def stored_calibration(table: pd.DataFrame) -> StoredCalibration | None:
-    """Return the calibration that came with a table.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        From `read_events`.
-
-    Returns
-    -------
-    StoredCalibration or None
-        None where the file had none.
-    """
+    """Return the calibration that came with a table."""
     fields = table.attrs.get("calibration")
     if fields is None:
         return None

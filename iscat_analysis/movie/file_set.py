@@ -18,19 +18,7 @@ from iscat_analysis.records import StackMetadata
 
 
 class FileSet:
-    """The frames of a set of files.
-
-    Parameters
-    ----------
-    members : sequence of Frames
-        Every file that holds frames, all of its images as frames.
-    files : sequence of Path
-        What the movie is made of.
-    where : ndarray of int, shape (t, 2)
-        File and image of each frame.
-    metadata : StackMetadata
-        What the description says.
-    """
+    """The frames of a set of files."""
 
     notes = ()
 
@@ -66,27 +54,7 @@ class FileSet:
 
 
 def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
-    """Open the files of a set, which lie beside each other.
-
-    Parameters
-    ----------
-    described : OmeSet
-        From the description in one of them.
-    path : Path
-        Of that one.
-    open_member : callable
-        Opens a file, whatever it says of itself, all of its images as frames.
-
-    Returns
-    -------
-    FileSet
-        Every frame.
-
-    Raises
-    ------
-    DataError
-        A file is missing, is not like the others, or holds fewer images than the description says.
-    """
+    """Open the files of a set, which lie beside each other."""
     files = [path.with_name(name) if name else path for name in described.files]
     missing = [file.name for file in files if not file.is_file()]
     if missing:

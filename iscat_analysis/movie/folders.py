@@ -26,18 +26,7 @@ _REMEMBERED = 4096  # files that were looked into
 
 
 def files_of(address: Path) -> tuple[Path, ...]:
-    """Give the files that hold a movie, without opening it.
-
-    Parameters
-    ----------
-    address : Path
-        Of the movie.
-
-    Returns
-    -------
-    tuple of Path
-        Those that are there: one file, all files of a folder, or all of a set.
-    """
+    """Give the files that hold a movie, without opening it."""
     path, _ = split_address(address)
     if path.is_dir():
         return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
@@ -45,18 +34,7 @@ def files_of(address: Path) -> tuple[Path, ...]:
 
 
 def members_of(address: Path) -> tuple[Path, ...]:
-    """Give the files of a set, or the file or folder itself, which tell one movie from another.
-
-    Parameters
-    ----------
-    address : Path
-        Of the movie.
-
-    Returns
-    -------
-    tuple of Path
-        Files of a set that are there; otherwise one path.
-    """
+    """Give the files of a set, or the file or folder itself, which tell one movie from another."""
     path, part = split_address(address)
     if path.suffix.lower() in _TIFF and path.is_file():
         names = _described(path, *_state(path))
@@ -99,18 +77,6 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
 
     A set of files is one movie, under the name of the first file that describes it, and an HDF5
     file is one if it holds a single dataset of frames.
-
-    Parameters
-    ----------
-    folder : Path
-        Its own folders are not searched.
-    but : collection of Path
-        What to leave out.
-
-    Returns
-    -------
-    list of Path
-        Sorted.
     """
     found = [path for path in sorted(folder.iterdir()) if path not in but and _is_movie(path)]
     return list(_once(found))

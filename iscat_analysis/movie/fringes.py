@@ -41,17 +41,7 @@ _LEAST_SQUARES = 24  # along an axis
 
 @dataclass(frozen=True, eq=False)
 class Fringes:
-    """Plane waves whose heights and phases change.
-
-    Attributes
-    ----------
-    waves : ndarray, shape (n, 2)
-        Wave vectors in y and x [rad/pixel].
-    degree : int
-        Of the polynomials in x and y that their heights are.
-    rms : float
-        Of their changes between frames that are compared, over the field and the movie.
-    """
+    """Plane waves whose heights and phases change."""
 
     waves: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     degree: int = 0
@@ -65,17 +55,7 @@ class Fringes:
     def axes(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Give what waves are made of, wherever their crests are.
 
-        Parameters
-        ----------
-        shape : (int, int)
-            Rows and columns.
-
-        Returns
-        -------
-        rows, columns : ndarray, shape (y, k) and (x, k)
-            Functions of each.
-        products : ndarray of bool, shape (k, k)
-            Of which of them there are products.
+        Shapes: `rows, columns` (y, k) and (x, k), `products` (k, k).
         """
         count, degrees = len(self.waves), np.arange(self.degree + 1)
 
@@ -95,22 +75,7 @@ NO_FRINGES = Fringes()
 
 
 def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
-    """Look for plane waves among changes of the light.
-
-    Parameters
-    ----------
-    changes : Changes
-        Between frames that are compared.
-    window : int
-        Frames that are averaged before and after.
-    highest : int
-        Degree of polynomials that follow smooth light: what these do is not looked for.
-
-    Returns
-    -------
-    Fringes
-        Of no wave where there is none.
-    """
+    """Look for plane waves among changes of the light."""
     side = max(1, -(-max(changes.light_e.shape) // _SIDE))
     change, light = changes.binned(side)
     if min(light.shape) < _LEAST_SQUARES:

@@ -27,36 +27,14 @@ _LEAST_TOLD = 1e-3  # by a part, of what others tell
 def lift(light_e: FloatArray) -> FloatArray:
     """Give the relative change of pixels to which the same is added.
 
-    Parameters
-    ----------
-    light_e : ndarray, shape (y, x)
-        Mean photoelectrons of a frame [e]; 0 in pixels that are not used.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Where the mean light is added; 0 in pixels that are not used.
+    Shapes: `light_e` (y, x), result (y, x).
     """
     used = light_e > 0
     return np.where(used, light_e[used].mean() / np.where(used, light_e, 1.0), 0.0)
 
 
 def find_haze(changes: Changes, window: int) -> float:
-    """Look for something that is added to all pixels alike, and changes.
-
-    Parameters
-    ----------
-    changes : Changes
-        Between frames that are compared, without what else changes.
-    window : int
-        Frames that are averaged before and after.
-
-    Returns
-    -------
-    float
-        Its range in the frames of the pairs, over the mean light; 0 where there is none, or where
-        all pixels have the same light, which tell nothing.
-    """
+    """Look for something that is added to all pixels alike, and changes."""
     light, more = changes.light_e, lift(changes.light_e)
     rows, columns = (
         np.equal.outer(np.arange(_PARTS), np.arange(n) * _PARTS // n).astype(np.float64)

@@ -46,27 +46,7 @@ _CODECS: Mapping[int, Callable[..., Any]] = {
 
 
 class StoredArray:
-    """A dataset whose bytes were all found in the file; `Hdf5Reader.array` makes it.
-
-    Parameters
-    ----------
-    data : mmap
-        The whole file.
-    path : Path
-        What messages call it.
-    name : str
-        Of the dataset.
-    shape : tuple of int
-        At least one axis.
-    stored : dtype
-        As in the file, byte order included.
-    chunk : tuple of int
-        Shape of one chunk; the whole shape where the bytes lie in one piece.
-    where : ndarray of int64, shape (chunk, 3)
-        Where each chunk lies, how long it is, and a mask of the filters that it left out.
-    filters : tuple of int
-        As they were applied; empty for plain bytes.
-    """
+    """A dataset whose bytes were all found in the file; `Hdf5Reader.array` makes it."""
 
     def __init__(
         self,
@@ -138,19 +118,7 @@ class StoredArray:
 
 
 class Hdf5Reader:
-    """Looks up datasets of one file; arrays found remain readable after it is closed.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        It is not an HDF5 file, or is damaged; or what is asked for is a link, lies in other files,
-        is incomplete, or cannot be decoded.
-    """
+    """Looks up datasets of one file; arrays found remain readable after it is closed."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

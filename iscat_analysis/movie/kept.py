@@ -15,15 +15,7 @@ S = TypeVar("S", bound=FrameSource)
 
 @dataclass(frozen=True, eq=False)
 class KeptFrames(Generic[S]):
-    """Some frames of a stack.
-
-    Attributes
-    ----------
-    source : FrameSource
-        The stack.
-    frames : ndarray of int
-        Which, rising.
-    """
+    """Some frames of a stack."""
 
     source: S
     frames: NDArray[np.int64]
@@ -41,15 +33,7 @@ class KeptFrames(Generic[S]):
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames by their place among those kept.
 
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            As stored [counts].
+        Shapes: result (stop − start, y, x).
         """
         wanted = self.frames[start:stop]
         runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)

@@ -24,19 +24,7 @@ _LEAST_LIGHT = 0.1  # of the median pixel's
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Sums of frames before and after.
-
-    Attributes
-    ----------
-    sums_e : ndarray, shape (pairs, 2, y, x)
-        Photoelectrons before and after [e]; 0 in pixels that are not used.
-    frames : ndarray of int, shape (pairs, 2)
-        How many frames each adds up.
-    light_e : ndarray, shape (y, x)
-        Mean photoelectrons of a frame [e]; 0 in pixels that are not used.
-    noises : ndarray, shape (pairs,)
-        Variance of a contrast, times the light of its pixels in a frame [e].
-    """
+    """Sums of frames before and after."""
 
     sums_e: FloatArray
     frames: NDArray[np.int64]
@@ -49,17 +37,7 @@ class Changes:
     ) -> Changes | None:
         """Sum frames.
 
-        Parameters
-        ----------
-        pairs : sequence of (ndarray, ndarray), shape (t, y, x)
-            Frames before and after [counts].
-        camera : Camera
-            Counts → photoelectrons.
-
-        Returns
-        -------
-        Changes or None
-            None where there are no frames, or too few photoelectrons.
+        Shapes: `pairs` (t, y, x).
         """
         if not pairs:
             return None
@@ -86,50 +64,20 @@ class Changes:
         return float(self.noises.mean() / self.light_e.sum())
 
     def least(self, window: int) -> float:
-        """Give the mean square contrast between two windows below which a change does not matter.
-
-        Parameters
-        ----------
-        window : int
-            Frames of each.
-
-        Returns
-        -------
-        float
-            Mean over the field.
-        """
+        """Give the mean square contrast of two windows below which a change does not matter."""
         return MATTERS * float(2 / (window * self.light_e[self.used].mean()))
 
     def divided(self, factors: FloatArray) -> Changes:
         """Divide the sums.
 
-        Parameters
-        ----------
-        factors : ndarray, shape (pairs, 2, y, x)
-            What of each is divided out.
-
-        Returns
-        -------
-        Changes
-            Of the same noise.
+        Shapes: `factors` (pairs, 2, y, x).
         """
         return replace(self, sums_e=self.sums_e / factors)
 
     def binned(self, side: int) -> tuple[FloatArray, FloatArray]:
         """Give the changes of squares of pixels.
 
-        Parameters
-        ----------
-        side : int
-            Of a square [pixels]; what is left of the field at its last rows and columns is not in
-            any.
-
-        Returns
-        -------
-        changes : ndarray, shape (pairs, y, x)
-            In standard deviations of shot noise; 0 where nothing is used.
-        light_e : ndarray, shape (y, x)
-            Of a frame [e].
+        Shapes: `changes` (pairs, y, x), `light_e` (y, x).
         """
         light = squares(self.light_e, side)
         before, after = np.moveaxis(squares(self.sums_e, side), 1, 0)
@@ -143,17 +91,7 @@ class Changes:
 def squares(values: FloatArray, side: int) -> FloatArray:
     """Sum squares of pixels.
 
-    Parameters
-    ----------
-    values : ndarray, shape (…, y, x)
-        Of pixels.
-    side : int
-        Of a square [pixels].
-
-    Returns
-    -------
-    ndarray, shape (…, y // side, x // side)
-        Sums.
+    Shapes: `values` (…, y, x), result (…, y // side, x // side).
     """
     if side == 1:
         return values
@@ -168,19 +106,7 @@ def usable_pixels(
 ) -> BoolArray:
     """Tell which pixels say something of the light.
 
-    Parameters
-    ----------
-    pairs : sequence of (ndarray, ndarray), shape (t, y, x)
-        Frames [counts].
-    light_e : ndarray, shape (y, x)
-        Their mean [e].
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Those that are lit, and saturated in none.
+    Shapes: `pairs` (t, y, x), `light_e` (y, x), result (y, x).
     """
     highest = np.max([part.max(axis=0) for two in pairs for part in two], axis=0)
     lit: BoolArray = light_e > _LEAST_LIGHT * max(float(np.median(light_e)), 0.0)

@@ -51,24 +51,7 @@ _LEAST_SHARE = 1e-10  # of what is told of the best known combination of terms
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Measures what of frames changes over their mean one; `find_surface` makes it.
-
-    Attributes
-    ----------
-    light_e : ndarray, shape (y, x)
-        Mean photoelectrons of a frame [e]; 0 in pixels that are not used.
-    degree : int
-        Of the polynomial in x and y; 0 where there is none.
-    rms : float
-        Of its change between frames that are compared, over the field and the movie.
-    fringes : Fringes
-        Waves that pass over the field.
-    seams : tuple of (tuple of int, tuple of int)
-        First rows and columns of parts that have factors of their own.
-    haze : float
-        What is added to all pixels alike, and changes: its range, over the mean light; 0 where
-        there is none.
-    """
+    """Measures what of frames changes over their mean one; `find_surface` makes it."""
 
     light_e: FloatArray
     degree: int
@@ -167,15 +150,7 @@ class Surface:
     def factors(self, electrons: FloatArray) -> FloatArray:
         """Measure the change of frames.
 
-        Parameters
-        ----------
-        electrons : ndarray, shape (…, y, x)
-            Frames [e].
-
-        Returns
-        -------
-        ndarray, shape (…, y, x)
-            Factor, whose mean over the light is 1; 1 where a frame has none.
+        Shapes: `electrons` (…, y, x), result (…, y, x).
         """
         used = self.light_e > 0
         seen = np.where(used, electrons, 0.0)
@@ -204,19 +179,7 @@ def find_surface(
 ) -> Surface | None:
     """Look for changes of the distribution of the light between frames.
 
-    Parameters
-    ----------
-    pairs : sequence of (ndarray, ndarray), shape (t, y, x)
-        Successive good frames, and others as much later as the windows that are compared [counts].
-    camera : Camera
-        Counts → photoelectrons.
-    window : int
-        Frames that are averaged before and after.
-
-    Returns
-    -------
-    Surface or None
-        None where the light changes by less than matters, or at every scale.
+    Shapes: `pairs` (t, y, x).
     """
     changes = Changes.of(pairs, camera)
     if changes is None:

@@ -35,18 +35,7 @@ _LEAST_LIT = 0.25  # of a line's pixels that must be usable
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Which lines flicker together, and how smoothly the light changes; `find_lines` makes it.
-
-    Attributes
-    ----------
-    light_e : ndarray, shape (y, x)
-        Mean photoelectrons of a frame [e]; 0 in pixels that say nothing of a line.
-    shares : (float, float)
-        Part of the variance of a pixel's noise that its whole row has in common, and its column;
-        0 where there is none, and nothing is corrected.
-    surface : Surface or None
-        None where the light of a frame is distributed as that of any other.
-    """
+    """Which lines flicker together, and how smoothly the light changes; `find_lines` makes it."""
 
     light_e: FloatArray
     shares: tuple[float, float]
@@ -90,15 +79,7 @@ class Lines:
     def factors(self, electrons: FloatArray) -> FloatArray:
         """Measure the smooth change of the light, and that of the lines over that of the frame.
 
-        Parameters
-        ----------
-        electrons : ndarray, shape (…, y, x)
-            Frames [e].
-
-        Returns
-        -------
-        ndarray, shape (…, y, x) or one that is broadcast to it
-            1 where a line or the frame has too little light.
+        Shapes: `electrons` (…, y, x), result (…, y, x).
         """
         used = self.light_e > 0
         seen = np.where(used, electrons, 0.0)
@@ -120,17 +101,7 @@ class Lines:
     def divided(self, counts: NDArray[Any], camera: Camera) -> NDArray[Any]:
         """Divide frames by what is measured of their light.
 
-        Parameters
-        ----------
-        counts : ndarray, shape (t, y, x)
-            As recorded.
-        camera : Camera
-            Counts → photoelectrons.
-
-        Returns
-        -------
-        ndarray of float32 or float64, shape (t, y, x)
-            Corrected counts; saturated pixels keep theirs, at the camera's full scale.
+        Shapes: `counts` (t, y, x), result (t, y, x).
         """
         offset = np.asarray(camera.offset_adu)
         steady = counts - offset
@@ -146,30 +117,14 @@ class Lines:
     def taken(self, signal: FloatArray) -> FloatArray:
         """Give what frames are divided by because of a signal.
 
-        Parameters
-        ----------
-        signal : ndarray, shape (…, y, x)
-            Contrast.
-
-        Returns
-        -------
-        ndarray, shape (…, y, x)
-            Factor.
+        Shapes: `signal` (…, y, x), result (…, y, x).
         """
         return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)
 
     def left(self, signal: FloatArray) -> FloatArray:
         """Give what is left of a signal.
 
-        Parameters
-        ----------
-        signal : ndarray, shape (y, x)
-            Contrast.
-
-        Returns
-        -------
-        ndarray, shape (y, x)
-            Contrast in corrected frames.
+        Shapes: `signal` (y, x), result (y, x).
         """
         return (1 + signal) / self.taken(signal) - 1
 
@@ -179,30 +134,7 @@ def _divided_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 
 class SteadyFrames:
-    """Frames of a movie, each line divided by its own light.
-
-    Parameters
-    ----------
-    movie : CountSource
-        As it was recorded.
-    lines : Lines
-        What flickers.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Attributes
-    ----------
-    shape : (int, int, int)
-        Frames, rows, columns.
-    dtype : dtype
-        Of floats.
-    name : str
-        What messages call the movie.
-    notes : tuple of str
-        Empty: what there was to say of the file was said of the file.
-    metadata : StackMetadata
-        Empty as well.
-    """
+    """Frames of a movie, each line divided by its own light."""
 
     notes: tuple[str, ...] = ()
     metadata = StackMetadata()
@@ -216,15 +148,7 @@ class SteadyFrames:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            Corrected counts; saturated pixels keep theirs, at the camera's full scale.
+        Shapes: result (stop − start, y, x).
         """
         return self._lines.divided(self._movie.read(start, stop), self._camera)
 
@@ -241,22 +165,7 @@ def find_lines(
 ) -> Lines | None:
     """Look for rows and columns that flicker.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive good frames.
-    camera : Camera
-        Counts → photoelectrons.
-    surface : Surface, optional
-        Smooth changes of the light, from `iscat_analysis.movie.lighting.find_surface`.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Lines or None
-        None where no line has noise of its own beyond 4.5 standard errors of it, and the light
-        does not change smoothly.
+    Shapes: `counts` (t, y, x).
     """
     mean = camera.to_electrons(counts.mean(axis=0))
     shape = (counts.shape[1], counts.shape[2])
@@ -275,20 +184,5 @@ def find_lines(
 
 
 def steady(movie: Stack, lines: Lines | None, camera: Camera) -> Stack:
-    """Give a movie as it is analysed, without the flicker of its lines.
-
-    Parameters
-    ----------
-    movie : Stack
-        As it was recorded.
-    lines : Lines or None
-        What flickers.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    Stack
-        The movie itself where nothing does.
-    """
+    """Give a movie as it is analysed, without the flicker of its lines."""
     return movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))

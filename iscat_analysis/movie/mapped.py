@@ -28,30 +28,13 @@ _MAPPED_ALONG = 2**16
 
 
 def map_file(path: Path) -> mmap.mmap:
-    """Map a whole file for reading.
-
-    Parameters
-    ----------
-    path : Path
-        The file; not empty.
-
-    Returns
-    -------
-    mmap
-        Its bytes.
-    """
+    """Map a whole file for reading."""
     with path.open("rb") as file:
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
 def unmap(data: mmap.mmap) -> None:
-    """Close a file, or have it closed when nobody uses frames where they lie in it any more.
-
-    Parameters
-    ----------
-    data : mmap
-        From `map_file`.
-    """
+    """Close a file, or have it closed when nobody uses frames where they lie in it any more."""
     with suppress(BufferError):
         data.close()
 
@@ -59,31 +42,7 @@ def unmap(data: mmap.mmap) -> None:
 def frames_in_place(
     path: Path, data: mmap.mmap, offset: int, shape: tuple[int, int, int], stored: np.dtype[Any]
 ) -> InPlace | None:
-    """Give frames that lie in a file one after the other.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    data : mmap
-        From `map_file`.
-    offset : int
-        Where the first one begins [bytes].
-    shape : tuple of int
-        Frames, rows, columns.
-    stored : dtype
-        Of the pixels, byte order included.
-
-    Returns
-    -------
-    InPlace or None
-        None where a processor could not use these numbers as they are.
-
-    Raises
-    ------
-    DataError
-        The file is gone, or shorter than it was.
-    """
+    """Give frames that lie in a file one after the other."""
     if not stored.isnative or offset % stored.itemsize:
         return None
     refuse_changed(path, data)
@@ -111,20 +70,7 @@ class _Lying:
 
 
 def refuse_changed(path: Path, data: mmap.mmap) -> None:
-    """Refuse a file that has shrunk: touching mapped bytes beyond its end kills the process.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    data : mmap
-        From `map_file`.
-
-    Raises
-    ------
-    DataError
-        The file is gone, or shorter than it was.
-    """
+    """Refuse a file that has shrunk: touching mapped bytes beyond its end kills the process."""
     try:
         size = path.stat().st_size
     except OSError as error:
@@ -137,16 +83,7 @@ def refuse_changed(path: Path, data: mmap.mmap) -> None:
 
 
 def release(data: mmap.mmap, start: int, stop: int) -> None:
-    """Let go of pages that were copied; the system would count them as this process's memory.
-
-    Parameters
-    ----------
-    data : mmap
-        From `map_file`.
-    start, stop : int
-        Half-open range of bytes.  Pages around it, which the system maps along with those that are
-        touched, go as well; should they be read after all, they come back from the file.
-    """
+    """Let go of pages that were copied; the system would count them as this process's memory."""
     first = max(start - _MAPPED_ALONG, 0) // mmap.PAGESIZE * mmap.PAGESIZE
     last = min(stop + _MAPPED_ALONG, len(data))
     if last > first and hasattr(data, "madvise"):

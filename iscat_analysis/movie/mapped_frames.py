@@ -28,28 +28,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 class MappedFrames:
-    """The frames of a file that is nothing but numbers, behind a header perhaps.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    shape : tuple of int
-        Frames, rows, columns.
-    stored : dtype
-        As in the file, byte order included.
-    offset : int
-        Where the numbers begin [bytes].
-    last_first : bool
-        Whether the first axis runs fastest, as in Fortran.
-    member : bool
-        One of several files of a movie, which may hold a single frame.
-
-    Raises
-    ------
-    DataError
-        It is not a movie, or the file is shorter.
-    """
+    """The frames of a file that is nothing but numbers, behind a header perhaps."""
 
     metadata = StackMetadata()
     notes = ()
@@ -116,23 +95,7 @@ class MappedFrames:
 
 
 def open_npy(path: Path) -> MappedFrames:
-    """Open an array that NumPy saved.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    MappedFrames
-        Its frames.
-
-    Raises
-    ------
-    DataError
-        It is not a movie, is damaged, or is cut short.
-    """
+    """Open an array that NumPy saved."""
     try:
         with path.open("rb") as file:
             version = npy.read_magic(file)
@@ -146,25 +109,7 @@ def open_npy(path: Path) -> MappedFrames:
 
 
 def open_raw(path: Path, part: str) -> MappedFrames:
-    """Open a file that holds the counts and nothing else.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    part : str
-        Shape and type, as `iscat_analysis.movie.addresses.layout` reads them.
-
-    Returns
-    -------
-    MappedFrames
-        Its frames.
-
-    Raises
-    ------
-    DataError
-        The file does not hold as many numbers of this type.
-    """
+    """Open a file that holds the counts and nothing else."""
     example = f"{path}{MARK}1500x128x128,uint16"
     said = layout(part)
     if said is None:

@@ -28,29 +28,7 @@ _OUTLIER_FRAMES = 16  # fewer, and the variance of one pixel is too uncertain to
 
 
 def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
-    """Fill what the configuration leaves out from what the movie says of itself.
-
-    Parameters
-    ----------
-    config : Config
-        It wins wherever both speak.
-    metadata : StackMetadata
-        Of the movie.
-
-    Returns
-    -------
-    Config
-        With a pixel size, and an exposure and a frame rate where either knows them.
-    tuple of str
-        One sentence for each disagreement by more than 1 %, and one where pixels are too large for
-        the optics.
-
-    Raises
-    ------
-    DataError
-        Neither gives the pixel size, or the movie gives one that no microscope has, or these
-        optics do not.
-    """
+    """Fill what the configuration leaves out from what the movie says of itself."""
     notes = []
     found: dict[str, float] = {}
     for key, unit, words in (
@@ -110,27 +88,7 @@ def _refuse_unlikely(pixel_nm: float, source: str) -> None:
 
 @dataclass(frozen=True)
 class GainDiagnosis:
-    """Measured noise beside what the configured gain predicts.
-
-    Attributes
-    ----------
-    noise_ratio : float
-        R, measured noise variance over the predicted; 1 where gain and reality agree.
-    noise_ratio_se : float
-        Its standard error.
-    configured_gain : float
-        Mean of the configured gain over the pixels used [e/count].
-    gain_e_per_adu : float
-        Gain that would explain the noise, `configured_gain`/R [e/count].
-    gain_se : float
-        Its standard error [e/count].
-    n_frames, n_pixels : int
-        What was used.
-    noise_counts : float
-        Standard deviation of a frame's noise [counts]; infinite where counts are no integers.
-    shaking : Shaking or None
-        What motion of the fixed pattern explains of an excess, where there is one.
-    """
+    """Measured noise beside what the configured gain predicts."""
 
     noise_ratio: float
     noise_ratio_se: float
@@ -204,25 +162,7 @@ def diagnose_gain(
     independent, so the standard error is that of a ratio over pixels, √Σ(a_p − R·b_p)² / Σ b_p; it
     holds although successive differences share a frame.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive background frames, t ≥ 2 [counts].
-    camera : Camera
-        As configured.
-    masked : array_like of bool, shape (y, x), optional
-        Pixels to leave out; saturated ones always are, and from 16 frames on those whose noise is
-        far from their neighbours'.
-
-    Returns
-    -------
-    GainDiagnosis
-        The ratio R, its standard error, and the gain g/R.
-
-    Raises
-    ------
-    DataError
-        There are fewer than two frames, no light, or no noise beyond the read noise.
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     n_frames = len(counts)
     if n_frames < 2:
@@ -291,21 +231,7 @@ def with_shaking(
 ) -> GainDiagnosis:
     """Measure what motion of the fixed pattern explains of an excess, where there is one.
 
-    Parameters
-    ----------
-    found : GainDiagnosis
-        Of these frames.
-    counts : ndarray, shape (t, y, x)
-        Successive frames.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), or None
-        Pixels to leave out.
-
-    Returns
-    -------
-    GainDiagnosis
-        The same where nothing is in excess, or it was measured.
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     if not found.off or found.noise_ratio < 1 or found.shaking is not None:
         return found

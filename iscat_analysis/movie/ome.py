@@ -30,15 +30,7 @@ _AXES = ("T", "Z", "C")
 
 @dataclass(frozen=True)
 class OmeMovie:
-    """What OME-XML says of a movie.
-
-    Attributes
-    ----------
-    order : ndarray of int64, shape (t,)
-        Image of the file that holds each frame.
-    hints : Hints
-        Pixel size and timing.
-    """
+    """What OME-XML says of a movie."""
 
     order: NDArray[np.int64]
     hints: Hints
@@ -46,17 +38,7 @@ class OmeMovie:
 
 @dataclass(frozen=True)
 class OmeSet:
-    """What OME-XML says of a movie in several files.
-
-    Attributes
-    ----------
-    files : tuple of str
-        Their names; empty for the file that says so.
-    where : ndarray of int64, shape (t, 2)
-        File and image that hold each frame.
-    hints : Hints
-        Pixel size and timing.
-    """
+    """What OME-XML says of a movie in several files."""
 
     files: tuple[str, ...]
     where: NDArray[np.int64]
@@ -64,44 +46,12 @@ class OmeSet:
 
 
 def is_ome(text: str) -> bool:
-    """Whether a description is OME-XML.
-
-    Parameters
-    ----------
-    text : str
-        The description.
-
-    Returns
-    -------
-    bool
-        True for anything that looks like an XML document with an ``OME`` element.
-    """
+    """Whether a description is OME-XML."""
     return text.startswith("<") and _OME_ROOT.search(text) is not None
 
 
 def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
-    """Read the OME-XML of a file.
-
-    Parameters
-    ----------
-    text : str
-        The XML.
-    n_images : int
-        Images the file holds.
-    path : Path
-        What messages call it.
-
-    Returns
-    -------
-    OmeMovie
-        Covers every image of the file exactly once.
-
-    Raises
-    ------
-    DataError
-        The XML is damaged or declares entities, describes several series, more or fewer frames
-        than the file holds, or more than one axis besides y and x.
-    """
+    """Read the OME-XML of a file."""
     images = _images(text, path)
     first = images[0]
     if len(images) == 1:
@@ -117,25 +67,7 @@ def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
 
 
 def read_ome_set(text: str, path: Path) -> OmeSet | None:
-    """Read the OME-XML of a movie that lies in several files.
-
-    Parameters
-    ----------
-    text : str
-        The XML of one of them.
-    path : Path
-        Of that file.
-
-    Returns
-    -------
-    OmeSet or None
-        Where every frame lies; None where all of them lie in one file.
-
-    Raises
-    ------
-    DataError
-        The XML is damaged, names files elsewhere, describes several series, or leaves frames out.
-    """
+    """Read the OME-XML of a movie that lies in several files."""
     images = _images(text, path)
     files = _files(images)
     if len(files) < 2:
@@ -170,25 +102,7 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
 
 
 def files_of_set(text: str, path: Path) -> tuple[str, ...]:
-    """Name the files that OME-XML describes.
-
-    Parameters
-    ----------
-    text : str
-        The XML.
-    path : Path
-        Of the file that holds it.
-
-    Returns
-    -------
-    tuple of str
-        Empty for the file that says so.
-
-    Raises
-    ------
-    DataError
-        The XML is damaged, or names files elsewhere.
-    """
+    """Name the files that OME-XML describes."""
     files = _files(_images(text, path))
     if any(Path(name).name != name for name in files):
         raise _damaged(path, "it names files in other folders")

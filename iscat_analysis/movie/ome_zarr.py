@@ -31,18 +31,7 @@ MARKS = ("zarr.json", ".zgroup", ".zarray")
 
 
 def is_zarr(folder: Path) -> bool:
-    """Tell whether a folder is one of Zarr's.
-
-    Parameters
-    ----------
-    folder : Path
-        Any.
-
-    Returns
-    -------
-    bool
-        Whether it holds one of `MARKS`.
-    """
+    """Tell whether a folder is one of Zarr's."""
     return any((folder / mark).is_file() for mark in MARKS)
 
 
@@ -59,26 +48,7 @@ class _Frames:
 
 
 def open_zarr(folder: Path, part: str) -> ArrayFrames:
-    """Open a movie in a Zarr folder.
-
-    Parameters
-    ----------
-    folder : Path
-        The folder.
-    part : str
-        Path of the array or of the image in it; empty for an OME-Zarr image, of which the finest
-        level is taken, or for the only array of frames.
-
-    Returns
-    -------
-    ArrayFrames
-        Its frames, with pixel size and frame rate where the image tells its scale.
-
-    Raises
-    ------
-    DataError
-        The package zarr is missing, there is no such array, there are several, or it is no movie.
-    """
+    """Open a movie in a Zarr folder."""
     try:
         import zarr
     except ImportError:

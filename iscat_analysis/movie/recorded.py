@@ -36,18 +36,7 @@ _LARGEST_SETTINGS = 10_000_000  # bytes; a text of a few kilobytes in truth
 
 
 def description_of(path: Path) -> Path | None:
-    """Find what describes a file of plain numbers.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    Path or None
-        The settings beside it; the file itself where its name tells; None where nothing does.
-    """
+    """Find what describes a file of plain numbers."""
     if path.suffix.lower() not in SUFFIXES:
         return None
     for stem in dict.fromkeys((path.stem, _PART.sub("", path.stem))):
@@ -58,18 +47,7 @@ def description_of(path: Path) -> Path | None:
 
 
 def recorded_files(path: Path) -> tuple[Path, ...]:
-    """Give the files of a movie, its settings last.
-
-    Parameters
-    ----------
-    path : Path
-        One that holds frames.
-
-    Returns
-    -------
-    tuple of Path
-        In the order of the frames; itself where nothing describes it.
-    """
+    """Give the files of a movie, its settings last."""
     settings = description_of(path)
     if settings is None or settings == path:
         return (path,)
@@ -88,23 +66,7 @@ def _settings(stem: str, path: Path) -> list[Path]:
 
 
 def open_recorded(path: Path) -> FileSet:
-    """Open a movie that `description_of` finds described.
-
-    Parameters
-    ----------
-    path : Path
-        One of its files that hold frames.
-
-    Returns
-    -------
-    FileSet
-        Every frame.
-
-    Raises
-    ------
-    DataError
-        The description does not fit the files, or says too little.
-    """
+    """Open a movie that `description_of` finds described."""
     named = _named(path) if description_of(path) == path else None
     if named is not None:
         frames, rows, columns, stored = named

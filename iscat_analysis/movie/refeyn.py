@@ -82,17 +82,7 @@ _DIALECTS = (
 
 
 class RefeynFrames:
-    """The frames of an ``.mp`` file; `open_refeyn` makes it.
-
-    Parameters
-    ----------
-    stored : StoredArray
-        Frames or differences, shape (t, y, x).
-    reader : Hdf5Reader
-        Of the file; only its mapped bytes are kept.
-    path : Path
-        What messages call it.
-    """
+    """The frames of an ``.mp`` file; `open_refeyn` makes it."""
 
     def __init__(self, stored: StoredArray, reader: Hdf5Reader, path: Path) -> None:
         t, y, x = stored.shape
@@ -118,17 +108,6 @@ class DifferenceFrames(RefeynFrames):
 
     Decoded frames are remembered here and there, so that no read starts from the first frame; a
     movie read in order is summed once.
-
-    Parameters
-    ----------
-    stored : StoredArray
-        Differences, unsigned integers.
-    reader : Hdf5Reader
-        As in `RefeynFrames`.
-    path : Path
-        What messages call the file.
-    known : (int, ndarray of shape (y, x)) or None
-        Number of a frame, and what it must sum to.
     """
 
     def __init__(
@@ -195,23 +174,7 @@ class DifferenceFrames(RefeynFrames):
 
 
 def open_refeyn(path: Path) -> RefeynFrames:
-    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    RefeynFrames
-        Every frame of it.
-
-    Raises
-    ------
-    DataError
-        It is not such a movie, is incomplete, or contradicts itself.
-    """
+    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one."""
     with closing(Hdf5Reader(path)) as reader:
         try:
             return _open(reader, path)
@@ -221,18 +184,7 @@ def open_refeyn(path: Path) -> RefeynFrames:
 
 
 def is_refeyn(reader: Hdf5Reader) -> bool:
-    """Tell whether a file has frames where one of Refeyn's has them.
-
-    Parameters
-    ----------
-    reader : Hdf5Reader
-        Of the file.
-
-    Returns
-    -------
-    bool
-        Whether it does.
-    """
+    """Tell whether a file has frames where one of Refeyn's has them."""
     return any(reader.array(dialect.frames) is not None for dialect in _DIALECTS)
 
 

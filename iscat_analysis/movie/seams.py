@@ -27,22 +27,7 @@ _NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 
 
 def find_seams(changes: Changes, window: int, known: Seams = ((), ())) -> Seams:
-    """Look for rows and columns at which the changes of the light have a step.
-
-    Parameters
-    ----------
-    changes : Changes
-        Between frames that are compared.
-    window : int
-        Frames that are averaged before and after.
-    known : tuple of (tuple of int, tuple of int)
-        Those that were found before, and whose factors were divided out.
-
-    Returns
-    -------
-    tuple of (tuple of int, tuple of int)
-        First row, and first column, of every part but the first; empty where there is one part.
-    """
+    """Look for rows and columns at which the changes of the light have a step."""
     least = changes.least(window) / changes.error
     return _along(changes, 2, least, known[0]), _along(changes, 1, least, known[1])
 
@@ -50,19 +35,7 @@ def find_seams(changes: Changes, window: int, known: Seams = ((), ())) -> Seams:
 def parts_of(shape: tuple[int, int], seams: Seams) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Tell which rows and columns belong together.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    seams : tuple of (tuple of int, tuple of int)
-        From `find_seams`.
-
-    Returns
-    -------
-    rows, columns : ndarray, shape (y, k) and (x, m)
-        1 in the part of a line, else 0; of no part where there is no seam.
-    products : ndarray of bool, shape (k, m)
-        True: each part of the rows with each of the columns is a part of the field.
+    Shapes: `rows, columns` (y, k) and (x, m), `products` (k, m).
     """
     rows, columns = (
         np.equal.outer(np.searchsorted(cuts, np.arange(n), side="right"), np.arange(len(cuts) + 1))

@@ -20,15 +20,7 @@ MOST_EXPLAINED = 0.5
 
 @dataclass(frozen=True)
 class Shaking:
-    """How much the fixed pattern moves from frame to frame.
-
-    Attributes
-    ----------
-    share : float
-        Of the variance beyond that of the light, what motion of the pattern explains.
-    rms_px : float
-        Standard deviation of its place along an axis, were frames independent [pixels].
-    """
+    """How much the fixed pattern moves from frame to frame."""
 
     share: float
     rms_px: float
@@ -42,19 +34,7 @@ def measure_shaking(
     A pattern B that moves by δ changes by −δ·∇B: the difference of two frames is fitted with ∂_y B
     and ∂_x B, weighted by shot noise.  Of noise alone each explains 1 of χ².
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    Shaking or None
-        None where there is no noise beyond that of the light, or no pattern.
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     seen = _Pattern.of(counts, camera, masked)
     if seen is None:
@@ -76,19 +56,7 @@ def without_shaking(
 ) -> NDArray[Any]:
     """Take the motion of the fixed pattern off frames, to first order.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    ndarray, shape (t, y, x)
-        Counts with the noise of a pattern that stands still; the same where there is no pattern.
+    Shapes: `counts` (t, y, x), `masked` (y, x), result (t, y, x).
     """
     seen = _Pattern.of(counts, camera, masked)
     if seen is None:

@@ -43,26 +43,6 @@ class NoiseSpectrum:
 
     Images are continued by reflection over `MARGIN_PX`, so that at an edge as well a pixel has
     neighbours like those that it is correlated with.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns of the continued images.
-    power : ndarray, shape (rows, columns // 2 + 1)
-        Variance over the expected, as `scipy.fft.rfft2` orders frequencies.
-    information : ndarray, shape (rows, columns // 2 + 1)
-        What the whitened noise tells about a signal of each frequency: 1/`power`, blurred by the
-        light, which no signal of a single frequency keeps its frequency in.
-    variance : float
-        Of one pixel, over the expected.
-    neighbours : (float, float)
-        Correlation of a pixel with the next one in x and in y.
-    shared : (float, float)
-        Part of the variance that a whole row has in common, and a whole column.
-    summed : (float, float)
-        Variance of a pixel and its covariances with all pixels near it, over the expected
-        variance, and the standard error: 1 where neighbours do nothing but exchange charge,
-        whatever that does to the variance of one.
     """
 
     shape: tuple[int, int]
@@ -87,18 +67,7 @@ class NoiseSpectrum:
     def whitened(self, weighted: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
         """Turn a signal, times its information, into what a template's overlap is taken with.
 
-        Parameters
-        ----------
-        weighted : ndarray, shape (y, x)
-            Signal times `weight`.
-        weight : ndarray, shape (y, x)
-            Information of each pixel about its signal, as of noise that is as expected; 0 where a
-            pixel is not used.
-
-        Returns
-        -------
-        ndarray
-            Of the same shape and type; `weighted` itself where the noise is as expected.
+        Shapes: `weighted` (y, x), `weight` (y, x).
         """
         root = np.sqrt(weight)
         in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
@@ -111,17 +80,7 @@ class NoiseSpectrum:
     def dual(self, template: FloatArray) -> FloatArray:
         """Give what an image's product with a template is, to the noise, as a product of numbers.
 
-        Parameters
-        ----------
-        template : ndarray, shape (…, k, k)
-            Signal per unit amplitude, or derivatives of it; what reaches beyond the field is left
-            out.
-
-        Returns
-        -------
-        ndarray, shape (…, k, k)
-            Multiplied with a template and with the information of each pixel, its sum is the
-            information about the amplitude; the template itself where the noise is as expected.
+        Shapes: `template` (…, k, k), result (…, k, k).
         """
         side = template.shape[-1]
         high, wide = (min(side, there) for there in self.shape)
@@ -174,27 +133,12 @@ def measure_spectrum(
 ) -> NoiseSpectrum | None:
     """Measure the noise between neighbouring frames.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive good frames.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out; saturated ones always are.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    NoiseSpectrum or None
-        None where the noise is white and of the expected size, as far as one can tell, or where
-        there are too few frames, pixels or photoelectrons to tell.
-
     Notes
     -----
     Covariances at distances up to `REACH_PX`, and those that a whole row or column shares, from the
     mean periodogram (R. B. Blackman and J. W. Tukey, The Measurement of Power Spectra, 1959).
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     rows, columns = counts.shape[1:]
     pairs = min(len(counts) // 2, _PAIRS)

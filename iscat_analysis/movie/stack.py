@@ -69,22 +69,7 @@ class ArrayLike(Protocol):
 
 
 class ArrayFrames:
-    """The frames of an array; `iscat_analysis.movie.open_stack` makes it.
-
-    Parameters
-    ----------
-    array : array_like, shape (t, y, x)
-        Counts; read a few frames at a time.
-    name : str
-        What messages call it.
-    metadata : StackMetadata
-        What the caller says of it.
-
-    Raises
-    ------
-    DataError
-        It has not three axes, holds no integers or floats, or fewer than two frames.
-    """
+    """The frames of an array; `iscat_analysis.movie.open_stack` makes it."""
 
     notes = ()
 
@@ -109,15 +94,7 @@ class ArrayFrames:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            A new array in native byte order [counts].
+        Shapes: result (stop − start, y, x).
         """
         return np.array(self._array[start:stop], dtype=self.dtype, order="C")
 
@@ -126,34 +103,12 @@ class ArrayFrames:
 
 
 def printable(text: str) -> str:
-    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold.
-
-    Parameters
-    ----------
-    text : str
-        As the system gives it.
-
-    Returns
-    -------
-    str
-        With the escapes of Python written out.
-    """
+    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def not_shared(path: Path) -> DataError:
-    """Say that a file is not, or not the same, where it shall be read.
-
-    Parameters
-    ----------
-    path : Path
-        Where another machine sees it.
-
-    Returns
-    -------
-    DataError
-        To be raised.
-    """
+    """Say that a file is not, or not the same, where it shall be read."""
     return DataError(
         f"{path}: is not on {platform.node()}, or is another file there; workers read and write by "
         "path, so that their machines must share the file system"

@@ -28,20 +28,7 @@ def shared_light(
 ) -> float | None:
     """Tell whether successive frames have light in common.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out.
-
-    Returns
-    -------
-    float or None
-        Variance between neighbouring frames over that of frames farther apart; None where they are
-        independent, as far as one can tell.
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     if len(counts) < _FEWEST:
         return None

@@ -6,33 +6,12 @@ _SEPARATORS = ",;\t"
 
 
 def without_remarks(text: str) -> list[str]:
-    """Leave out empty lines and those that begin with ``#``.
-
-    Parameters
-    ----------
-    text : str
-        Of the whole table.
-
-    Returns
-    -------
-    list of str
-        The other lines, the heading first.
-    """
+    """Leave out empty lines and those that begin with ``#``."""
     return [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
 
 
 def separator(text: str) -> str:
     r"""Find what separates the cells of a table.
-
-    Parameters
-    ----------
-    text : str
-        Of the whole table.
-
-    Returns
-    -------
-    str
-        Comma, semicolon or tab, whichever the heading has most of.
 
     Examples
     --------
@@ -44,17 +23,5 @@ def separator(text: str) -> str:
 
 
 def decimal_mark(between: str) -> str:
-    """Give what stands before the decimals of a table's numbers.
-
-    Parameters
-    ----------
-    between : str
-        From `separator`.
-
-    Returns
-    -------
-    str
-        A comma, as spreadsheets of many languages write it, where commas do not part the cells of a
-        table that they wrote; else a point.
-    """
+    """Give what stands before the decimals of a table's numbers."""
     return "." if between == "," else ","

@@ -77,27 +77,7 @@ _PLAIN = dict.fromkeys(("is_lsm", "is_ndpi", "is_ome", "is_scanimage", "is_stk")
 
 
 class TiffFrames:
-    """The frames of a TIFF file; `open_tiff` makes it.
-
-    Parameters
-    ----------
-    data : mmap
-        The whole file.
-    path : Path
-        What messages call it.
-    dtype : dtype
-        Of the pixels, in the byte order of the file.
-    images : sequence
-        One image per frame, or a single one that the other frames' pixels follow.
-    n_frames : int
-        In the movie.
-    metadata : StackMetadata
-        What the file says of itself.
-    notes : tuple of str
-        What a user should know of it.
-    decode : callable
-        tifffile's decoder of the strips or tiles of these images.
-    """
+    """The frames of a TIFF file; `open_tiff` makes it."""
 
     def __init__(
         self,
@@ -126,20 +106,7 @@ class TiffFrames:
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        ndarray, shape (stop − start, y, x)
-            A new array in native byte order [counts].
-
-        Raises
-        ------
-        DataError
-            The file has changed since it was opened, or its pixels cannot be decoded.
+        Shapes: result (stop − start, y, x).
         """
         refuse_changed(self._path, self._data)
         block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
@@ -156,23 +123,7 @@ class TiffFrames:
         return block
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
-        """Give frames where they lie in the file.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range inside the movie.
-
-        Returns
-        -------
-        InPlace or None
-            None where they are compressed, or do not lie one after the other.
-
-        Raises
-        ------
-        DataError
-            The file is gone, or shorter than it was.
-        """
+        """Give frames where they lie in the file."""
         if self._starts is None or start >= stop:
             return None
         shape = (stop - start, *self.shape[1:])
@@ -219,25 +170,7 @@ class TiffFrames:
 
 
 def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
-    """Open a TIFF movie.
-
-    Parameters
-    ----------
-    path : Path
-        The file, or one of a set that OME-XML describes.
-    member : bool
-        Take all images of the file for frames, whatever it says of a set.
-
-    Returns
-    -------
-    TiffFrames or FileSet
-        Every frame of it.
-
-    Raises
-    ------
-    DataError
-        It is not a movie, is cut short, or contradicts its own description.
-    """
+    """Open a TIFF movie."""
     data = map_file(path)
     try:
         with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
@@ -255,18 +188,7 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
 
 
 def first_texts(path: Path) -> tuple[str, ...]:
-    """Read the descriptions of the first image alone.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-
-    Returns
-    -------
-    tuple of str
-        As they stand there; what a damaged file raises is any of `WHAT_LIBRARIES_RAISE`.
-    """
+    """Read the descriptions of the first image alone."""
     with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
         return tuple(_text(tag.value) for tag in file.pages[0].tags.getall(_DESCRIPTION, ()))
 

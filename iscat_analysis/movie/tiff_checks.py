@@ -34,25 +34,7 @@ _OVERLAP_BYTES = 1_000_000
 
 @dataclass(frozen=True, slots=True)
 class Image:
-    """One image of the file: how it is stored, and where its strips or tiles lie.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Of its pixels.
-    dtype : dtype or None
-        Of its pixels; None where NumPy has no such type.
-    encoding : int
-        Equal where one decoder serves both of two images.
-    reduced : bool
-        Whether it is said to be a thumbnail.
-    texts : tuple of str
-        Its descriptions.
-    offsets, sizes : tuple of int
-        First byte, and bytes, of every strip or tile.
-    start : int or None
-        First byte of the pixels where they lie in one piece as they are.
-    """
+    """One image of the file: how it is stored, and where its strips or tiles lie."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any] | None
@@ -68,43 +50,13 @@ class Image:
 
 
 def refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
-    """Refuse images that share one long value, which would cost its length each time.
-
-    Parameters
-    ----------
-    values : int
-        Bytes of the values of tags so far.
-    data : mmap
-        The whole file.
-    path : Path
-        What messages call the file.
-
-    Raises
-    ------
-    DataError
-        There are more of them than the file has room for.
-    """
+    """Refuse images that share one long value, which would cost its length each time."""
     if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
         raise damaged(path, "the headers of its images overlap")
 
 
 def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
-    """Refuse an image whose strips or tiles are not all listed, and whole, in the file.
-
-    Parameters
-    ----------
-    page : tifffile.TiffPage
-        The image.
-    file_size : int
-        Bytes of the file.
-    path : Path
-        What messages call the file.
-
-    Raises
-    ------
-    DataError
-        One is missing, or shorter than it needs to be.
-    """
+    """Refuse an image whose strips or tiles are not all listed, and whole, in the file."""
     number, rows, columns = page.index, page.imagelength, page.imagewidth
     frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
     if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
@@ -137,25 +89,7 @@ def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) ->
 
 
 def pixel_type(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
-    """Give the type of the pixels, if the movie is of a kind that can be analysed.
-
-    Parameters
-    ----------
-    page : tifffile.TiffPage
-        The first frame.
-    path : Path
-        What messages call the file.
-
-    Returns
-    -------
-    dtype
-        Unsigned or signed whole numbers, or floats.
-
-    Raises
-    ------
-    DataError
-        It holds colours, volumes, or pixels that are compressed with losses or of another type.
-    """
+    """Give the type of the pixels, if the movie is of a kind that can be analysed."""
     if page.samplesperpixel > 1:
         raise DataError(
             f"{path}: holds colour images ({page.samplesperpixel} samples per pixel); "
@@ -182,20 +116,7 @@ def pixel_type(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
 
 
 def refuse_differences(frames: Sequence[Image], path: Path) -> None:
-    """Refuse frames that are not all stored alike.
-
-    Parameters
-    ----------
-    frames : sequence of Image
-        In order.
-    path : Path
-        What messages call the file.
-
-    Raises
-    ------
-    DataError
-        One differs from the first.
-    """
+    """Refuse frames that are not all stored alike."""
     first = frames[0]
     for number, image in enumerate(frames):
         if image.encoding != first.encoding:
@@ -208,24 +129,7 @@ def refuse_differences(frames: Sequence[Image], path: Path) -> None:
 
 
 def refuse_growth(size: int, stored: int, ratio: int, what: str, path: Path) -> None:
-    """Refuse what decodes to far more than it was stored in.
-
-    Parameters
-    ----------
-    size, stored : int
-        Bytes decoded, and in the file.
-    ratio : int
-        Largest that a recording has.
-    what : str
-        What messages call it.
-    path : Path
-        What messages call the file.
-
-    Raises
-    ------
-    DataError
-        It would grow more than that.
-    """
+    """Refuse what decodes to far more than it was stored in."""
     if size > max(_BOMB_BYTES, ratio * stored):
         raise DataError(
             f"{path}: {what} would grow from {stored} to {size} bytes, which no recording does; "
@@ -234,18 +138,5 @@ def refuse_growth(size: int, stored: int, ratio: int, what: str, path: Path) -> 
 
 
 def damaged(path: Path, how: str) -> DataError:
-    """Make the error of a damaged file.
-
-    Parameters
-    ----------
-    path : Path
-        What messages call the file.
-    how : str
-        What is wrong with it.
-
-    Returns
-    -------
-    DataError
-        To be raised.
-    """
+    """Make the error of a damaged file."""
     return DataError(f"{path}: is damaged ({how}); export it again")

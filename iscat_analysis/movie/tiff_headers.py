@@ -22,21 +22,7 @@ _PLACES = {3: "H", 4: "I", 16: "Q"}  # types of number that may say where pixels
 
 @dataclass(frozen=True, slots=True)
 class Repetition:
-    """What an image must look like to be like another; `repetition_of` makes it.
-
-    Attributes
-    ----------
-    tiff : TiffFormat
-        Of the file.
-    tags : bytes
-        The list of tags, number first, with zeros where images may differ.
-    free : tuple of (int, int)
-        Where they may.
-    place : (str, int)
-        Format and position of the first byte of the pixels.
-    size : int
-        Bytes of pixels.
-    """
+    """What an image must look like to be like another; `repetition_of` makes it."""
 
     tiff: tifffile.TiffFormat
     tags: bytes
@@ -45,21 +31,7 @@ class Repetition:
     size: int
 
     def find(self, data: mmap.mmap, offset: int) -> tuple[int, int] | None:
-        """Compare an image.
-
-        Parameters
-        ----------
-        data : mmap
-            The whole file.
-        offset : int
-            Of the image's list of tags.
-
-        Returns
-        -------
-        start, following : int
-            First byte of its pixels and list of tags of the next image, 0 after the last; or None
-            where it is another kind of image, or lies outside the file.
-        """
+        """Compare an image."""
         end = offset + len(self.tags)
         here = bytearray(data[offset : end + self.tiff.offsetsize])
         if offset <= 0 or len(here) < len(self.tags) + self.tiff.offsetsize:
@@ -76,24 +48,7 @@ class Repetition:
 def repetition_of(
     tiff: tifffile.TiffFormat, data: mmap.mmap, offset: int, size: int
 ) -> Repetition | None:
-    """Take an image for a pattern.
-
-    Parameters
-    ----------
-    tiff : TiffFormat
-        Of the file.
-    data : mmap
-        The whole file.
-    offset : int
-        Of the image's list of tags.
-    size : int
-        Bytes of pixels.
-
-    Returns
-    -------
-    Repetition or None
-        None where the pixels do not lie in one piece.
-    """
+    """Take an image for a pattern."""
     (count,) = struct.unpack_from(tiff.tagnoformat, data, offset)
     length = tiff.tagnosize + count * tiff.tagsize
     tags = bytearray(data[offset : offset + length])

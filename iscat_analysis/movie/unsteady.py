@@ -37,15 +37,7 @@ _MOST = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 def unsteady_said(pixels: BoolArray) -> str:
     """Say which pixels are unsteady.
 
-    Parameters
-    ----------
-    pixels : ndarray of bool, shape (y, x)
-        From `find_unsteady`.
-
-    Returns
-    -------
-    str
-        One line.
+    Shapes: `pixels` (y, x).
     """
     number = int(pixels.sum())
     where = [
@@ -68,20 +60,7 @@ def find_unsteady(
 ) -> BoolArray | None:
     """Find pixels that flicker, switch or repeat themselves.
 
-    Parameters
-    ----------
-    blocks : sequence of ndarray, shape (t, y, x)
-        Frames next to each other, from several times of a movie [counts].
-    camera : Camera
-        Counts → photoelectrons.
-    least_beside : float
-        Part of what a pixel changes by, that those beside it change by in a particle's picture.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x), or None
-        None where there are none, too few frames or photoelectrons to tell, or so many that the
-        pixels are not to blame.
+    Shapes: `blocks` (t, y, x), result (y, x).
     """
     frames = np.array([len(block) for block in blocks])
     freedom = int((frames - 1).sum()), len(blocks) - 1

@@ -31,15 +31,7 @@ _FEWEST_AZIMUTHS, _MOST_AZIMUTHS = 64, 1024
 
 @dataclass(frozen=True)
 class Aperture:
-    """A pupil on a quadrature; build it with `aperture`.
-
-    Attributes
-    ----------
-    optics : Optics
-        The ``[optics]`` section.
-    pupil : Pupil
-        The unaberrated wave on the quadrature.
-    """
+    """A pupil on a quadrature; build it with `aperture`."""
 
     optics: Optics
     pupil: Pupil
@@ -87,15 +79,7 @@ class Aperture:
     def polarised(self, phi: FloatArray) -> ComplexArray:
         """Wave without its aberrations: along the reference's polarisation, and across it.
 
-        Parameters
-        ----------
-        phi : ndarray, shape (m,)
-            Azimuths [rad].
-
-        Returns
-        -------
-        complex ndarray, shape (2, n, m)
-            p*·A and the other component, before the analyser.
+        Shapes: `phi` (m,), result (2, n, m).
         """
         p, s = self.pupil.t_p_cos[:, None], self.pupil.t_s[:, None]
         if self.optics.polarization == "circular":
@@ -139,19 +123,7 @@ def harmonics(
 ) -> ComplexArray:
     """Fourier series along the azimuth, as far as it is not negligible.
 
-    Parameters
-    ----------
-    waves : complex ndarray, shape (k, n, m)
-        Pupil functions at m equally spaced azimuths.
-    weight : ndarray, shape (n,)
-        Moduli of the quadrature's weights, which say what is negligible.
-    negligible : float
-        Share of a function's light amplitude below which its harmonics are left out.
-
-    Returns
-    -------
-    complex ndarray, shape (k, 2·M + 1, n)
-        Harmonics −M…M.
+    Shapes: `waves` (k, n, m), `weight` (n,), result (k, 2·M + 1, n).
     """
     series = np.fft.fft(waves, axis=2) / waves.shape[2]
     size = (np.abs(series) * weight[:, None]).sum(1)
@@ -164,18 +136,7 @@ def harmonics(
 
 
 def critical_angle(optics: Optics) -> float | None:
-    """Return the angle in the oil at which light grazes the sample.
-
-    Parameters
-    ----------
-    optics : Optics
-        The microscope.
-
-    Returns
-    -------
-    float or None
-        The angle [rad]; None where the pupil does not come near it.
-    """
+    """Return the angle in the oil at which light grazes the sample."""
     near = NEAR_CRITICAL * optics.n_sample < optics.na and optics.n_sample < optics.n_immersion
     return math.asin(optics.n_sample / optics.n_immersion) if near else None
 
@@ -183,17 +144,7 @@ def critical_angle(optics: Optics) -> float | None:
 def aperture_on(optics: Optics, theta: FloatArray, weight: FloatArray) -> Aperture:
     """Make the pupil on given angles.
 
-    Parameters
-    ----------
-    optics : Optics
-        The microscope.
-    theta, weight : ndarray, shape (n,)
-        Quadrature [rad].
-
-    Returns
-    -------
-    Aperture
-        There.
+    Shapes: `theta, weight` (n,).
     """
     pupil = make_pupil(
         theta,
@@ -209,20 +160,7 @@ def aperture_on(optics: Optics, theta: FloatArray, weight: FloatArray) -> Apertu
 
 
 def aperture(optics: Optics, nodes: int, nodes_above: int) -> Aperture:
-    """Make the pupil on panels that end at the mask's edge and at the critical angle.
-
-    Parameters
-    ----------
-    optics : Optics
-        The microscope.
-    nodes, nodes_above : int
-        Nodes of each panel below the critical angle, and above.
-
-    Returns
-    -------
-    Aperture
-        Ready.
-    """
+    """Make the pupil on panels that end at the mask's edge and at the critical angle."""
     alpha = math.asin(optics.na / optics.n_immersion)
     edge = math.asin(optics.mask_na / optics.n_immersion)
     theta, weight = gauss_legendre(alpha, critical_angle(optics), nodes, nodes_above, edge)
@@ -234,19 +172,7 @@ def weight_on(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Weigh the components in the field's integral at z = 0, and give the phase per height.
 
-    Parameters
-    ----------
-    opening : Aperture
-        The pupil on its quadrature.
-    factor : complex
-        What multiplies the whole integral.
-    oil_nm : float
-        Excess thickness of the oil [nm].
-
-    Returns
-    -------
-    weight, axial : complex ndarray, shape (n,)
-        Factor of each direction; phase per height of the particle [rad/nm].
+    Shapes: `weight, axial` (n,).
     """
     optics, pupil = opening.optics, opening.pupil
     axial = pupil.axial

@@ -37,67 +37,19 @@ _SPREADS: list[float] = (2 - 6 * _TIMES + 6 * _TIMES**2).tolist()
 
 
 def spreads(variance_nm2: float, *, each_axis: bool = False) -> list[tuple[float, float]]:
-    """Give normal spreads that together are that of a path about its mean.
-
-    Parameters
-    ----------
-    variance_nm2 : float
-        Variance of the path along each axis [nm²].
-    each_axis : bool
-        For each axis by itself, where the average over both is taken as the product of two.  What
-        a product lacks of the fourth moment between the axes is then added to that along them, so
-        that the size of round pictures is right.
-
-    Returns
-    -------
-    list of (float, float)
-        Share of the exposure, and the variance then [nm²].
-    """
+    """Give normal spreads that together are that of a path about its mean."""
     wider = math.sqrt(4 / 3) if each_axis else 1.0
     ratios = [1 + wider * (v - 1) for v in _SPREADS]
     return [(share, variance_nm2 * v) for share, v in zip(_SHARES, ratios, strict=True)]
 
 
 def path_variance_nm2(d_um2_s: float, exposure_s: float) -> float:
-    """Variance of a path about its mean place during an exposure.
-
-    Parameters
-    ----------
-    d_um2_s : float
-        Diffusion coefficient along each axis [µm²/s].
-    exposure_s : float
-        Exposure [s].
-
-    Returns
-    -------
-    float
-        D E/3 along each axis [nm²].
-    """
+    """Variance of a path about its mean place during an exposure."""
     return d_um2_s * 1e6 * exposure_s / 3
 
 
 def blurred(model: ForwardModel, variance_nm2: float, *, upwards: bool) -> ForwardModel:
-    """Average a model over the path of a particle that diffuses.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Of a particle that stands still.
-    variance_nm2 : float
-        Variance of the path about its mean, along each axis [nm²].
-    upwards : bool
-        Whether the particle moves along z as well.
-
-    Returns
-    -------
-    ForwardModel
-        The same mass scale: amplitudes are those of a particle that stands still.
-
-    Raises
-    ------
-    ConfigError
-        The picture was measured, so that its waves are not known.
-    """
+    """Average a model over the path of a particle that diffuses."""
     if variance_nm2 == 0:
         return model
     wave = model.wave

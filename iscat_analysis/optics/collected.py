@@ -14,20 +14,6 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
 
     It is counted before mask and analyser; aberrations do not change it.  Multiplied by the
     background per area it gives the collected scattered photons.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Of the microscope and the particle's material.
-    z_nm : float
-        Height [nm]; evanescent waves weaken with it.
-    mass_kda : float
-        Mass [kDa].
-
-    Returns
-    -------
-    float
-        Area [nm²]; in dark field per unit incident intensity; NaN where the picture was measured.
     """
     if model.is_measured:
         return math.nan
@@ -42,21 +28,6 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
 
 
 def photons_per_intensity(model: ForwardModel, photons_per_frame: float, pixel_nm: float) -> float:
-    """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|².
-
-    Parameters
-    ----------
-    model : ForwardModel
-        In dark field.
-    photons_per_frame : float
-        Scattered photons collected per frame from a particle of the nominal mass.
-    pixel_nm : float
-        Pixel side [nm].
-
-    Returns
-    -------
-    float
-        s.
-    """
+    """Dark field's scale s: photoelectrons per pixel and frame for unit |E_sca|²."""
     area = collected_area_nm2(model, model.height_nm, model.material.mass_kda)
     return photons_per_frame * pixel_nm**2 / area

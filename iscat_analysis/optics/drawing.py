@@ -15,20 +15,7 @@ FloatArray = NDArray[np.float64]
 def signals_within(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> FloatArray:
     """Draw particles, each by itself, that are within the reach of their model.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Of all of them.
-    grid : PixelGrid
-        Where to evaluate them.
-    theta : ndarray, shape (n, 4)
-        x, y, z [nm] and amplitude of each.
-
-    Returns
-    -------
-    ndarray, shape (n, ny, nx)
-        As `ForwardModel.amplitude_image` gives them; 0 where it would refuse, because the grid
-        extends farther from the particle than ``reach_nm``.
+    Shapes: `theta` (n, 4), result (n, ny, nx).
     """
     far_x, far_y = (
         np.maximum(np.abs(axis[0] - place), np.abs(axis[-1] - place)) + grid.pixel_nm / 2

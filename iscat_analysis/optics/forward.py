@@ -74,35 +74,7 @@ def forward_model(
     nodes: int | None = None,
     like: ForwardModel | None = None,
 ) -> ForwardModel:
-    """Build the forward model of a configuration.
-
-    Parameters
-    ----------
-    config : Config
-        Optics, camera, particle and calibration are used.
-    reach_nm : float
-        Largest distance from the particle at which images are wanted [nm].
-    z_max_nm : float, optional
-        Largest height that will be asked for; default the larger of ``fit.z_range_nm`` and
-        ``particle.height_nm`` [nm].  It sets the number of quadrature nodes.
-    nodes : int, optional
-        Quadrature nodes per panel, or of D21's rectangle rule; by default chosen from the phase
-        that turns across the pupil.
-    like : ForwardModel, optional
-        A neighbour in a scan; its Bessel table is taken over where it is the same.
-
-    Returns
-    -------
-    ForwardModel
-        Ready to evaluate.
-
-    Raises
-    ------
-    ConfigError
-        The particle's material has no data at this wavelength.
-    ContrastError
-        A calibration has the sign that this focus cannot give.
-    """
+    """Build the forward model of a configuration."""
     optics = config.optics
     if config.calibration is not None:
         reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
@@ -170,55 +142,20 @@ def forward_model(
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
-    """Put a measured picture in the place of the computed one.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        An interferometric microscope; it gives the scale of masses: its peak contrast per kDa.
-    template : Template
-        The picture.
-
-    Returns
-    -------
-    ForwardModel
-        With the same peak contrast, of the template's sign.
-    """
+    """Put a measured picture in the place of the computed one."""
     wave = MeasuredField(template, peak_per_amplitude(model), model.reach_nm)
     return replace(model, wave=wave, scale=MassScale())
 
 
 def peak_per_amplitude(model: ForwardModel) -> float:
-    """Give the magnitude of the peak contrast of a faint particle, per unit amplitude.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        An interferometric microscope, at the height for which it was focused.
-
-    Returns
-    -------
-    float
-        Contrast per unit amplitude.
-    """
+    """Give the magnitude of the peak contrast of a faint particle, per unit amplitude."""
     if isinstance(model.wave, MeasuredField):
         return model.wave.gain
     return abs(signed_peak(model))
 
 
 def signed_peak(model: ForwardModel) -> float:
-    """Give the peak contrast of a faint particle, per unit amplitude.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        As for `peak_per_amplitude`, and computed from optics.
-
-    Returns
-    -------
-    float
-        Contrast per unit amplitude; negative where the particle is dark.
-    """
+    """Give the peak contrast of a faint particle, per unit amplitude."""
     weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
     linear, _ = model.wave.peak(model.height_nm, weak, model.rho)
     return linear / weak

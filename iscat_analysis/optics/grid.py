@@ -16,20 +16,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PixelGrid:
-    """Pixel centres on a regular grid; x along columns, y down the rows.
-
-    Attributes
-    ----------
-    x_nm, y_nm : ndarray, shape (nx,), (ny,)
-        Centres [nm].
-    pixel_nm : float
-        Side of a pixel [nm].
-
-    Raises
-    ------
-    DataError
-        The centres are not finite numbers that ascend, or the side is not positive.
-    """
+    """Pixel centres on a regular grid; x along columns, y down the rows."""
 
     x_nm: FloatArray
     y_nm: FloatArray

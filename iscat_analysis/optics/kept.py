@@ -16,18 +16,6 @@ def kept(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
 
     Threads that ask for the same at the same time wait for the one that makes it; with
     `functools.lru_cache` each would make its own.
-
-    Parameters
-    ----------
-    size : int
-        Number of results that are kept.
-    make : callable
-        The function; its arguments are hashable.
-
-    Returns
-    -------
-    callable
-        The function with its results at hand.
     """
 
     @lru_cache(size)

@@ -85,17 +85,7 @@ _KINDS = {
 
 @dataclass(frozen=True)
 class Material:
-    """What the scattering of a particle depends on.
-
-    Attributes
-    ----------
-    permittivity : complex
-        Relative permittivity at the wavelength.
-    density_kg_m3 : float
-        Mass density [kg/m³].
-    mass_kda : float
-        Nominal mass: start value of fits, truth of simulations [kDa].
-    """
+    """What the scattering of a particle depends on."""
 
     permittivity: complex
     density_kg_m3: float
@@ -103,25 +93,7 @@ class Material:
 
 
 def material(particle: Particle, wavelength_nm: float) -> Material:
-    """Resolve a particle of the configuration at a wavelength.
-
-    Parameters
-    ----------
-    particle : Particle
-        The ``[particle]`` section.
-    wavelength_nm : float
-        Vacuum wavelength [nm].
-
-    Returns
-    -------
-    Material
-        Permittivity, density and nominal mass.
-
-    Raises
-    ------
-    ConfigError
-        The wavelength lies outside the table of the material.
-    """
+    """Resolve a particle of the configuration at a wavelength."""
     kind = _KINDS.get(particle.kind)
     if particle.permittivity is not None:
         permittivity = complex(*particle.permittivity)

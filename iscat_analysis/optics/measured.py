@@ -37,25 +37,7 @@ _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The contrast of a faint particle, measured.
-
-    Attributes
-    ----------
-    contrast : ndarray, shape (n, n)
-        On a square lattice around the particle, rows along y; the largest magnitude anywhere is 1.
-    sigma : ndarray, shape (n, n)
-        Its standard deviation.
-    step_nm : float
-        Step of the lattice [nm].
-    pixel_nm : float
-        Side of the pixels that it was measured with [nm].
-    roi_nm : float
-        Side of the square around a particle in which it is known [nm].
-    peak_se : float
-        Relative standard error of the peak, which is common to all contrasts.
-    sights : int
-        Pictures that made it.
-    """
+    """The contrast of a faint particle, measured."""
 
     contrast: FloatArray
     sigma: FloatArray
@@ -74,23 +56,7 @@ class Template:
 
     @classmethod
     def read(cls, path: Path) -> Template:
-        """Read what `to_bytes` gave.
-
-        Parameters
-        ----------
-        path : Path
-            The file.
-
-        Returns
-        -------
-        Template
-            The template.
-
-        Raises
-        ------
-        ConfigError
-            It cannot be read, or is no template.
-        """
+        """Read what `to_bytes` gave."""
         try:
             content = path.read_bytes()
         except OSError as error:
@@ -98,20 +64,7 @@ class Template:
         return _parsed(str(path), content)
 
     def refuse_mismatch(self, pixel_nm: float | None, roi_nm: float) -> None:
-        """Refuse pixels or squares that the template was not measured with.
-
-        Parameters
-        ----------
-        pixel_nm : float or None
-            Pixel side, where it is known [nm].
-        roi_nm : float
-            Side of the fitted square [nm].
-
-        Raises
-        ------
-        ConfigError
-            Another pixel size, or a larger square.
-        """
+        """Refuse pixels or squares that the template was not measured with."""
         if pixel_nm is not None and abs(pixel_nm / self.pixel_nm - 1) > _SAME_PIXEL:
             raise ConfigError(
                 f"optics.template was measured with pixels of {self.pixel_nm:g} nm, and "
@@ -126,18 +79,7 @@ class Template:
 
 
 def sha256_of(content: bytes) -> str:
-    """Give the checksum that ``optics.toml`` names its template with.
-
-    Parameters
-    ----------
-    content : bytes
-        Of the file.
-
-    Returns
-    -------
-    str
-        Hexadecimal SHA-256.
-    """
+    """Give the checksum that ``optics.toml`` names its template with."""
     return hashlib.sha256(content).hexdigest()
 
 
@@ -157,18 +99,7 @@ def _parsed(name: str, content: bytes) -> Template:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredField:
-    """Field of a measured picture, at all heights the same; beside `RadialField`.
-
-    Attributes
-    ----------
-    template : Template
-        The picture.
-    gain : float
-        Its peak per unit amplitude.
-    reach_nm : float
-        Largest distance from the particle at which images are wanted; nothing is seen beyond the
-        template [nm].
-    """
+    """Field of a measured picture, at all heights the same; beside `RadialField`."""
 
     template: Template
     gain: float
@@ -257,18 +188,5 @@ class MeasuredField:
 
 
 def lattice_step_nm(wavelength_nm: float, n_glass: float) -> float:
-    """Step of the lattice on which light of a wavelength is known, whatever the pupil.
-
-    Parameters
-    ----------
-    wavelength_nm : float
-        In vacuum [nm].
-    n_glass : float
-        Index that no numerical aperture reaches.
-
-    Returns
-    -------
-    float
-        Step [nm].
-    """
+    """Step of the lattice on which light of a wavelength is known, whatever the pupil."""
     return LATTICE_STEP * wavelength_nm / (2 * math.pi * n_glass)

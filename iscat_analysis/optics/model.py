@@ -44,40 +44,7 @@ _TABLES_KEPT = 4  # heights whose derivatives or tables are at hand, some MB eac
 
 @dataclass(frozen=True)
 class ForwardModel:
-    """Expected images of one particle in one microscope; build it with `forward_model`.
-
-    Attributes
-    ----------
-    optics : Optics
-        The ``[optics]`` section.
-    material : Material
-        Permittivity, density, nominal mass.
-    aperture : Aperture
-        The pupil on its quadrature.
-    height_nm : float
-        The height for which the focus was set [nm].
-    reference : float
-        |E_ref| for unit incident amplitude; 0 in dark field.
-    rho : float
-        1 with a reference, 0 in dark field: the reference in the unit of the field.
-    factor : complex
-        What multiplies the field's integral over the pupil, per unit amplitude and over the
-        reference.
-    oil_nm : float
-        Excess thickness of the oil that stays when the particle moves [nm].
-    wave : RadialField, LatticeField or MeasuredField
-        The scattered field, tabulated.
-    strength : complex
-        E1·e^{iψ0} per unit amplitude [nm].
-    reach_nm : float
-        Largest distance from the particle that images may have [nm].
-    z_range_nm : (float, float)
-        Heights that fits may ask for [nm].
-    samples : (ndarray, ndarray)
-        Sample offsets inside a pixel, as fractions of it, and their weights.
-    scale : MassScale
-        Mass ↔ amplitude.
-    """
+    """Expected images of one particle in one microscope; build it with `forward_model`."""
 
     optics: Optics
     material: Material
@@ -125,21 +92,7 @@ class ForwardModel:
         return self.scale.amplitude(self.material.mass_kda)
 
     def profile(self, z_nm: float, orders: int = 2) -> FloatArray:
-        """Profile of the field at a height.
-
-        Parameters
-        ----------
-        z_nm : float
-            Height [nm].
-        orders : int
-            1, 2 or 3: fields, with ∂/∂z, with ∂²/∂z².
-
-        Returns
-        -------
-        ndarray
-            See `iscat_analysis._kernels.radial` and `iscat_analysis._kernels.lattice`.  The last
-            few are kept: not to be written to.
-        """
+        """Profile of the field at a height."""
         return self.wave.profile(z_nm, orders)
 
     @cached_property
@@ -148,18 +101,7 @@ class ForwardModel:
         return axial_table(self.wave, self.z_range_nm)
 
     def height_table(self, z_nm: float) -> AxialTable:
-        """Profiles at one height, in the form of `axial_table`; the last few are kept.
-
-        Parameters
-        ----------
-        z_nm : float
-            Height [nm].
-
-        Returns
-        -------
-        AxialTable
-            For kernels that stay at this height.
-        """
+        """Profiles at one height, in the form of `axial_table`; the last few are kept."""
         return self._height_tables(z_nm)
 
     @cached_property
@@ -167,22 +109,7 @@ class ForwardModel:
         return kept(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def picture_table(self, pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
-        """Picture at `height_nm` on the pixels' own grid; the last few are kept.
-
-        Parameters
-        ----------
-        pixel_nm : float
-            Side of a pixel [nm].
-        half_px : int
-            Largest distance of a pixel from the particle along an axis [pixels].
-
-        Returns
-        -------
-        lens : Lens
-            How the kernels take it.
-        table : AxialTable
-            For kernels that stay at this height; see `iscat_analysis.optics.stamp`.
-        """
+        """Picture at `height_nm` on the pixels' own grid; the last few are kept."""
         return self._picture_tables(pixel_nm, half_px)
 
     @cached_property
@@ -198,19 +125,7 @@ class ForwardModel:
     ) -> FloatArray:
         """Signal of one particle.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        mass_kda : float
-            Mass [kDa]; negative for a field of opposite sign.
-
-        Returns
-        -------
-        ndarray, shape (ny, nx)
-            Contrast C, or |E_sca|² in dark field.
+        Shapes: result (ny, nx).
         """
         return self.amplitude_image(grid, x_nm, y_nm, z_nm, self.scale.amplitude(mass_kda))
 
@@ -222,19 +137,7 @@ class ForwardModel:
         Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
         an amplitude must be drawn from it.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        amplitude : float
-            Amplitude, see `MassScale`.
-
-        Returns
-        -------
-        ndarray, shape (ny, nx)
-            As `image` gives it.
+        Shapes: result (ny, nx).
         """
         out = np.empty(grid.shape)
         signal_image(self.profile(z_nm, 1), *self._geometry(grid, x_nm, y_nm, amplitude), out)
@@ -245,21 +148,7 @@ class ForwardModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Signal and its analytic derivatives.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        mass_kda : float
-            Mass [kDa].
-
-        Returns
-        -------
-        signal : ndarray, shape (ny, nx)
-            As `image` gives it.
-        gradient : ndarray, shape (4, ny, nx)
-            Derivatives with respect to x, y, z [1/nm] and mass [1/kDa].
+        Shapes: `signal` (ny, nx), `gradient` (4, ny, nx).
         """
         amplitude = self.scale.amplitude(mass_kda)
         signal, gradient = self.amplitude_gradient(grid, x_nm, y_nm, z_nm, amplitude)
@@ -271,21 +160,7 @@ class ForwardModel:
     ) -> tuple[FloatArray, FloatArray]:
         """Signal and its derivatives in (x, y, z, a), a the amplitude.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        amplitude : float
-            Amplitude, see `MassScale`.
-
-        Returns
-        -------
-        signal : ndarray, shape (ny, nx)
-            As `image` gives it.
-        gradient : ndarray, shape (4, ny, nx)
-            Derivatives with respect to x, y, z [1/nm] and the amplitude.
+        Shapes: `signal` (ny, nx), `gradient` (4, ny, nx).
         """
         rows = np.empty((grid.shape[0], 5, grid.shape[1]))
         signal_gradient(self.profile(z_nm, 2), *self._geometry(grid, x_nm, y_nm, amplitude), rows)
@@ -297,23 +172,7 @@ class ForwardModel:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Signal, gradient and second derivatives in (x, y, z, a), a the amplitude.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        amplitude : float
-            Amplitude, see `MassScale`.
-
-        Returns
-        -------
-        signal : ndarray, shape (ny, nx)
-            As `image` gives it.
-        gradient : ndarray, shape (4, ny, nx)
-            First derivatives.
-        hessian : ndarray, shape (4, 4, ny, nx)
-            Second derivatives.
+        Shapes: `signal` (ny, nx), `gradient` (4, ny, nx), `hessian` (4, 4, ny, nx).
         """
         rows = self.derivative_rows(grid, np.array([x_nm, y_nm, z_nm, amplitude]))
         out = np.moveaxis(rows, 1, 0)
@@ -327,20 +186,7 @@ class ForwardModel:
     ) -> FloatArray:
         """Signal and its derivatives up to the second, as the kernels of a fit take them.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate them.
-        theta : ndarray, shape (4,) or more
-            x, y, z [nm] and amplitude.
-        height : {"exact", "between", "fixed"}
-            Between the heights of `axial_table` second derivatives are known to 1e-6 of the
-            largest.  Where the height is fixed those in z may be 0.
-
-        Returns
-        -------
-        ndarray, shape (ny, ROWS, nx)
-            See `iscat_analysis._kernels.hessian.signal_hessian`.
+        Shapes: `theta` (4,), result (ny, ROWS, nx).
         """
         rows = np.empty((grid.shape[0], ROWS, grid.shape[1]))
         x, y, z, amplitude = (float(value) for value in theta[:4])
@@ -364,32 +210,7 @@ class ForwardModel:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Signal and its analytic derivatives with respect to particle and microscope.
 
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        mass_kda : float
-            Mass [kDa].
-        names : sequence of str
-            Parameters of ``[optics]``: ``focus_nm``, ``na``, ``reference_phase_deg``, ``mask_na``,
-            ``attenuation`` and ``z5`` to ``z37`` [nm].
-
-        Returns
-        -------
-        signal : ndarray, shape (ny, nx)
-            As `image` gives it, to a part in 10⁶.
-        own : ndarray, shape (4, ny, nx)
-            As `gradient` gives it, to a part in 10⁵.
-        shared : ndarray, shape (len(names), ny, nx)
-            Per unit of each parameter, at fixed amplitude of the scattered field: where a
-            calibration ties mass to contrast, the mass of that amplitude changes with the optics.
-
-        Raises
-        ------
-        ConfigError
-            A name is unknown, or the convention is D21's.
+        Shapes: `signal` (ny, nx), `own` (4, ny, nx), `shared` (len(names).
         """
         amplitude = self.scale.amplitude(mass_kda)
         signal, own, shared = self.amplitude_joint_gradient(
@@ -407,29 +228,7 @@ class ForwardModel:
         amplitude: float,
         names: Sequence[str],
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Signal and its derivatives for an amplitude instead of a mass, see `amplitude_image`.
-
-        Parameters
-        ----------
-        grid : PixelGrid
-            Where to evaluate it.
-        x_nm, y_nm, z_nm : float
-            Particle [nm].
-        amplitude : float
-            Amplitude, see `MassScale`.
-        names : sequence of str
-            As in `joint_gradient`.
-
-        Returns
-        -------
-        signal, own, shared : ndarray
-            As `joint_gradient` gives them, with ∂/∂amplitude in place of ∂/∂mass.
-
-        Raises
-        ------
-        ConfigError
-            A name is unknown, or the convention is D21's.
-        """
+        """Signal and its derivatives for an amplitude instead of a mass, see `amplitude_image`."""
         check_names(self.optics, names)
         if self.is_measured:
             raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
@@ -458,58 +257,17 @@ class ForwardModel:
     ) -> ComplexArray:
         """Scattered field over the reference (dark field: over the incident amplitude).
 
-        Parameters
-        ----------
-        dx_nm, dy_nm : ndarray
-            Camera position minus the particle's [nm], same shape.
-        z_nm : float
-            Height [nm].
-        mass_kda : float
-            Mass [kDa].
-
-        Returns
-        -------
-        complex ndarray, shape (1 or 2, *dx_nm.shape)
-            Component along the reference's polarisation p, and, without an analyser, the other:
-            across it where p is linear, along p* where it is circular.
+        Shapes: result (1 or 2, *dx_nm.shape).
         """
         amplitude = self.scale.amplitude(mass_kda)
         return amplitude * self.wave.components(dx_nm, dy_nm, z_nm)
 
     def peak_contrast(self, z_nm: float, mass_kda: float) -> float:
-        """Signal of largest magnitude over the plane, with its sign.
-
-        Parameters
-        ----------
-        z_nm : float
-            Height [nm].
-        mass_kda : float
-            Mass [kDa].
-
-        Returns
-        -------
-        float
-            Peak contrast, or the peak of |E_sca|² in dark field.
-        """
+        """Signal of largest magnitude over the plane, with its sign."""
         return self.amplitude_contrast(z_nm, self.scale.amplitude(mass_kda))
 
     def amplitude_contrast(self, z_nm: float, amplitude: float, height: str = "exact") -> float:
-        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`.
-
-        Parameters
-        ----------
-        z_nm : float
-            Height [nm].
-        amplitude : float
-            Amplitude, see `MassScale`.
-        height : {"exact", "between"}
-            As in `derivative_rows`; of a height that only one fit asks for.
-
-        Returns
-        -------
-        float
-            Peak contrast, or the peak of |E_sca|² in dark field.
-        """
+        """Peak contrast of an amplitude; see `peak_contrast` and `amplitude_image`."""
         if height == "exact" or isinstance(self.wave, MeasuredField):
             return sum(self.wave.peak(z_nm, amplitude, self.rho))
         if isinstance(self.wave, RadialField):

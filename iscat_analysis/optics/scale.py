@@ -24,13 +24,6 @@ class MassScale:
     contrast up to the offset belongs to two masses of opposite sign, which differ by twice this
     mass; `mass` gives the one whose sign the contrast has.  Where it is negative, contrasts below
     the offset belong to none, and `mass` continues the line, below zero.
-
-    Attributes
-    ----------
-    calibration : Calibration or None
-        The line.
-    linear, quadratic : float
-        L and Q, per unit amplitude.
     """
 
     calibration: Calibration | None = None
@@ -73,16 +66,6 @@ class MassScale:
 
         The scattered field is in proportion to the mass, and the contrast has its square: what a
         line makes of C = L·a + Q·a² is too small by −Q·a/L, where the standards are faint.
-
-        Parameters
-        ----------
-        mass_kda : ndarray
-            Masses by the line [kDa].
-
-        Returns
-        -------
-        ndarray, same shape
-            True mass over that of the line, less 1; 0 without a calibration.
         """
         sizes = np.abs(np.asarray(mass_kda, dtype=float))
         if self.calibration is None:
@@ -101,23 +84,7 @@ class MassScale:
     def off_line(
         self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
     ) -> NDArray[np.bool_]:
-        """Tell whose contrasts are no single mass on the line of a calibration.
-
-        Parameters
-        ----------
-        amplitude : ndarray
-            Amplitudes.
-        sigma_kda : ndarray, same shape
-            Standard deviations of their masses [kDa].
-        errors : float
-            How many of them count as the reach of the data.
-
-        Returns
-        -------
-        ndarray of bool, same shape
-            Where another mass has the same contrast, or would within the reach of the data, and is
-            farther away than one standard deviation; and where no mass has it within that reach.
-        """
+        """Tell whose contrasts are no single mass on the line of a calibration."""
         amplitude, sigma_kda = np.asarray(amplitude, dtype=float), np.asarray(sigma_kda)
         if self.calibration is None or self.calibration.offset == 0.0:
             return np.zeros(amplitude.shape, dtype=np.bool_)

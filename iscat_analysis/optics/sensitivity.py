@@ -38,20 +38,7 @@ COARSER = 2
 
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
-    """Refuse what has no derivative.
-
-    Parameters
-    ----------
-    optics : Optics
-        The microscope.
-    names : sequence of str
-        Parameters asked for.
-
-    Raises
-    ------
-    ConfigError
-        A name is unknown, or the paper's convention, whose quadrature has no derivative, is set.
-    """
+    """Refuse what has no derivative."""
     unknown = [name for name in names if name not in MEASURABLE]
     if unknown:
         raise ConfigError(f"names = {unknown}: choose among {', '.join(MEASURABLE)}")
@@ -76,27 +63,7 @@ def sensitivity_lattices(
 ) -> tuple[LatticeLens, FloatArray]:
     """Lattices of the field and of its derivatives at one height.
 
-    Parameters
-    ----------
-    opening : Aperture
-        The pupil on the model's quadrature.
-    weight_on : callable
-        See `Weight`.
-    z_nm : float
-        Height [nm].
-    names : tuple of str
-        Parameters.
-    rho : float
-        1 with a reference, 0 in dark field.
-    reach_nm : float
-        Largest distance from the particle [nm].
-
-    Returns
-    -------
-    lens : LatticeLens
-        How the kernels read them.
-    stack : ndarray, shape (2 + len(names), components, 2, nodes, nodes)
-        The field's lattice, that of its derivative along z, then that of each parameter.
+    Shapes: `stack` (2 + len(names).
     """
     optics = opening.optics
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
@@ -160,23 +127,7 @@ def signal_derivatives(
 ) -> FloatArray:
     """Combine lattices to derivatives of the signal.
 
-    Parameters
-    ----------
-    stack : ndarray, shape (2 + n, components, 2, nodes, nodes)
-        From `sensitivity_lattices`.
-    lens : LatticeLens
-        Beside them.
-    pixels : Pixels
-        Where.
-    x_nm, y_nm : float
-        Particle [nm].
-    amplitude : float
-        a.
-
-    Returns
-    -------
-    ndarray, shape (n, ny, nx)
-        Derivatives, at fixed amplitude.
+    Shapes: `stack` (2 + n, components, 2, nodes, nodes), result (n, ny, nx).
     """
     count, components = stack.shape[:2]
     out = np.empty((count, pixels.y.size, pixels.x.size))

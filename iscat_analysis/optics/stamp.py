@@ -41,42 +41,14 @@ _POINTS = 24  # of the quadrature over each band
 
 
 def samples_per_pixel(optics: Optics, pixel_nm: float, band: float = BAND) -> int:
-    """Give how many samples per pixel the picture needs along each axis.
-
-    Parameters
-    ----------
-    optics : Optics
-        Of the model.
-    pixel_nm : float
-        Side of a pixel [nm].
-    band : float
-        Largest u of the interference.
-
-    Returns
-    -------
-    int
-        At least 1.
-    """
+    """Give how many samples per pixel the picture needs along each axis."""
     bandwidth = 2 * math.pi / optics.wavelength_nm * optics.na
     bandwidth *= 2 if optics.scheme == "darkfield" else 1
     return max(1, math.ceil(bandwidth * pixel_nm / band))
 
 
 def margin_nm(optics: Optics, pixel_nm: float) -> float:
-    """Give how far a model must reach beyond the pixels for its picture to be known at all of them.
-
-    Parameters
-    ----------
-    optics : Optics
-        Of the model.
-    pixel_nm : float
-        Side of a pixel [nm].
-
-    Returns
-    -------
-    float
-        Distance along an axis [nm].
-    """
+    """Give how far beyond the pixels a model must reach to be known at all of them."""
     return pixel_nm + TAPS / 2 * pixel_nm / samples_per_pixel(optics, pixel_nm)
 
 
@@ -85,24 +57,7 @@ def sample_picture(
 ) -> tuple[StampLens, FloatArray]:
     """Sample the picture of a particle at the model's height.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        The picture.
-    pixel_nm : float
-        Side of a pixel [nm].
-    half_px : float
-        Largest distance of a pixel from the particle along an axis [pixels].
-    band : float
-        Largest u of the interference.
-
-    Returns
-    -------
-    lens : StampLens
-        How the kernels take it; sharp.
-    samples : ndarray, shape (2, nodes, nodes)
-        P and Q of a P + a² Q, columns in the order that `iscat_analysis._kernels.stamp` needs; 0
-        beyond the model's reach.
+    Shapes: `samples` (2, nodes, nodes).
     """
     fine = samples_per_pixel(model.optics, pixel_nm, band)
     step = pixel_nm / fine
@@ -137,17 +92,7 @@ def sample_picture(
 def weights_between(variance: float, band: float = BAND) -> FloatArray:
     """Weights of the samples around a place, for a blur.
 
-    Parameters
-    ----------
-    variance : float
-        Of the blur, in units of the squared distance of the samples.
-    band : float
-        Largest u of the interference.
-
-    Returns
-    -------
-    ndarray, shape (degree + 1, TAPS)
-        Coefficients of the powers of t ∈ [0, 1), the place after the fourth sample.
+    Shapes: result (degree + 1, TAPS).
     """
     points, quadrature = np.polynomial.legendre.leggauss(_POINTS)
     u = band * np.concatenate([(points + 1) / 2, (points + 3) / 2])

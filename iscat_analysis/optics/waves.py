@@ -53,20 +53,7 @@ _AT_ONCE = 16  # heights of the axial table made together
 
 
 def check_table(what: str, numbers: float) -> None:
-    """Refuse a table that would not fit into the memory, before it is allocated.
-
-    Parameters
-    ----------
-    what : str
-        What the message calls it.
-    numbers : float
-        How many 8-byte numbers it holds.
-
-    Raises
-    ------
-    ConfigError
-        It is larger than `TABLE_LIMIT_MB`.
-    """
+    """Refuse a table that would not fit into the memory, before it is allocated."""
     megabytes = 8e-6 * numbers
     if megabytes > TABLE_LIMIT_MB:
         raise ConfigError(
@@ -79,25 +66,7 @@ def check_table(what: str, numbers: float) -> None:
 
 @dataclass(frozen=True)
 class RadialField:
-    """Field of a pupil whose only direction is the polarisation's.
-
-    Attributes
-    ----------
-    source : complex ndarray, shape (2, n)
-        Pupil weights of F0 and F2 at z = 0.
-    axial : complex ndarray, shape (n,)
-        Phase per height of the particle [rad/nm].
-    transverse : ndarray, shape (n,)
-        Transverse wavenumbers [rad/nm].
-    table : ndarray, shape (2, n, 3, intervals + 1)
-        Bessel matrices.
-    step_nm : float
-        Radial step [nm].
-    psi : float
-        Angle of the polarisation [rad].
-    circular, analyzer : bool
-        State of polarisation, and whether only the reference's is seen.
-    """
+    """Field of a pupil whose only direction is the polarisation's."""
 
     source: ComplexArray
     axial: ComplexArray
@@ -181,21 +150,7 @@ class RadialField:
 
 @dataclass(frozen=True)
 class LatticeField:
-    """Field of any pupil.
-
-    Attributes
-    ----------
-    harmonics : complex ndarray, shape (components, 2·M + 1, n)
-        Azimuthal harmonics −M…M of the pupil weights at z = 0.
-    axial : complex ndarray, shape (n,)
-        Phase per height of the particle [rad/nm].
-    transverse : ndarray, shape (n,)
-        Transverse wavenumbers [rad/nm].
-    band : float
-        The largest transverse wavenumber, k·NA [rad/nm].
-    reach_nm : float
-        Largest distance from the particle at which images are wanted [nm].
-    """
+    """Field of any pupil."""
 
     harmonics: ComplexArray
     axial: ComplexArray
@@ -354,20 +309,7 @@ Field = RadialField | LatticeField | MeasuredField
 
 
 def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
-    """Profiles along z, for the kernels that interpolate there.
-
-    Parameters
-    ----------
-    field : RadialField, LatticeField or MeasuredField
-        The field.
-    z_range_nm : (float, float)
-        Heights to cover [nm].
-
-    Returns
-    -------
-    AxialTable
-        Profiles on a grid of heights, with what turns them into any height between.
-    """
+    """Profiles along z, for the kernels that interpolate there."""
     low, high = z_range_nm
     kappa = float(field.axial.real.min() + field.axial.real.max()) / 2
     step = STEP / float(np.abs(field.axial - kappa).max())
@@ -392,27 +334,7 @@ def radial_field(
 ) -> RadialField:
     """Tabulate a round pupil.
 
-    Parameters
-    ----------
-    source, axial : ndarray, complex
-        As in `RadialField`.
-    transverse : ndarray, shape (n,)
-        Transverse wavenumbers [rad/nm].
-    band : float
-        The largest of them [rad/nm].
-    reach_nm : float
-        Largest distance wanted [nm].
-    psi : float
-        As in `RadialField`.
-    circular, analyzer : bool
-        As in `RadialField`.
-    like : RadialField or None
-        One whose Bessel table is taken over where it is the same.
-
-    Returns
-    -------
-    RadialField
-        Ready.
+    Shapes: `transverse` (n,).
     """
     step = STEP / band
     intervals = math.ceil(reach_nm / step) + 1

@@ -27,27 +27,7 @@ LARGEST_RATIO = 1e9
 
 @dataclass(frozen=True)
 class Counts:
-    """Regions of one size under one microscope; build it with `gather`.
-
-    Attributes
-    ----------
-    config : Config
-        Microscope, particle and camera.
-    model : ForwardModel
-        Reaches over a region from wherever a fit may move.
-    grid : PixelGrid
-        Of every region.
-    before, after : ndarray, shape (n, y, x)
-        Photoelectrons [e].
-    ratio : ndarray, shape (n,)
-        Light after over light before.
-    level : bool
-        Whether a common level is fitted.
-    n_before, n_after : int
-        Frames.
-    masked, saturated : ndarray of bool, shape (n, y, x)
-        Pixels to leave out, and the saturated ones among them.
-    """
+    """Regions of one size under one microscope; build it with `gather`."""
 
     config: Config
     model: ForwardModel
@@ -62,18 +42,7 @@ class Counts:
     saturated: BoolArray
 
     def likelihood(self, index: int) -> Likelihood:
-        """Likelihood of one region.
-
-        Parameters
-        ----------
-        index : int
-            Which.
-
-        Returns
-        -------
-        Likelihood
-            Conditional where the background is measured and interferes, Poisson otherwise.
-        """
+        """Likelihood of one region."""
         read = float(self.config.camera.read_noise_e) ** 2
         ratio = float(self.ratio[index])
         return counts_likelihood(
@@ -87,20 +56,7 @@ class Counts:
         )  # fmt: skip
 
     def collected(self, index: int, z_nm: float, mass_kda: float) -> float:
-        """Scattered photons that the pupil collected in the frames after.
-
-        Parameters
-        ----------
-        index : int
-            Which region.
-        z_nm, mass_kda : float
-            Its particle.
-
-        Returns
-        -------
-        float
-            Photoelectrons.
-        """
+        """Scattered photons that the pupil collected in the frames after."""
         area = collected_area_nm2(self.model, z_nm, mass_kda) / self.grid.pixel_nm**2
         ratio = float(self.ratio[index])
         if not self.model.rho:
@@ -129,30 +85,7 @@ def gather(
 ) -> Counts:
     """Check counts and what is said of them.
 
-    Parameters
-    ----------
-    config : Config
-        From `config_of`.
-    before, after : array_like, shape (n, y, x)
-        As in `fit_rois`.
-    n_before, n_after : int
-        As in `fit_rois`.
-    power_ratio : array_like, optional
-        As in `fit_rois`.
-    level : bool, optional
-        As in `fit_rois`.
-    masked, saturated : array_like, optional
-        As in `fit_rois`.
-
-    Returns
-    -------
-    Counts
-        Ready to be fitted.
-
-    Raises
-    ------
-    ConfigError, DataError
-        As in `fit_rois`.
+    Shapes: `before, after` (n, y, x).
     """
     frames_before = int(number_in("n_before", n_before, least=0, whole=True))
     frames_after = int(number_in("n_after", n_after, least=1, whole=True))

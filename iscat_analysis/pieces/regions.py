@@ -157,21 +157,7 @@ def fit_rois(
 
 
 def lines_from(lines: Sequence[Mapping[str, Any]], *further: str) -> pd.DataFrame:
-    """Put fits below one another.
-
-    Parameters
-    ----------
-    lines : sequence of mapping
-        From `line_of`; what one does not have is empty.
-    *further : str
-        Columns beside `EVENT_COLUMNS` that all of them have, of whole numbers.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `EVENT_COLUMNS` but for ``event``, and `further`; a frame that is not known is
-        empty.
-    """
+    """Put fits below one another."""
     names = [name for name in (*EVENT_COLUMNS, *further) if name != "event"]
     table = pd.DataFrame(list(lines), columns=names)
     known = bool(table["frame"].notna().all())
@@ -182,20 +168,7 @@ def lines_from(lines: Sequence[Mapping[str, Any]], *further: str) -> pd.DataFram
 
 
 def numbered(lines: pd.DataFrame, numbers: Sequence[int] | NDArray[np.int64]) -> pd.DataFrame:
-    """Make rows of lines: the number of an event is known where all events are.
-
-    Parameters
-    ----------
-    lines : pandas.DataFrame
-        From `lines_from`, of all events, in their order.
-    numbers : sequence of int
-        Of the events.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``event``, then the columns of the lines; rows are counted from 0.
-    """
+    """Make rows of lines: the number of an event is known where all events are."""
     event = pd.Series(np.asarray(numbers, dtype=np.int64), name="event")
     return pd.concat([event, lines.reset_index(drop=True)], axis=1)
 
@@ -214,29 +187,7 @@ def line_of(
 ) -> dict[str, Any]:
     """Put a fit and its bounds into a line of the table, which has no number yet.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        The one that was maximised.
-    fit : FitResult
-        Its estimate, in the full frame.
-    collected : float
-        Scattered photons that the pupil collected in the frames after.
-    flags : iterable of Status
-        What the fit and its surroundings are remarked for.
-    frame : int or None
-        First frame of the new state, where it is known.
-    n_before, n_after : int
-        Frames.
-    sign : int
-        −1 for a particle that leaves, whose mass and contrast are told with the other sign.
-    quantum : complex ndarray, shape (4, 4), optional
-        As in `iscat_analysis.bounds.classical.event_bounds`.
-
-    Returns
-    -------
-    dict
-        With the keys `EVENT_COLUMNS`, but for ``event``.
+    Shapes: `quantum` (4, 4).
     """
     model, pixel_nm = likelihood.model, likelihood.grid.pixel_nm
     bounds = event_bounds(
@@ -312,21 +263,7 @@ def saturated_near(
 ) -> bool:
     """Tell whether saturated pixels spoil a fit.
 
-    Parameters
-    ----------
-    saturated : ndarray of bool, shape (rows, columns)
-        Those of the region.
-    x_nm, y_nm : float
-        Place of the particle [nm].
-    pixel_nm : float
-        Pixel side [nm].
-    corner : (int, int)
-        Row and column of the region's first pixel, where the place is that of the full frame.
-
-    Returns
-    -------
-    bool
-        Whether one lies within `SATURATION_NM` of the particle.
+    Shapes: `saturated` (rows, columns).
     """
     rows, columns = np.nonzero(saturated)
     dx = (columns + corner[1]) * pixel_nm - x_nm

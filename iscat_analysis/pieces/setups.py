@@ -28,33 +28,7 @@ def config_of(
     z_range_nm: tuple[float, float] | None = None,
     calibration: Calibration | None = None,
 ) -> Config:
-    """Put microscope, particle and camera together.
-
-    Parameters
-    ----------
-    optics : Optics
-        The microscope.
-    particle : Particle
-        What is seen.
-    camera : CameraConfig
-        What records it.
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    z_range_nm : (float, float), optional
-        Heights that are searched [nm].
-    calibration : Calibration, optional
-        Contrast against mass.
-
-    Returns
-    -------
-    Config
-        Whose other sections are at their defaults.
-
-    Raises
-    ------
-    ConfigError
-        An argument is of another kind, or a number that the pieces need is missing.
-    """
+    """Put microscope, particle and camera together."""
     for name, value, kind, example in (
         ("optics", optics, Optics, "Optics(na=1.42)"),
         ("particle", particle, Particle, "Particle(mass_kda=480)"),
@@ -86,25 +60,7 @@ def config_of(
 def together(
     given: Mapping[str, ArrayLike], *, least: Mapping[str, float]
 ) -> dict[str, FloatArray]:
-    """Broadcast arrays against one another.
-
-    Parameters
-    ----------
-    given : mapping of str to array_like
-        Arrays by name.
-    least : mapping of str to float
-        Smallest possible value of some of them.
-
-    Returns
-    -------
-    dict of str to ndarray
-        All of one shape, finite, and no length beyond `LARGEST_NM`.
-
-    Raises
-    ------
-    ConfigError
-        The shapes do not go together, or a value is impossible.
-    """
+    """Broadcast arrays against one another."""
     arrays = {name: real_array(name, value) for name, value in given.items()}
     for name, array in arrays.items():
         most = LARGEST_NM if name.endswith("_nm") else LARGEST
@@ -128,23 +84,7 @@ def together(
 
 
 def darkfield_photons(particle: Particle) -> float:
-    """Give the scale of masses in dark field.
-
-    Parameters
-    ----------
-    particle : Particle
-        With ``photons_per_frame``.
-
-    Returns
-    -------
-    float
-        Scattered photons collected per frame from a particle of this mass.
-
-    Raises
-    ------
-    ConfigError
-        It is not given.
-    """
+    """Give the scale of masses in dark field."""
     if particle.photons_per_frame is None:
         raise ConfigError(
             "particle.photons_per_frame is needed in dark field, where it is the scale of masses: "

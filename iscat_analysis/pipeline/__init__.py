@@ -181,29 +181,7 @@ def analyse(
     place: Place | None = None,
     begin_report: Callable[[Analysis], None] = _nobody_draws,
 ) -> Analysis:
-    """Analyse an open movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        From `iscat_analysis.movie.open_stack`.
-    config : Config
-        What to do.
-    progress, notify, command
-        As in `fit_stack`.
-    partial : Path, optional
-        Folder that keeps the finished chunks of a landing movie, or blocks of one in mode track,
-        so that an interrupted run can be resumed; without it nothing is kept.
-    inject, place
-        As in `fit_stack`.
-    begin_report : callable
-        Given what was found before its species are known, which takes a while in a large movie.
-
-    Returns
-    -------
-    Analysis
-        Everything found.
-    """
+    """Analyse an open movie."""
     if place is not None and place.distant and not movie.identity:
         raise ConfigError(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "

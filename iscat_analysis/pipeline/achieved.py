@@ -22,25 +22,7 @@ _SHARE = 0.3  # of an excess that is worth naming
 def measure_spread(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray], empty: EmptySpread | None
 ) -> dict[str, Achieved]:
-    """Pool the repeats of all events that are ok or whose only fault is a poor fit.
-
-    Parameters
-    ----------
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    repeats : sequence of ndarray
-        Of each row, from `iscat_analysis.inference.repeats.repeats_of`; of single frames, from
-        `iscat_analysis.pipeline.blank.FrameNoise`.
-    empty : EmptySpread or None
-        The noise of whole windows or single frames, where it was looked at.
-
-    Returns
-    -------
-    dict of str to Achieved
-        By free parameter; empty where no event has repeats.
-    """
+    """Pool the repeats of all events that are ok or whose only fault is a poor fit."""
     kept = [
         repeat
         for repeat, status, flags in zip(repeats, table["status"], table["flags"], strict=True)
@@ -66,22 +48,7 @@ def measure_spread(
 def repeat_columns(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
-    """Give the columns ``repeat_*``: the error of each event as its own frames show it.
-
-    Parameters
-    ----------
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    repeats : sequence of ndarray
-        Of each row.
-
-    Returns
-    -------
-    dict of str to ndarray
-        By column; NaN where the parameter is not free or the frames could not be compared.
-    """
+    """Give the columns ``repeat_*``: the error of each event as its own frames show it."""
     columns = {name: np.full(len(table), np.nan) for name in REPEAT_COLUMNS}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
         squares, counts = (np.array([r[0, i] for r in repeats], dtype=float) for i in (k, -1))
@@ -92,18 +59,7 @@ def repeat_columns(
 
 
 def measured_scale(found: Mapping[str, Achieved]) -> dict[str, float]:
-    """Give what σ is multiplied by with ``fit.sigma = "measured"``: the spread over the bound.
-
-    Parameters
-    ----------
-    found : mapping of str to Achieved
-        From `measure_spread`.
-
-    Returns
-    -------
-    dict of str to float
-        By column ``sigma_*``; never less than 1.
-    """
+    """Give what σ is multiplied by with ``fit.sigma = "measured"``: the spread over the bound."""
     return {f"sigma_{name}": max(a.over_crb, 1.0) for name, a in found.items()}
 
 
@@ -115,27 +71,7 @@ def spread_verdict(
     rejected: bool = False,
     sliding: bool = True,
 ) -> dict[str, Any]:
-    """Say whether σ is too small, by what factor, and what the noise suggests.
-
-    Parameters
-    ----------
-    found : mapping of str to Achieved
-        From `measure_spread`.
-    noise : mapping
-        What the summary holds under ``landing`` or ``background``: the noise of single pixels.
-    scaled : bool
-        Whether σ was scaled by the measured spread.
-    rejected : bool
-        Whether the model of the image is rejected.
-    sliding : bool
-        Whether windows slide; else frames stand against a background recorded before them.
-
-    Returns
-    -------
-    dict
-        ``understated``: whether σ is smaller than the measured spread; ``message``: one line, empty
-        where there is nothing to say; ``cause``: the part that names the noise.
-    """
+    """Say whether σ is too small, by what factor, and what the noise suggests."""
     high = {name: a for name, a in found.items() if a.exceeds}
     low = {name: a for name, a in found.items() if a.falls_short}
     if not high:
@@ -170,23 +106,6 @@ def likely_noise(
     sliding: bool = True,
 ) -> str:
     """Name what an excess of noise looks like.
-
-    Parameters
-    ----------
-    found : Achieved
-        Of one parameter.
-    noise : mapping
-        As in `spread_verdict`.
-    rejected : bool
-        Whether the model of the image is rejected: what it leaves over of other particles then
-        looks like slow noise.
-    sliding : bool
-        As in `spread_verdict`.
-
-    Returns
-    -------
-    str
-        Half a sentence.
 
     Notes
     -----

@@ -54,20 +54,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Aligned:
-    """Pictures of tracks.
-
-    Attributes
-    ----------
-    track : ndarray of int, shape (n,)
-        Of each picture.
-    counts_e, light_e, read_e2 : ndarray, shape (n, side, side)
-        Photoelectrons of the particle over its light, that light alone, and the variance of the
-        read noise; light is 0 where the picture has no pixels.
-    theta : ndarray, shape (n, 5)
-        Place from the middle of the first pixel [nm], height [nm], amplitude, 0.
-    frames : ndarray of int, shape (n,)
-        How many were added up.
-    """
+    """Pictures of tracks."""
 
     track: IntArray
     counts_e: FloatArray
@@ -82,36 +69,12 @@ class Aligned:
 
     @classmethod
     def unpacked(cls, data: Mapping[str, NDArray[Any]]) -> Aligned | None:
-        """Read what `packed` gave; None where there is none.
-
-        Parameters
-        ----------
-        data : mapping of str to ndarray
-            What was kept.
-
-        Returns
-        -------
-        Aligned or None
-            The pictures.
-        """
+        """Read what `packed` gave; None where there is none."""
         names = [f"aligned_{part.name}" for part in fields(cls)]
         return cls(*(data[name] for name in names)) if names[0] in data else None
 
     def likelihood(self, scene: Scene, number: int) -> Likelihood:
-        """Give the likelihood of a picture of a particle that stands still.
-
-        Parameters
-        ----------
-        scene : Scene
-            Its model.
-        number : int
-            Which picture.
-
-        Returns
-        -------
-        Likelihood
-            Of Poisson counts over light that is known.
-        """
+        """Give the likelihood of a picture of a particle that stands still."""
         light = self.light_e[number]
         side = light.shape[0]
         return poisson(
@@ -125,20 +88,7 @@ class Aligned:
         )
 
     def sight(self, scene: Scene, number: int) -> Sight:
-        """Give a picture to those who measure the microscope.
-
-        Parameters
-        ----------
-        scene : Scene
-            Its model.
-        number : int
-            Which picture.
-
-        Returns
-        -------
-        Sight
-            It starts from what the track says.
-        """
+        """Give a picture to those who measure the microscope."""
         likelihood = self.likelihood(scene, number)
         theta = self.theta[number]
         fit = scene.config.fit
@@ -154,20 +104,7 @@ class Aligned:
 
 
 def align(scene: Scene, moving: Moving) -> Aligned:
-    """Put the frames of the brightest tracks on top of each other.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `iscat_analysis.pipeline.moving_field.track_scene`.
-    moving : Moving
-        From `iscat_analysis.pipeline.moving.follow`.
-
-    Returns
-    -------
-    Aligned
-        Of frames in which the particle was alone.
-    """
+    """Put the frames of the brightest tracks on top of each other."""
     side = _side(scene)
     empty = np.zeros((0, side, side))
     nothing = np.zeros(0, dtype=np.int64)

@@ -192,37 +192,7 @@ def choice_of(
     widths: Widths,
     background: bool,
 ) -> Choice:
-    """Say which species to look for, and refuse what is impossible.
-
-    Parameters
-    ----------
-    k : int or None
-        So many species.
-    masses_kda : sequence of float or None
-        Species of these masses [kDa].
-    ladder : float, "auto" or None
-        The monomer of oligomers [kDa].
-    steps : sequence of int
-        Which oligomers.
-    offset : bool
-        Whether an offset is fitted.
-    hold : bool
-        Whether the monomer is held.
-    widths : {"common", "free"}
-        One width for all, or one for each.
-    background : bool
-        Whether something else may be there.
-
-    Returns
-    -------
-    Searched, Number, Given or Ladder
-        What `describe` takes.
-
-    Raises
-    ------
-    ConfigError
-        Options are impossible, or exclude each other.
-    """
+    """Say which species to look for, and refuse what is impossible."""
     named = [
         name
         for name, value in (("k", k), ("masses_kda", masses_kda), ("ladder", ladder))

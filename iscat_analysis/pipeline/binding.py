@@ -261,22 +261,7 @@ def check_reaction(
     *,
     names: tuple[str, str] = ("model", "masses_kda"),
 ) -> None:
-    """See that there is such a reaction, and that the masses are of its partners.
-
-    Parameters
-    ----------
-    model : str
-        Must be ``"dimer"`` or ``"ab"``.
-    masses_kda : sequence of float or None
-        About the mass of the monomer, or of A and B [kDa].
-    names : (str, str)
-        What messages call the two.
-
-    Raises
-    ------
-    ConfigError
-        Otherwise.
-    """
+    """See that there is such a reaction, and that the masses are of its partners."""
     choice_in(f"`{names[0]}`", model, get_args(Model))
     parts = len(CONCENTRATIONS[model])  # type: ignore[index]
     if masses_kda is None:
@@ -318,20 +303,7 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
 
 
 def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], tuple[str, ...]]:
-    """Tell which tables have events enough for an equilibrium.
-
-    Parameters
-    ----------
-    tables : sequence of EventTable
-        Of a series.
-
-    Returns
-    -------
-    enough : list of bool
-        Of each table.
-    notes : tuple of str
-        Names the others, where there are any.
-    """
+    """Tell which tables have events enough for an equilibrium."""
     enough = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
     few = [table.name for table, keep in zip(tables, enough, strict=True) if not keep]
     return enough, (

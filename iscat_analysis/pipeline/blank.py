@@ -43,19 +43,7 @@ def taken_places(
 ) -> BoolArray:
     """Give the pixels so near to a particle that its fit, and not the noise, is seen.
 
-    Parameters
-    ----------
-    scene : Scene
-        Knows the square that is fitted.
-    shape : (int, int)
-        Rows and columns.
-    places : sequence of (float, float, bool)
-        x and y [pixels], and whether the model describes the particle there.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        True near them.
+    Shapes: result (y, x).
     """
     taken = np.zeros(shape, dtype=np.bool_)
     for x, y, described in places:
@@ -74,21 +62,7 @@ def taken_by(
 ) -> BoolArray:
     """Give the pixels that fitted particles take.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        The sums in which they were fitted.
-    events : sequence of Event
-        The particles.
-    signal : ndarray, shape (y, x)
-        Of all of them.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Near them; and where they outshine the background, as their light has noise of its own.
+    Shapes: `signal` (y, x), result (y, x).
     """
     rows, columns = windows.after_e.shape
     taken = taken_places(
@@ -111,25 +85,7 @@ def empty_field(
 ) -> EmptyField:
     """Make the estimator of particles such as were fitted.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    mean_e : ndarray, shape (y, x)
-        Photoelectrons per unit of power without the particles [e].
-    read : ndarray, shape (y, x)
-        Variance of the read noise of one frame [e²].
-    used : ndarray of bool, shape (y, x)
-        Pixels in use.
-    fits : sequence of FitResult
-        At their median height and mass.
-    level : bool
-        Whether the level of the light is fitted too.
-
-    Returns
-    -------
-    EmptyField
-        At places half a resolution apart.
+    Shapes: `mean_e` (y, x), `read` (y, x), `used` (y, x).
     """
     model, pixel = scene.model, scene.pixel_nm
     theta = np.median([fit.theta for fit in fits], axis=0)
@@ -153,23 +109,7 @@ def background_field(
 ) -> EmptyField:
     """Make the estimator for frames against a background.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        The background.
-    power : float
-        Its light.
-    read : ndarray, shape (y, x)
-        Variance of the read noise of one frame [e²].
-    fits : sequence of FitResult
-        What is sought.
-
-    Returns
-    -------
-    EmptyField
-        Relative to the background per unit of power.
+    Shapes: `read` (y, x).
     """
     mean = windows.before_e
     if scene.additive:  # counts may be few, and weights must not follow their fluctuations
@@ -178,19 +118,7 @@ def background_field(
 
 
 class FrameNoise:
-    """What single frames make of nothing, each against the background, as tracks are fitted.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        The background, and the range of the frames that are fitted.
-    read_e2 : ndarray, shape (y, x)
-        Variance of the read noise of one frame [e²].
-    fits : sequence of FitResult
-        Particles whose height and mass the estimator is for.
-    """
+    """What single frames make of nothing, each against the background, as tracks are fitted."""
 
     def __init__(
         self, scene: Scene, windows: Windows, read_e2: FloatArray, fits: Sequence[FitResult]
@@ -218,18 +146,7 @@ class FrameNoise:
     def look(self, here: Windows, events: Sequence[Event]) -> FloatArray:
         """Look at one frame, where no particle was fitted in it.
 
-        Parameters
-        ----------
-        here : Windows
-            The frame, with its final power.
-        events : sequence of Event
-            What was fitted.
-
-        Returns
-        -------
-        ndarray, shape (1 + len(LENGTHS), n + 1)
-            As `repeats_of` returns it: in the first row squares over what the model expects, and in
-            the last column how many.
+        Shapes: result (1 + len(LENGTHS).
         """
         scene, field = self._scene, self._field
         shape = (here.after_e.shape[0], here.after_e.shape[1])

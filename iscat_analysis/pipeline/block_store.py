@@ -29,39 +29,7 @@ from iscat_analysis.threads import beside
 
 @dataclass(frozen=True)
 class Block:
-    """What was found in a block of frames.
-
-    Attributes
-    ----------
-    span : (int, int)
-        Half-open range of frames.
-    rows : Rows
-        Every particle in every frame of its life, numbered in the block; frames are the movie's.
-    error : float
-        Of an amplitude in one frame, for linking; 0 where there is no row.
-    table : pandas.DataFrame
-        From `iscat_analysis.pipeline.moving_table.moving_table`, a line for each of the rows.
-    inside : ndarray of bool, shape (n,)
-        Which of them are in the field.
-    masses : pandas.DataFrame
-        From `iscat_analysis.pipeline.moving_table.common_masses`.
-    views : tuple of EventView
-        The clearest frame of each track that was in the field.
-    level : ndarray, shape (y, x)
-        Light without particles, in a frame of power 1 [e].
-    power : ndarray, shape (t,)
-        Power of each frame, 1 on average.
-    total_e : ndarray, shape (y, x)
-        Sum of the frames [e].
-    used, saturated : ndarray of bool, shape (y, x)
-        Pixels that were used, and those that were not because they were too bright in some frame.
-    noise : tuple of str
-        What the noise says of the camera; empty where they agree, and in all blocks but the first.
-    noise_differs : bool
-        As `iscat_analysis.pipeline.noise.Noise.differs`.
-    aligned : Aligned or None
-        Pictures of the brightest tracks; None in all blocks but the first.
-    """
+    """What was found in a block of frames."""
 
     span: tuple[int, int]
     rows: Rows
@@ -85,18 +53,7 @@ class Block:
         return self.span[1] - self.span[0]
 
     def windows(self, camera: Camera) -> Windows:
-        """Put the background and the sum of all frames side by side.
-
-        Parameters
-        ----------
-        camera : Camera
-            Its read noise.
-
-        Returns
-        -------
-        Windows
-            Both of all frames.
-        """
+        """Put the background and the sum of all frames side by side."""
         read = self.frames * camera.read_variance_e2((self.used.shape[0], self.used.shape[1]))
         return Windows(
             before_e=self.level * self.power.sum(),
@@ -126,34 +83,7 @@ def analyse_block(
     progress: Progress,
     cautious: bool = False,
 ) -> Block:
-    """Follow the particles of a block of frames.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `iscat_analysis.pipeline.moving_field.track_scene`.
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-    goes_on : (bool, bool)
-        Whether there is a block before, and one after.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs parts of the block.
-    progress : Progress
-        Told the stages.
-    cautious : bool
-        As in `follow`.
-
-    Returns
-    -------
-    Block
-        The frames themselves are not kept.
-    """
+    """Follow the particles of a block of frames."""
     first, frames = span[0], span[1] - span[0]
     # Nearer to a border than this a track may go on in the next block.
     near = scene.config.track.memory_frames + 1
@@ -203,24 +133,7 @@ def analyse_block(
 
 
 def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> EventView:
-    """Draw a particle in one frame.
-
-    Parameters
-    ----------
-    field : MovingField
-        The frames.
-    ground : Ground
-        The light without particles.
-    rows : Rows
-        All particles.
-    mine : int
-        Which of the rows.
-
-    Returns
-    -------
-    EventView
-        What was measured without the others, the model and what both leave over.
-    """
+    """Draw a particle in one frame."""
     frame, theta = int(rows.frame[mine]), rows.theta[mine]
     spans = [
         box_of(float(centre), field.pixel_nm, field.roi_px, size)
@@ -247,20 +160,7 @@ class BlockStore(Shelf):
     """Finished blocks of frames on disk."""
 
     def load(self, number: int, span: tuple[int, int]) -> Block | None:
-        """Give a finished block, or None.
-
-        Parameters
-        ----------
-        number : int
-            Of the block.
-        span : (int, int)
-            Its frames, which it must have.
-
-        Returns
-        -------
-        Block or None
-            None where it was never finished.
-        """
+        """Give a finished block, or None."""
         found = self.read(number)
         if found is None or tuple(found[1].get("span", ())) != span:
             return None
@@ -291,15 +191,7 @@ class BlockStore(Shelf):
             return None
 
     def save(self, number: int, block: Block) -> None:
-        """Keep a finished block.
-
-        Parameters
-        ----------
-        number : int
-            Of the block.
-        block : Block
-            What was found in it.
-        """
+        """Keep a finished block."""
         rows = block.rows
         arrays = {
             "span": np.array(block.span),

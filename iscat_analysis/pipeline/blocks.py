@@ -57,20 +57,7 @@ _SMALLEST_PX = 32  # side of a field in which a pattern is followed
 
 @dataclass(frozen=True)
 class Plan:
-    """How a movie is divided.
-
-    Attributes
-    ----------
-    spans : tuple of (int, int)
-        Half-open ranges of frames, without gaps.
-    moved_px : (float, float) or None
-        Shift (y, x) of the fixed pattern from the first frames to the last; None where it was not
-        looked at, or there is none to follow.
-    drift_over_counting : float or None
-        C of the blocks.
-    drifts : bool
-        Whether drift, and not memory, made the blocks as short as they are.
-    """
+    """How a movie is divided."""
 
     spans: tuple[tuple[int, int], ...]
     moved_px: tuple[float, float] | None = None
@@ -93,18 +80,7 @@ class Plan:
         }
 
     def message(self, name: str) -> str:
-        """Say in one line why there are several blocks; empty where nothing needs to be said.
-
-        Parameters
-        ----------
-        name : str
-            What messages call the movie.
-
-        Returns
-        -------
-        str
-            With the number and what it follows from.
-        """
+        """Say in one line why there are several blocks; empty where nothing needs to be said."""
         if not self.drifts or self.moved_px is None or self.drift_over_counting is None:
             return ""
         y, x = self.moved_px
@@ -130,33 +106,7 @@ def plan_blocks(
     span: tuple[int, int] | None = None,
     mapper: Mapper = map,
 ) -> Plan:
-    """Divide a movie into blocks of frames that have a background each.
-
-    Parameters
-    ----------
-    movie : FrameSource
-        The movie.
-    config : Config
-        ``track.block_frames``, ``compute.memory_limit_mb`` and ``fit.frames``.
-    camera : Camera
-        Counts → photoelectrons.
-    check : callable
-        Refuses impossible counts.
-    span : (int, int), optional
-        Half-open range of frames; default ``fit.frames``, or all.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Plan
-        Of one block, where the movie fits into the memory and does not drift.
-
-    Raises
-    ------
-    DataError
-        The frames are not there, or a block does not fit into the memory.
-    """
+    """Divide a movie into blocks of frames that have a background each."""
     first, last = span or fitted_frames(movie, config)
     frames, pixels = last - first, movie.shape[1] * movie.shape[2]
     room = int(config.compute.memory_limit_mb * 1e6) // (BYTES * pixels)
@@ -196,19 +146,7 @@ def drift_over_counting(
 ) -> float:
     """Compare what drift makes of backgrounds with their counting noise.
 
-    Parameters
-    ----------
-    shift_px : ndarray, shape (t, 2)
-        Of the pattern in every frame.
-    stiffness : ndarray, shape (2, 2)
-        K, the mean of ∂_i B ∂_j B/B over the pixels [1/px²].
-    spans : tuple of (int, int)
-        Half-open ranges of frames, each with a background of its own.
-
-    Returns
-    -------
-    float
-        C, the mean over the frames.
+    Shapes: `shift_px` (t, 2), `stiffness` (2, 2).
     """
     total = sum(
         (b - a) ** 2 * float(np.sum(stiffness * np.cov(shift_px[a:b].T, bias=True)))
@@ -228,27 +166,7 @@ def follow_light(
 ) -> tuple[Trajectory | None, FloatArray]:
     """Follow the fixed pattern through a movie, and say how much light its motion moves.
 
-    Parameters
-    ----------
-    movie : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-    config : Config
-        ``compute.memory_limit_mb``.
-    check : callable
-        Refuses impossible counts.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    way : Trajectory or None
-        In frames of the movie; None where there is no pattern to follow.
-    stiffness : ndarray, shape (2, 2)
-        K [1/px²].
+    Shapes: `stiffness` (2, 2).
     """
     first, last = span
     shape = (movie.shape[1], movie.shape[2])

@@ -54,27 +54,7 @@ _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of 
 
 
 def find_bound(ready: Prepared, run: Run) -> Found:
-    """Find particles in the frames after a background, together or, in mode track, one by one.
-
-    Parameters
-    ----------
-    ready : Prepared
-        The movie.
-    run : Run
-        Is told what the user should know.
-
-    Returns
-    -------
-    Found
-        Everything found.
-
-    Raises
-    ------
-    ConfigError
-        The background frames are not given.
-    DataError
-        The background leaves no frame to fit, or a frame is impossible.
-    """
+    """Find particles in the frames after a background, together or, in mode track, one by one."""
     ready, windows = _summed(ready, run)
     scene, noise, summary, doubt = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera

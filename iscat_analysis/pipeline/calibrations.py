@@ -65,37 +65,7 @@ def camera_calibration(
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
 ) -> CameraCalibration:
-    """Calibrate a camera from recordings and write what was found.
-
-    Parameters
-    ----------
-    stacks : sequence of Path
-        Flats, or the movie itself; may be empty where `dark` is given.
-    out : Path
-        Folder for camera.json, camera.toml, camera.html and the maps.
-    dark : Path, optional
-        Frames without light.
-    offset_adu : float, optional
-        The offset, where it is known and there is no dark [counts].
-    maps : bool
-        Write TIFF maps, and name them in camera.toml.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-    progress : Progress
-        Told how many frames are done.
-    notify : callable, optional
-        Given each note, a sentence.
-
-    Returns
-    -------
-    CameraCalibration
-        What was found.
-
-    Raises
-    ------
-    DataError
-        A recording cannot be used, or the folder may not be written.
-    """
+    """Calibrate a camera from recordings and write what was found."""
     check_output(out, overwrite, known=CAMERA_FILES)
     with ExitStack() as opened:
         light = [opened.enter_context(open_stack(path)) for path in stacks]
@@ -138,38 +108,7 @@ def optics_calibration(
 ) -> OpticsCalibration:
     """Learn the optics from a movie and write what was found.
 
-    Parameters
-    ----------
-    movie : str, Path or array_like of shape (t, y, x)
-        A landing movie, one with background frames, or a scan of the focus.
-    config : Config
-        The microscope as far as it is known.
-    out : Path
-        Folder for optics.json, optics.html and, unless the result is refused, optics.toml.
-    name : str, optional
-        What messages and the report call an array.
-    free : str or sequence of str, optional
-        What may change; default everything.
-    focus_step_nm : float, optional
-        Rise of the focus from frame to frame of a scan [nm].
-    overwrite : bool
-        Whether an earlier result may be replaced.
-    progress : Progress
-        Told how far it is.
-    notify : callable, optional
-        Given each note, a sentence.
-
-    Returns
-    -------
-    OpticsCalibration
-        What was found.
-
-    Raises
-    ------
-    DataError
-        The movie shows too few particles, or the folder may not be written.
-    ConfigError
-        The configuration cannot be calibrated.
+    Shapes: `movie` (t, y, x).
     """
     check_output(out, overwrite, known=OPTICS_FILES)
     with open_stack(movie, name=name) as stack:
@@ -200,36 +139,7 @@ def template_calibration(
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
 ) -> MeasuredPicture:
-    """Measure the picture of a particle in a movie and write what was found.
-
-    Parameters
-    ----------
-    movie : Path
-        A landing movie, or one with background frames.
-    config : Config
-        The microscope as far as it is known.
-    out : Path
-        Folder for template.json, template.html and, unless the result is refused, template.npz and
-        optics.toml, which names it.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-    progress : Progress
-        Told how far it is.
-    notify : callable, optional
-        Given each note, a sentence.
-
-    Returns
-    -------
-    MeasuredPicture
-        What was found.
-
-    Raises
-    ------
-    DataError
-        The movie shows too few particles, or the folder may not be written.
-    ConfigError
-        The configuration has no such picture.
-    """
+    """Measure the picture of a particle in a movie and write what was found."""
     check_output(out, overwrite, known=TEMPLATE_FILES)
     with open_stack(movie) as stack:
         found = measure_template(stack, config, progress=progress, notify=notify)
@@ -257,37 +167,7 @@ def mass_calibration(
     overwrite: bool = False,
     notify: Callable[[str], None] | None = None,
 ) -> MassCalibration:
-    """Calibrate contrast against standards and write what was found.
-
-    Parameters
-    ----------
-    events : Path
-        ``fits.csv``, or an event table of Refeyn's programs.
-    standards_kda : sequence of float
-        Masses of the standards [kDa].
-    out : Path
-        Folder for calibration.json, calibration.toml and calibration.html.
-    standards_se_kda : sequence of float, optional
-        Their standard errors [kDa].
-    landing : {"dark", "bright"}, optional
-        What landing does; by default what the table's own masses say, or dark.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-    notify : callable, optional
-        Given each note, a sentence.
-
-    Returns
-    -------
-    MassCalibration
-        What was found.
-
-    Raises
-    ------
-    ConfigError
-        The standards are impossible.
-    DataError
-        The table cannot be read, has no such peaks, or the folder may not be written.
-    """
+    """Calibrate contrast against standards and write what was found."""
     check_output(out, overwrite, known=MASS_FILES)
     table = read_contrasts(events)
     contrast = table["contrast"].to_numpy(float)
@@ -325,24 +205,7 @@ def mass_calibration(
 
 
 def read_contrasts(path: Path) -> pd.DataFrame:
-    """Read contrasts and masses from a table of this package or of Refeyn's programs.
-
-    Parameters
-    ----------
-    path : Path
-        ``fits.csv`` (its rows with status ok) or the folder that holds it, or what `read_events`
-        takes.
-
-    Returns
-    -------
-    pandas.DataFrame
-        contrast and mass_kda [kDa]; for ``fits.csv`` also sigma_contrast.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read as either.
-    """
+    """Read contrasts and masses from a table of this package or of Refeyn's programs."""
     path = path / "fits.csv" if (path / "fits.csv").is_file() else path
     try:
         with path.open("rb") as file:

@@ -22,18 +22,6 @@ def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
 
     Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
     meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
-
-    Parameters
-    ----------
-    zero : LightZero
-        Where the light is zero.
-    gain : GainDiagnosis
-        What the noise says of the gain.
-
-    Returns
-    -------
-    bool
-        Whether to name the offset, and not the gain.
     """
     if not zero.off or gain.shakes:
         return False
@@ -57,20 +45,7 @@ def _effect(share: float) -> str:
 
 
 def offset_said(zero: LightZero, camera: Camera) -> str:
-    """Say where the light is zero, and what a wrong offset does.
-
-    Parameters
-    ----------
-    zero : LightZero
-        Where the light is zero.
-    camera : Camera
-        Counts → photoelectrons, as configured.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """Say where the light is zero, and what a wrong offset does."""
     per_count = float(np.mean(camera.gain_e_per_adu))
     counts = zero.electrons / per_count
     se = zero.se * counts / zero.share
@@ -97,20 +72,6 @@ def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> 
     """Say that an offset may be as wrong as a gain, where the noise fits both.
 
     An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
-
-    Parameters
-    ----------
-    gain : GainDiagnosis
-        What the noise says of the gain.
-    zero : LightZero or None
-        Where the light is zero, if that is known.
-    camera : Camera
-        Counts → photoelectrons, as configured.
-
-    Returns
-    -------
-    str
-        One line; empty where there is little to say, or they are told apart.
     """
     share = 1 - gain.noise_ratio
     if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
@@ -129,18 +90,6 @@ def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
     """Judge the gain by the noise that neighbouring pixels have together.
-
-    Parameters
-    ----------
-    gain : GainDiagnosis
-        From the variance of single pixels.
-    spectrum : NoiseSpectrum or None
-        Of the same frames.
-
-    Returns
-    -------
-    GainDiagnosis
-        The same where pixels are independent.
 
     Notes
     -----

@@ -36,29 +36,7 @@ from iscat_analysis.threads import threads
 
 @dataclass(frozen=True)
 class ChunkSetting:
-    """What the chunks of a movie have in common, for a process that can read its file.
-
-    Attributes
-    ----------
-    frames : CountSource
-        The movie, as it is analysed; pickled, one from a file is opened again.
-    camera : Camera
-        Counts → photoelectrons.
-    config : Config
-        Resolved, its paths absolute.
-    span : (int, int)
-        Half-open range of frames to analyse.
-    searches : int
-        Boundaries that are searched in all of them.
-    window : int
-        Frames before and after a step.
-    noise : NoiseSpectrum or None
-        Of the movie.
-    excess_noise : ExcessNoise or None
-        Where the noise is not as expected.
-    lines : Lines or None
-        What was divided out of the frames.
-    """
+    """What the chunks of a movie have in common, for a process that can read its file."""
 
     frames: CountSource
     camera: Camera
@@ -93,26 +71,7 @@ def chunk_job(
     *,
     progress: Progress = silent,
 ) -> Done:
-    """Analyse one chunk from the movie's file.
-
-    Parameters
-    ----------
-    setting : ChunkSetting
-        Of the movie.
-    core, span : (int, int)
-        Half-open ranges of frames, from `iscat_analysis.pipeline.chunks.plan_chunks`.
-    posteriors : int
-        Events whose posterior is sampled, at most.
-    earlier : int
-        Events that come before all of this chunk, as far as is known.
-    progress : Progress
-        Told when the frames are read.
-
-    Returns
-    -------
-    Done
-        The same as in the process that has the other chunks.
-    """
+    """Analyse one chunk from the movie's file."""
     with threads(setting.config.compute.workers) as pool:
         chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
@@ -132,33 +91,7 @@ def analyse_chunk(
     excess_noise: ExcessNoise | None,
     earlier: int,
 ) -> Done:
-    """Find and fit every step of a chunk.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and threshold.
-    chunk : Chunk
-        Its frames, with those around its core.
-    core : (int, int)
-        Half-open range of the frames whose steps are its own.
-    window : int
-        Frames before and after a step.
-    pool : ThreadPoolExecutor
-        Runs parts of it.
-    posteriors : int
-        Events whose posterior is sampled, at most.
-    excess_noise : ExcessNoise or None
-        Where the noise is not as expected.
-    earlier : int
-        Events that come before all of this chunk, as far as is known: what the report shows of
-        single events it shows of the first, and that of others is not made.
-
-    Returns
-    -------
-    Done
-        Everything found.
-    """
+    """Find and fit every step of a chunk."""
     wanted = scene.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
     fitter = ChunkFitter(scene, still, window, pool, pattern, excess_noise=excess_noise)

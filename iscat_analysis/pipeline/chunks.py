@@ -45,21 +45,7 @@ _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is co
 
 
 class Reader:
-    """Frames of one chunk after the other: where they lie in the file, or read into memory once.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    first, last : int
-        Half-open range of frames to analyse.
-    room_bytes : int
-        Of counts, for the longest chunk; from `counts_budget`.
-    dark_e : float
-        Light of a frame [e per pixel] below which it has none, as behind a closed shutter.
-    """
+    """Frames of one chunk after the other: where they lie in the file, or read into memory once."""
 
     def __init__(
         self,
@@ -221,15 +207,6 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
 
     Frames that have to be read into memory are left for then: whoever looks at them divided by the
     flicker of their light needs as much room again.
-
-    Parameters
-    ----------
-    reader : Reader
-        The frames.
-    config : Config
-        ``compute``, and what else tells chunks apart.
-    window : int
-        Frames before and after a step.
     """
     if not reader.in_place:
         return
@@ -247,24 +224,7 @@ def _runs(flags: BoolArray) -> Iterator[slice]:
 
 
 def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[int, int]) -> Reader:
-    """Read frames of a landing movie.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The movie.
-    config : Config
-        ``compute.memory_limit_mb``, and the scheme: of dark field the background says nothing.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames to analyse.
-
-    Returns
-    -------
-    Reader
-        Which takes frames behind a closed shutter for frames without light.
-    """
+    """Read frames of a landing movie."""
     dark_e = -math.inf
     if config.optics.scheme != "darkfield" and span[0] < span[1]:
         numbers = np.linspace(span[0], span[1] - 1, _LOOKS).astype(int).tolist()
@@ -277,40 +237,14 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
 
 
 def counts_budget(config: Config) -> int:
-    """Bytes that the stored counts of a chunk may take.
-
-    Parameters
-    ----------
-    config : Config
-        ``compute.memory_limit_mb``.
-
-    Returns
-    -------
-    int
-        A share of it.
-    """
+    """Bytes that the stored counts of a chunk may take."""
     return int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
 
 
 def plan_chunks(
     reader: Reader, config: Config, window: int, stride: int
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Divide a movie; block edges fall on the same frames in every chunk.
-
-    Parameters
-    ----------
-    reader : Reader
-        The frames.
-    config : Config
-        ``compute.memory_limit_mb`` bounds a chunk.
-    window, stride : int
-        Frames in a window, and between two of its positions.
-
-    Returns
-    -------
-    list of ((int, int), (int, int))
-        For each chunk its core, and the span of frames around it that is read.
-    """
+    """Divide a movie; block edges fall on the same frames in every chunk."""
     first, last = reader.first, reader.last
     halo = math.ceil(HALO * window / stride) * stride
     budget = counts_budget(config)

@@ -34,13 +34,7 @@ R = TypeVar("R")
 
 
 class Pair:
-    """The process that asks, and a copy of it for as long as `each` is at work.
-
-    Parameters
-    ----------
-    threads : int
-        Of both processes together.
-    """
+    """The process that asks, and a copy of it for as long as `each` is at work."""
 
     def __init__(self, threads: int) -> None:
         self._first = os.getpid()
@@ -147,25 +141,7 @@ class Pair:
 
 
 def paired(place: Place, config: Config, setting: ChunkSetting, chunks: int) -> Place:
-    """Let a second process help, where there is something to do for it and room.
-
-    Parameters
-    ----------
-    place : Place
-        Where the work runs without one.
-    config : Config
-        Says how many threads may run.
-    setting : ChunkSetting
-        What the chunks have in common.
-    chunks : int
-        Their number.
-
-    Returns
-    -------
-    Place
-        A `Pair` where several chunks of a movie in a file would be analysed in this process, and
-        two threads may run on two processors; else the place that was given.
-    """
+    """Let a second process help, where there is something to do for it and room."""
     wanted = (
         sys.platform == "linux"
         and isinstance(place, Here)

@@ -225,24 +225,7 @@ def compare_tables(
 def comparison_document(
     first: str, others: Sequence[str], found: Sequence[Comparison], notes: Sequence[str]
 ) -> dict[str, Any]:
-    """Lay out comparisons as the document ``species_comparison``.
-
-    Parameters
-    ----------
-    first : str
-        The table that the others are compared with.
-    others : sequence of str
-        These.
-    found : sequence of Comparison
-        One for each of them.
-    notes : sequence of str
-        What the user should know.
-
-    Returns
-    -------
-    dict
-        Nested plain values.
-    """
+    """Lay out comparisons as the document ``species_comparison``."""
     pairs = zip(others, found, strict=True)
     return {
         "source": first,
@@ -252,18 +235,7 @@ def comparison_document(
 
 
 def comparison_rows(contents: dict[str, Any]) -> pd.DataFrame:
-    """Lay out a document ``species_comparison`` as a table.
-
-    Parameters
-    ----------
-    contents : dict
-        From `comparison_document`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row for each table and species: source, p-values, and the columns of the species.
-    """
+    """Lay out a document ``species_comparison`` as a table."""
     return pd.DataFrame(
         [
             {

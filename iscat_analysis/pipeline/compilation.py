@@ -47,22 +47,7 @@ _PICTURES = "the picture of a particle"
 
 
 class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
-    """Listens to Numba; `compiling` makes one.
-
-    Parameters
-    ----------
-    notify : callable
-        Told one line at a time.
-    together : bool
-        Whether a second process may be started.
-    needs : sequence of str
-        As in `compiling`.
-
-    Attributes
-    ----------
-    needs : sequence of str
-        As given.
-    """
+    """Listens to Numba; `compiling` makes one."""
 
     def __init__(
         self, notify: Callable[[str], None], *, together: bool, needs: Sequence[str]
@@ -78,13 +63,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         self._timer: threading.Timer | None = None
 
     def on_start(self, event: event.Event) -> None:
-        """Note that a function is being compiled.
-
-        Parameters
-        ----------
-        event : numba.core.event.Event
-            Whose data hold its dispatcher.
-        """
+        """Note that a function is being compiled."""
         self._depth += 1
         module = event.data["dispatcher"].py_func.__module__
         if self._depth > 1 or not module.startswith(_ROOM):
@@ -103,13 +82,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
                 self._say("still compiling")
 
     def on_end(self, event: event.Event) -> None:
-        """Note that it is compiled.
-
-        Parameters
-        ----------
-        event : numba.core.event.Event
-            As in `on_start`.
-        """
+        """Note that it is compiled."""
         del event
         self._depth -= 1
 
@@ -157,19 +130,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
 
 
 def needs_of(config: Config) -> tuple[str, ...]:
-    """Name the kernels that an analysis needs and not every other one does.
-
-    Parameters
-    ----------
-    config : Config
-        Of the analysis.
-
-    Returns
-    -------
-    tuple of str
-        As from `iscat_analysis.inference.noise.parts_of`, and ``"tracks"`` where particles move,
-        ``"sliding"`` where windows slide.
-    """
+    """Name the kernels that an analysis needs and not every other one does."""
     way = way_of(config)
     free = FREE_PARAMETERS[config.track.free if way == "tracks" else config.fit.mode]
     parts = parts_of(free, posteriors=config.samples_posterior)
@@ -180,22 +141,7 @@ def needs_of(config: Config) -> tuple[str, ...]:
 def compiling(
     notify: Callable[[str], None], workers: int, needs: Sequence[str] = ()
 ) -> Iterator[Compilation]:
-    """Say what is compiled until the block ends.
-
-    Parameters
-    ----------
-    notify : callable
-        Told one line at a time, after a second of compilation.
-    workers : int
-        From two on, a second process compiles half of them.
-    needs : sequence of str
-        As from `needs_of`.
-
-    Yields
-    ------
-    Compilation
-        That knows what is needed.
-    """
+    """Say what is compiled until the block ends."""
     if _kernels.TEMPORARY:
         notify(
             "compiled kernels cannot be kept, because neither the installation nor the home "

@@ -57,35 +57,14 @@ _APART_NM = 100.0  # foci to begin with
 
 @dataclass(frozen=True)
 class WrongSign:
-    """A configured focus that gives the contrast the other sign.
-
-    Attributes
-    ----------
-    config : Config
-        As configured.
-    said : str
-        That it does, in words.
-    starts : tuple of Config
-        The same with foci that give contrast the right sign.
-    """
+    """A configured focus that gives the contrast the other sign."""
 
     config: Config
     said: str
     starts: tuple[Config, ...]
 
     def error(self, why: str) -> ConfigError:
-        """Say that nothing can be fitted, and why the movie does not help.
-
-        Parameters
-        ----------
-        why : str
-            What the movie says, or why it says nothing.
-
-        Returns
-        -------
-        ConfigError
-            To be raised.
-        """
+        """Say that nothing can be fitted, and why the movie does not help."""
         return ConfigError(
             f"{self.said}; {why}: correct optics.focus_nm, or calibration.gradient_per_kda if that "
             "has the wrong sign"
@@ -93,18 +72,7 @@ class WrongSign:
 
 
 def wrong_sign(config: Config) -> WrongSign | None:
-    """Tell whether the configured optics give contrast the sign that the calibration has.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved.
-
-    Returns
-    -------
-    WrongSign or None
-        None where they do, or there is no calibration.
-    """
+    """Tell whether the configured optics give contrast the sign that the calibration has."""
     if config.calibration is None or config.optics.psf != "model":
         return None
     try:
@@ -141,35 +109,7 @@ def learn_sign(
     notify: Callable[[str], None] = unheard,
     opening: Opening | None = None,
 ) -> tuple[Config, dict[str, Any]]:
-    """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, or one with background frames.
-    wrong : WrongSign
-        What is wrong.
-    camera : Camera
-        Counts → photoelectrons.
-    tell : callable
-        As for `learn_optics`.
-    notify : callable
-        As for `learn_optics`.
-    opening : Opening, optional
-        As for `learn_optics`.
-
-    Returns
-    -------
-    config : Config
-        With optics that describe the particles and have the calibration's sign.
-    summary : dict
-        What ``summary.json`` says of it.
-
-    Raises
-    ------
-    ConfigError
-        The movie does not tell them, or is not to be asked.
-    """
+    """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""
     config = wrong.config
     reason = why_not(config)
     if reason:

@@ -46,24 +46,7 @@ fitted with the next ones has a single one."""
 def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
 ) -> tuple[list[Sight], list[Sight]]:
-    """Fit the field, and cut out the particles that are farthest from others.
-
-    Parameters
-    ----------
-    windows : Windows
-        The sums before and after.
-    config : Config
-        Resolved; with the optics to fit with.
-    pool : ThreadPoolExecutor
-        Runs the fits.
-
-    Returns
-    -------
-    sights : list of Sight
-        `LEAST_SIGHTS` or more where there are so many, the brightest first.
-    others : list of Sight
-        Every particle, on small regions.
-    """
+    """Fit the field, and cut out the particles that are farthest from others."""
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
     rows, columns = windows.after_e.shape
@@ -81,31 +64,7 @@ def learn_in_field(
     source: Mapping[str, str],
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
-    """Learn the optics from all particles of a field together.
-
-    Parameters
-    ----------
-    windows : Windows
-        The sums before and after.
-    config : Config
-        Resolved; with the optics where the search begins.
-    groups : sequence of str
-        As for `calibrate_sights`.
-    source : mapping of str to str
-        As for `calibrate_sights`.
-    pool : ThreadPoolExecutor
-        Runs the fits.
-
-    Returns
-    -------
-    OpticsCalibration
-        Of the first round that is accepted, or of the last.
-
-    Raises
-    ------
-    DataError
-        The field has too few particles.
-    """
+    """Learn the optics from all particles of a field together."""
     guess: Config | None = config
     before, free = math.inf, heights_free(config)
     if not free:

@@ -60,24 +60,7 @@ class _Darkened:
 
 
 def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, str]:
-    """Leave frames out of sums in which a part of the light is missing, and name the dark ones.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        Its sums.
-
-    Returns
-    -------
-    movie : Stack
-        Where a frame is cut off it is dark throughout, and adds nothing to sums; else itself.
-    message : str
-        Which frames add nothing; empty where all do.
-    """
+    """Leave frames out of sums in which a part of the light is missing, and name the dark ones."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     power = windows.power
     usual = float(np.median(power))

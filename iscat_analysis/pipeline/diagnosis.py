@@ -53,17 +53,7 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
     What changes least from one to the next, in proportion to their means, are frames: light on a
     pixel repeats but for its noise, and neighbouring pixels have different light.
 
-    Parameters
-    ----------
-    name : str
-        Of the movie.
-    counts : ndarray, shape (t, y, x)
-        Some of its frames.
-
-    Returns
-    -------
-    str
-        One line; empty where frames differ less than neighbouring pixels, or these hardly differ.
+    Shapes: `counts` (t, y, x).
     """
     middle = tuple(slice(max(n - _LOOKED_AT, 0) // 2, (n + _LOOKED_AT) // 2) for n in counts.shape)
     part = counts[middle].astype(np.float64)
@@ -89,20 +79,7 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
 
 
 def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
-    """Say how many pixels are left out, and why.
-
-    Parameters
-    ----------
-    defects : int
-        Dead and hot pixels, and where particles move noisy ones.
-    saturated : int
-        Those that are saturated in some frame.
-
-    Yields
-    ------
-    str
-        One line each.
-    """
+    """Say how many pixels are left out, and why."""
     if defects:
         yield f"{count(defects, 'dead, hot or noisy pixel')} {_be(defects)} left out"
     if saturated:
@@ -117,20 +94,7 @@ def _be(number: int) -> str:
 
 
 def repeats_warning(movie: Stack, windows: Windows) -> str:
-    """Say which frames repeat the one before them, which the sums count as frames of their own.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    windows : Windows
-        The sums, with the light of each of their frames.
-
-    Returns
-    -------
-    str
-        One line; empty where there are none.
-    """
+    """Say which frames repeat the one before them, which the sums count as frames of their own."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
     same &= well_lit(windows.power, DARK)[1:]  # of dark ones something else is said
@@ -155,23 +119,7 @@ def uneven_warning(
 ) -> str:
     """Say that the light is uneven where one level is taken for the background of all pixels.
 
-    Parameters
-    ----------
-    config : Config
-        With the level.
-    name : str
-        Of the movie.
-    windows : Windows
-        The sum of the frames, over that level.
-    explained : ndarray, shape (y, x), optional
-        Contrast of all particles, as they were fitted, or their photoelectrons in dark field; NaN
-        where a particle is so near that a wrong model leaves much over.  Without it rings may make
-        some of what is uneven.
-
-    Returns
-    -------
-    str
-        One line; empty where the background was measured, or pixels differ by their noise.
+    Shapes: `explained` (y, x).
     """
     level = windows.power_ratio * windows.before_e
     used = ~windows.masked & (level > 0)
@@ -206,20 +154,7 @@ def uneven_warning(
 
 
 def misfit_warning(config: Config, events: Sequence[Event]) -> str:
-    """Say what is probably wrong with the model, where it misses the brightest particles.
-
-    Parameters
-    ----------
-    config : Config
-        The microscope as it is configured.
-    events : sequence of Event
-        Fitted particles.
-
-    Returns
-    -------
-    str
-        One line; empty where most of the brightest are described, or nothing stands out.
-    """
+    """Say what is probably wrong with the model, where it misses the brightest particles."""
     if config.optics.psf == "measured":
         return ""
     alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
@@ -232,20 +167,7 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
 
 
 def line_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say which contrasts the line of the calibration turns into no single mass.
-
-    Parameters
-    ----------
-    config : Config
-        With the calibration.
-    table : pandas.DataFrame
-        Rows of ``fits.csv``.
-
-    Returns
-    -------
-    str
-        One line; empty where there are none.
-    """
+    """Say which contrasts the line of the calibration turns into no single mass."""
     line = config.calibration
     if line is None or not line.offset:
         return ""
@@ -271,20 +193,7 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def bend_warning(scale: MassScale, table: pd.DataFrame) -> str:
-    """Say which particles are too heavy for a line that faint standards gave.
-
-    Parameters
-    ----------
-    scale : MassScale
-        Of the fits.
-    table : pandas.DataFrame
-        Rows of ``fits.csv``.
-
-    Returns
-    -------
-    str
-        One line; empty where there are none.
-    """
+    """Say which particles are too heavy for a line that faint standards gave."""
     bent = is_bent(scale, table)
     if not bent.any():
         return ""
@@ -302,20 +211,7 @@ def bend_warning(scale: MassScale, table: pd.DataFrame) -> str:
 
 
 def sign_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that nearly all particles change the light the other way than the model has it.
-
-    Parameters
-    ----------
-    config : Config
-        Of the movie.
-    table : pandas.DataFrame
-        Rows of ``fits.csv``.
-
-    Returns
-    -------
-    str
-        One line; empty where they do not, or are too few to tell.
-    """
+    """Say that nearly all particles change the light the other way than the model has it."""
     mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
     turned = int((mass < 0).sum())
     if turned < _FEWEST_TURNED or turned < _NEARLY_ALL * len(mass):
@@ -335,16 +231,6 @@ def course_warning(table: pd.DataFrame) -> str:
 
     Their pictures agree with the model, and the goodness of fit is theirs; `Status.POOR_FIT` is
     then of the course of the light before and after.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        Rows of ``fits.csv`` of a landing movie.
-
-    Returns
-    -------
-    str
-        One line; empty where these are few.
     """
     poor = table["status"] == Status.POOR_FIT.value
     slow = int((poor & (table["p_value"] >= POOR_FIT_P)).sum())
@@ -360,20 +246,7 @@ def course_warning(table: pd.DataFrame) -> str:
 
 
 def plane_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that particles whose height was fitted in every frame do not move along z.
-
-    Parameters
-    ----------
-    config : Config
-        In mode ``track``.
-    table : pandas.DataFrame
-        Rows of ``fits.csv``.
-
-    Returns
-    -------
-    str
-        One line; empty where they do, or too few steps tell.
-    """
+    """Say that particles whose height was fitted in every frame do not move along z."""
     if config.track.free != "joint":
         return ""
     good = table[table["status"] == Status.OK.value].sort_values(["track", "frame"])
@@ -401,19 +274,7 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
     A picture is that of a normal distribution about the mean of the path, along z in phase too; of
     a long path no two are alike.
 
-    Parameters
-    ----------
-    config : Config
-        In mode joint, where heights are fitted, or mass.
-    table : pandas.DataFrame
-        Rows of particles and frames.
-    smear_nm : ndarray, shape (n,)
-        Spread of the path of each about its mean, along each axis [nm].
-
-    Returns
-    -------
-    str
-        One line; empty where most fits are described, or heights are not fitted.
+    Shapes: `smear_nm` (n,).
     """
     if config.fit.mode != "joint" or len(table) < _ENOUGH_STEPS:
         return ""
@@ -439,20 +300,6 @@ def shaking_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> st
     """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
 
     Particles that move add noise too, but not along the gradient of the mean of all frames.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    frames : (int, int)
-        Half-open range of frames, of which the first are looked at.
-
-    Returns
-    -------
-    str
-        One line; empty where it stands still.
     """
     counts = movie.read(frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES))
     try:

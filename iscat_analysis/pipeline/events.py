@@ -25,17 +25,7 @@ PlaceAndMass = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Fitted:
-    """One fitted particle: where it was searched, what was fitted, and the likelihood used.
-
-    Attributes
-    ----------
-    region : Region
-        Its pixels, in the full frame.
-    fit : FitResult
-        In the full frame, with the flags that it raised itself.
-    likelihood : Likelihood
-        Of the counts of these pixels.
-    """
+    """One fitted particle: where it was searched, what was fitted, and the likelihood used."""
 
     region: Region
     fit: FitResult
@@ -67,24 +57,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Event(Fitted):
-    """One particle, fitted and judged.
-
-    Attributes
-    ----------
-    windows : Windows
-        The sums of its pixels, those with the particle as "after".
-    flags : tuple of Status
-        What is to be remarked on it, worst first.
-    frame : int
-        First frame of the new state.
-    n_before, n_after : int
-        Frames before and after it that were used; 0 before where the background is known.
-    sign : int
-        −1 where it leaves.
-    half_width : int or None
-        `frame` ± `half_width` holds the step with a probability of 95 %; None where the frames are
-        given, and nothing was dated.
-    """
+    """One particle, fitted and judged."""
 
     windows: Windows
     flags: tuple[Status, ...]
@@ -104,28 +77,7 @@ def remarks(
     too_close: bool,
     poor_fit: bool = False,
 ) -> tuple[Status, ...]:
-    """Add what the surroundings of a particle say of its fit.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its pixel size.
-    fitted : Fitted
-        With the flags that its fit raised itself.
-    windows : Windows
-        Of its region.
-    sidelobe : bool
-        Whether the particle may be no more than what the model leaves over of a brighter one.
-    too_close : bool
-        Whether another one is too near to be kept out of the fit.
-    poor_fit : bool
-        Whether its light changes otherwise than by one step.
-
-    Returns
-    -------
-    tuple of Status
-        All remarks, worst first.
-    """
+    """Add what the surroundings of a particle say of its fit."""
     fit, region = fitted.fit, fitted.region
     corner = region.rows[0], region.columns[0]
     saturated = saturated_near(windows.saturated, fit.x_nm, fit.y_nm, scene.pixel_nm, corner=corner)
@@ -137,42 +89,14 @@ def remarks(
 
 
 def standing_out(events: Sequence[Event]) -> Sequence[Event]:
-    """Keep the events on which nothing is to be remarked.
-
-    Parameters
-    ----------
-    events : sequence of Event
-        Any.
-
-    Returns
-    -------
-    sequence of Event
-        All of them, where something is to be remarked on each.
-    """
+    """Keep the events on which nothing is to be remarked."""
     return [event for event in events if not event.flags] or events
 
 
 def posterior_of(
     scene: Scene, event: Event, number: int, *, stopped: Callable[[], bool] = lambda: False
 ) -> PosteriorResult:
-    """Sample the posterior of an event.
-
-    Parameters
-    ----------
-    scene : Scene
-        Knows the settings of the sampler and the seed.
-    event : Event
-        The particle.
-    number : int
-        Added to the seed.
-    stopped : callable, optional
-        Whether to give up.
-
-    Returns
-    -------
-    PosteriorResult
-        The chain and the verdict on it.
-    """
+    """Sample the posterior of an event."""
     settings = scene.config.posterior
     return sample_posterior(
         event.likelihood,

@@ -39,28 +39,7 @@ class _End:
 def extended(
     field: MovingField, ground: Ground, rows: Rows, *, resolution_nm: float, reach_nm: float
 ) -> tuple[Rows, int]:
-    """Let tracks go on from their ends as far as the movie shows them.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie.
-    ground : Ground
-        The background.
-    rows : Rows
-        Particles with their tracks.
-    resolution_nm : float
-        λ/NA [nm].
-    reach_nm : float
-        Farthest that a particle goes from one frame to the next [nm].
-
-    Returns
-    -------
-    rows : Rows
-        With the new ones.
-    added : int
-        How many.
-    """
+    """Let tracks go on from their ends as far as the movie shows them."""
     tracks = int(rows.track.max(initial=-1)) + 1
     if not tracks:
         return rows, 0

@@ -61,30 +61,7 @@ def fit_field(
     pool: ThreadPoolExecutor,
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
-    """Find and fit every particle in a field.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and matched filter.
-    windows : Windows
-        Sums before and after.
-    starts : sequence of Candidate
-        Particles known beforehand, fitted first.
-    excess_noise : ExcessNoise, optional
-        With it a search is given up that such noise passes; see `refuse_flood`.
-    pool : ThreadPoolExecutor
-        Runs the fits; the result does not depend on its size.
-    progress : Progress
-        Told the rounds.
-
-    Returns
-    -------
-    events : tuple of Event
-        In order of y, then x.
-    windows : Windows
-        With the laser power estimated anew.
-    """
+    """Find and fit every particle in a field."""
     events: list[Fitted] = []
     fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
@@ -145,11 +122,6 @@ def _with_concealed(
     Of several particles that are missing around a known one, each explains but a part of what its
     fit leaves over, and none is told from a misfit.  So candidates that explain some of it are
     tried together.  Those stay that explain most of what is left with all the others in place.
-
-    Returns
-    -------
-    (list of Fitted, Windows) or None
-        All particles, and the windows with the power that goes with them; None where none is added.
     """
     trial, power = known, windows
     for _ in range(MAX_ROUNDS):
@@ -193,19 +165,7 @@ def _tenable(scene: Scene, trial: Sequence[Fitted], known: Sequence[Fitted]) -> 
 def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted]) -> FloatArray:
     """Signal of all fitted particles over the field.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    shape : (int, int)
-        Rows and columns.
-    events : sequence of Fitted
-        The particles.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Contrast, or |E_sca|² in dark field.
+    Shapes: result (y, x).
     """
     total = np.zeros(shape)
     for event in events:
@@ -216,16 +176,7 @@ def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted])
 def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatArray) -> None:
     """Add a particle's signal to the pixels of a region that it reaches.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    place : (float, float, float, float)
-        x, y, z [nm] and mass [kDa].
-    region : Region
-        The pixels of `total`.
-    total : ndarray, shape (y, x)
-        Added to.
+    Shapes: `total` (y, x).
     """
     x_nm, y_nm, _, _ = place
     spans = []
@@ -251,26 +202,7 @@ def search_field(
     *,
     explains: float = EXPLAINS,
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Find new particles, and what may be but the side lobe of a known one.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and matched filter.
-    windows : Windows
-        Sums before and after.
-    events : sequence of Fitted
-        Particles that are known.
-    excess_noise : ExcessNoise, optional
-        As for `fit_field`.
-    explains : float
-        Share of the χ² in excess of a poor fit that a particle near it must explain.
-
-    Returns
-    -------
-    fresh, doubtful : list of Candidate
-        Strongest first.
-    """
+    """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     explained = scene.left(total_signal(scene, shape, events))
     likelihood = search_likelihood(scene, windows, explained)

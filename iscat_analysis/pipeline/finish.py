@@ -42,30 +42,7 @@ def gather(
     started: str,
     interrupted: bool,
 ) -> Analysis:
-    """Gather everything that is reported of a movie.
-
-    Parameters
-    ----------
-    ready : Prepared
-        The movie.
-    run : Run
-        Is told what the user should know.
-    found : Found
-        What was found in it.
-    extra : mapping
-        What ``summary.json`` says beside that.
-    command : str
-        The command line, for the record.
-    started : str
-        When, as ISO 8601 in UTC.
-    interrupted : bool
-        Whether the user stopped it.
-
-    Returns
-    -------
-    Analysis
-        What the report is made of.
-    """
+    """Gather everything that is reported of a movie."""
     progress = run.progress
     if interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)

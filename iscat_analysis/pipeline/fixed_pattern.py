@@ -26,23 +26,7 @@ _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
-    """Measure noise against averaging, and how far the fixed pattern moved.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background, and the frames with the particles.
-
-    Returns
-    -------
-    dict
-        What ``summary.json`` adds under ``"background"``; drift is from the background to the
-        frames after it, None where there is no pattern to follow.
-    """
+    """Measure noise against averaging, and how far the fixed pattern moved."""
     curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
     limit = drift = error = None
     if windows.n_before >= 2 and is_lit(windows):
@@ -107,20 +91,7 @@ def _part_moved(
 
 
 def drift_warning(name: str, background: dict[str, Any]) -> str | None:
-    """Say that the fixed pattern moved, where that can be taken for particles.
-
-    Parameters
-    ----------
-    name : str
-        Of the movie.
-    background : dict
-        From `examine_background`.
-
-    Returns
-    -------
-    str or None
-        None where it stood still, as far as one can tell.
-    """
+    """Say that the fixed pattern moved, where that can be taken for particles."""
     if background["drift_px"] is None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]

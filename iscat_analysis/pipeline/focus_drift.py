@@ -41,17 +41,7 @@ _PASSES = 10
 
 
 class FocusDrift(NamedTuple):
-    """How the focus of a movie rises.
-
-    Attributes
-    ----------
-    nm : float
-        In 1000 frames.
-    sigma_nm : float
-        Its standard error.
-    frames : (int, int)
-        Half-open range that is analysed.
-    """
+    """How the focus of a movie rises."""
 
     nm: float
     sigma_nm: float
@@ -83,26 +73,7 @@ def focus_drift(
     frames: tuple[int, int],
     mapper: Mapper = map,
 ) -> FocusDrift:
-    """Measure how the focus rises, to first order.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Pictures of a landing movie, with their own unknowns fitted.
-    config : Config
-        Resolved.
-    settings : mapping
-        The microscope with which they were fitted, of one focus.
-    frames : (int, int)
-        Half-open range that is analysed.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    FocusDrift
-        `STEADY` from fewer pictures, or times of pictures, than `LEAST_PICTURES`.
-    """
+    """Measure how the focus rises, to first order."""
     seen = dated(sights, frames)
     if len({sight.focus_steps for sight in seen}) < LEAST_PICTURES:
         return STEADY
@@ -121,30 +92,7 @@ def learned_with_drift(
     source: Mapping[str, str],
     mapper: Mapper = map,
 ) -> OpticsCalibration:
-    """Learn the optics together with the rise of their focus.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Pictures of a landing movie.
-    others : sequence of Sight
-        Every particle that `Sight.neighbours` counts.
-    config : Config
-        Resolved.
-    settings : mapping
-        A microscope near the one that made them, as it is in the middle of the movie.
-    drift : FocusDrift
-        Near which the search begins.
-    source : mapping of str to str
-        As for `calibrate_sights`.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    OpticsCalibration
-        With ``optics.focus_drift_nm``, and ``optics.focus_nm`` at the middle frame.
-    """
+    """Learn the optics together with the rise of their focus."""
     build, frames = microscopes(config, max(map(reach_nm, sights))), drift.frames
     near: dict[str, object] = {**settings, FOCUS_DRIFT: drift.nm}
     signed = with_masses(sights, build, settings)  # what leaves is seen before
@@ -166,28 +114,7 @@ def with_drift(
     source: Mapping[str, str],
     mapper: Mapper = map,
 ) -> OpticsCalibration:
-    """Look whether the focus moved in what was learned, and then learn the optics with that.
-
-    Parameters
-    ----------
-    found : OpticsCalibration
-        With one focus.
-    sights, others : sequence of Sight
-        From which it was learned.
-    config : Config
-        Resolved.
-    frames : (int, int)
-        Half-open range that is analysed.
-    source : mapping of str to str
-        As for `calibrate_sights`.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    OpticsCalibration
-        `found` itself where its focus rests, or where a moving one explains the pictures no better.
-    """
+    """Look whether the focus moved in what was learned, and then learn the optics with that."""
     settings = found.measured.settings
     drift = focus_drift(found.measured.estimate.sights, config, settings, frames, mapper)
     if not drift.moves:
@@ -197,20 +124,7 @@ def with_drift(
 
 
 def dated(sights: Sequence[Sight], frames: tuple[int, int]) -> list[Sight]:
-    """Give pictures the time of the frames that show their particle.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Pictures of a landing movie.
-    frames : (int, int)
-        Half-open range that is analysed.
-
-    Returns
-    -------
-    list of Sight
-        With `Sight.focus_steps` in thousands of frames since the middle one.
-    """
+    """Give pictures the time of the frames that show their particle."""
     part = max((frames[1] - frames[0]) / _FOCI, 1.0)
     middle = _middle(frames)
 

@@ -29,26 +29,7 @@ def decide_heights(
     fringe_nm: float,
     z_range_nm: tuple[float, float],
 ) -> Rows:
-    """Put every row into the fringe that its track says.
-
-    Parameters
-    ----------
-    field : MovingField
-        The movie, with z free.
-    ground : Ground
-        The background.
-    rows : Rows
-        Particles with their tracks; each of those without is decided alone.
-    fringe_nm : float
-        Distance of the fringes [nm].
-    z_range_nm : tuple of float
-        Where z is searched [nm].
-
-    Returns
-    -------
-    Rows
-        Fitted in their fringes.
-    """
+    """Put every row into the fringe that its track says."""
     if not len(rows.frame):
         return rows
     starts = rows.starts(field.frames)

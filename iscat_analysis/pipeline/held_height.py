@@ -47,30 +47,7 @@ def held_height_warning(
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
 ) -> str:
-    """Say that particles seem to stay at one height, where free heights lead nowhere.
-
-    Parameters
-    ----------
-    config : Config
-        In mode ``track``, with the optics as they were configured.
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames with one background.
-    fits : pandas.DataFrame
-        Rows of ``fits.csv``.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs parts of the frames.
-
-    Returns
-    -------
-    str
-        One line; empty where most rows are described, or are not at one height either.
-    """
+    """Say that particles seem to stay at one height, where free heights lead nowhere."""
     if config.track.free != "joint" or not len(fits):
         return ""
     first, last = span[0], min(span[1], span[0] + _LOOKED_AT)

@@ -51,23 +51,7 @@ IntArray = NDArray[np.int64]
 
 
 def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
-    """Exchange what comes after meetings between tracks where that is far more likely.
-
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-    near_nm : float
-        Distance within which two may be taken for each other [nm].
-    error : float
-        Of an amplitude in one frame.
-
-    Returns
-    -------
-    Rows
-        The same places, some of them in other tracks.  Where a particle had two tracks at a time,
-        the fainter one is left out.
-    """
+    """Exchange what comes after meetings between tracks where that is far more likely."""
     track = rows.track.copy()
     typical = _Typical.of(rows, near_nm, error)
     meetings = _meetings(rows, near_nm)
@@ -86,21 +70,7 @@ def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
 
 @dataclass(frozen=True)
 class _Part:
-    """What a track did for a while.
-
-    Attributes
-    ----------
-    steps : float
-        From frame to frame, so many as say as much as their median does.
-    square : float
-        Half the sum of their squares [nm²].
-    mass, variance : float
-        Median amplitude, and its variance.
-    frames : ndarray of int, shape (2,)
-        The first and the last.
-    places : ndarray, shape (2, 2)
-        Where it was in them [nm].
-    """
+    """What a track did for a while."""
 
     steps: float
     square: float
@@ -112,17 +82,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Typical:
-    """What is expected of a particle of which nothing is known.
-
-    Attributes
-    ----------
-    step_nm2 : float
-        Variance of its steps along an axis.
-    mass, variance : float
-        Of amplitudes.
-    near_nm, error : float
-        As of `identified`.
-    """
+    """What is expected of a particle of which nothing is known."""
 
     step_nm2: float
     mass: float
@@ -189,15 +149,7 @@ def _normal(off: float, variance: float) -> float:
 
 
 class _Meeting(NamedTuple):
-    """When tracks were within reach of one another.
-
-    Attributes
-    ----------
-    rows : ndarray of int
-        All that were, in order.
-    pairs : ndarray of int, shape (n, 2)
-        Those that were near each other, the nearest first.
-    """
+    """When tracks were within reach of one another."""
 
     rows: IntArray
     pairs: IntArray
@@ -205,19 +157,7 @@ class _Meeting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """A track in a meeting.
-
-    Attributes
-    ----------
-    track : int
-        Its number.
-    first, last : int
-        Frames in which others are near it.
-    before, after : _Part or None
-        Until the first, and from the last to the next meeting.
-    begins, ends : bool
-        Whether it does so in the meeting, or a few frames from it.
-    """
+    """A track in a meeting."""
 
     track: int
     first: int

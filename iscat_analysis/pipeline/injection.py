@@ -44,21 +44,7 @@ _SAME_FRAMES = 4  # beside the stated interval of the frame
 
 @dataclass(frozen=True)
 class Injected:
-    """One particle that is added to a movie.
-
-    Attributes
-    ----------
-    frame, leave : int
-        First frame with it, and first without it again.
-    x_px, y_px : float
-        Position.
-    mass_kda : float
-        Mass.
-    corner : (int, int)
-        Row and column of the first pixel of `contrast`.
-    contrast : ndarray
-        Its image.
-    """
+    """One particle that is added to a movie."""
 
     frame: int
     leave: int
@@ -70,21 +56,7 @@ class Injected:
 
 
 class InjectedMovie:
-    """A movie with particles added as it is read.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The measured one.
-    camera : Camera
-        Counts → photoelectrons.
-    particles : sequence of Injected
-        What is added.
-    seed : int
-        Of the noise; a frame's does not depend on how the movie is read.
-    trajectory : Trajectory, optional
-        Of the fixed pattern, with which the particles then move.
-    """
+    """A movie with particles added as it is read."""
 
     def __init__(
         self,
@@ -166,24 +138,7 @@ def _with_particle(
 
 
 def injected(ready: Prepared, run: Run, found: Found) -> tuple[dict[str, Any], bool]:
-    """Tell how many known particles are found, and how well they are measured.
-
-    Parameters
-    ----------
-    ready : Prepared
-        The movie.
-    run : Run
-        `Run.inject` says how many.
-    found : Found
-        What was found without them.
-
-    Returns
-    -------
-    summary : dict
-        What ``summary.json`` adds.
-    interrupted : bool
-        Whether the user stopped it; what the movie itself gave is kept.
-    """
+    """Tell how many known particles are found, and how well they are measured."""
     if not run.inject or found.interrupted:
         return {}, False
     try:
@@ -208,35 +163,7 @@ def inject_and_recover(
     progress: Progress,
     place: Place | None = None,
 ) -> dict[str, Any]:
-    """Add known particles to a movie, analyse it again and compare.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The movie.
-    config : Config
-        As it was analysed.
-    camera : Camera
-        Counts → photoelectrons.
-    result : Found
-        What was found without them: their masses are drawn from it.
-    count : int
-        Particles.
-    progress : Progress
-        Told how far it is.
-    place : Place, optional
-        As in `analyse_landings`.
-
-    Returns
-    -------
-    dict
-        From `recovery`.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        The user stopped it: half of a search says nothing of what is found.
-    """
+    """Add known particles to a movie, analyse it again and compare."""
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})
@@ -276,31 +203,7 @@ def draw_particles(
     table: pd.DataFrame,
     seed: int,
 ) -> list[Injected]:
-    """Choose what to add: anywhere, at any time, of masses as they were found.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    field_px : (int, int)
-        Rows and columns.
-    frames : (int, int)
-        Half-open range of the movie.
-    window : int
-        Frames before and after a step.
-    count : int
-        How many.
-    table : pandas.DataFrame
-        Events found in the movie; of those that are ok the masses are drawn.  Without any,
-        ``particle.mass_kda`` is taken.
-    seed : int
-        Of the choice.
-
-    Returns
-    -------
-    list of Injected
-        In order of landing.
-    """
+    """Choose what to add: anywhere, at any time, of masses as they were found."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
     good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
     if not good.size:
@@ -339,35 +242,7 @@ def recovery(
     sign: int = 0,
     threshold: float | None = None,
 ) -> dict[str, Any]:
-    """Compare what was found with what was added.
-
-    Parameters
-    ----------
-    particles : list of Injected
-        What was added.
-    found : pandas.DataFrame
-        Events of the movie with them.
-    last : int
-        One past its last frame.
-    separation_px : float
-        Steps farther from every other one than this, or than a window in time, are isolated.
-    window : int
-        Frames before and after a step.
-    sign : int
-        Of the steps that are looked for: 1 landings, −1 leavings, 0 both.
-    threshold : float, optional
-        Signal-to-noise ratio that a step must exceed, for ``predicted``.
-
-    Returns
-    -------
-    dict
-        ``stay_frames``, the shortest stay among the particles, ``added``, ``recovered``,
-        ``recall``, which says nothing of briefer stays; ``predicted``, the recall that the Fisher
-        information makes of the masses that were added, each alone; of the isolated ones
-        ``isolated``, ``recall_isolated``, ``bias_rel`` and ``bias_rel_se`` (mass),
-        ``spread_over_crb`` with its standard error, ``pull_std``, ``frame_within_1``,
-        ``frame_in_interval``.
-    """
+    """Compare what was found with what was added."""
     steps = [(p.frame, 1, p) for p in particles]
     steps += [(p.leave, -1, p) for p in particles if p.leave < last]
     frame, x, y, mass, error = (

@@ -40,17 +40,7 @@ _MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda", "told"]
 
 @dataclass(frozen=True)
 class Joined:
-    """What was followed through the blocks of a movie.
-
-    Attributes
-    ----------
-    fits : pandas.DataFrame
-        One row per particle and frame.
-    views : tuple of EventView
-        One per track, of its clearest frame.
-    followed : Followed
-        Backgrounds, and the masses of tracks.
-    """
+    """What was followed through the blocks of a movie."""
 
     fits: pd.DataFrame
     views: tuple[EventView, ...]
@@ -58,22 +48,7 @@ class Joined:
 
 
 def join_blocks(config: Config, blocks: Sequence[Block], camera: Camera) -> Joined:
-    """Make one result of the blocks of a movie.
-
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    blocks : sequence of Block
-        At least one; of successive spans.
-    camera : Camera
-        Its read noise.
-
-    Returns
-    -------
-    Joined
-        Tracks numbered in the order of their first frames.
-    """
+    """Make one result of the blocks of a movie."""
     numbers = join_tracks(config, blocks)
     table = table_of_tracks(
         pd.concat([b.table for b in blocks], ignore_index=True),
@@ -95,17 +70,7 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
     linked as two frames are, each with the median mass of its track.  A particle may be missed
     there for as many frames as elsewhere, and one that hardly moves for more.
 
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    blocks : sequence of Block
-        Of successive spans.
-
-    Returns
-    -------
-    list of ndarray of int, shape (tracks of the block,)
-        Number in the movie of every track of each block.
+    Shapes: result (tracks of the block,).
     """
     sizes = [int(b.rows.track.max(initial=-1)) + 1 for b in blocks]
     if len(blocks) == 1:
@@ -163,24 +128,7 @@ def _both(one: Rows, two: Rows) -> Rows:
 def combine_masses(
     masses: Sequence[pd.DataFrame], numbers: Sequence[IntArray], table: pd.DataFrame
 ) -> pd.DataFrame:
-    """Combine the masses of the parts of tracks by their variances.
-
-    Parameters
-    ----------
-    masses : sequence of pandas.DataFrame
-        From `iscat_analysis.pipeline.moving_table.common_masses`, of each block.
-    numbers : sequence of ndarray of int
-        From `join_tracks`.
-    table : pandas.DataFrame
-        The rows of all tracks, in which each has its ``mass_kda``.
-
-    Returns
-    -------
-    pandas.DataFrame
-        ``mass_kda``, ``sigma_mass_kda``, ``crb_mass_kda`` and ``told`` by track.  A part too short
-        to tell its blur, or whose mass is not that of most rows of its track, counts only where no
-        other does.
-    """
+    """Combine the masses of the parts of tracks by their variances."""
     if len(masses) == 1:
         return masses[0][_MASS]
     parts = pd.concat(masses, ignore_index=True)

@@ -47,19 +47,7 @@ class _Frames(KeptFrames[Stack]):
 
 @dataclass(frozen=True)
 class Kept:
-    """What is left of a movie.
-
-    Attributes
-    ----------
-    movie : Stack
-        Of the frames that are kept, where any was left out; else the movie itself.
-    span : (int, int)
-        Half-open range of its frames to be analysed.
-    numbers : ndarray of int, shape (n,), or None
-        Of these frames in the movie; None where all are kept.
-    message : str
-        Which were left out; empty where all are kept.
-    """
+    """What is left of a movie."""
 
     movie: Stack
     span: tuple[int, int]
@@ -67,18 +55,7 @@ class Kept:
     message: str = ""
 
     def put_back(self, found: Found) -> Found:
-        """Give frames the numbers that they have in the movie.
-
-        Parameters
-        ----------
-        found : Found
-            What was found in the frames that were kept.
-
-        Returns
-        -------
-        Found
-            The same, frame by frame of the movie.
-        """
+        """Give frames the numbers that they have in the movie."""
         if self.numbers is None or found.followed is None:
             return found
         numbers, followed = self.numbers, found.followed
@@ -100,24 +77,7 @@ class Kept:
 def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
 ) -> Kept:
-    """Leave out frames that show nothing new.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames to be analysed.
-    additive : bool
-        Whether particles add light to a background that is next to none, as in dark field.
-
-    Returns
-    -------
-    Kept
-        The others.
-    """
+    """Leave out frames that show nothing new."""
     dark, repeats = _odd(movie, camera, span, additive=additive)
     good = ~(dark | repeats)
     if good.all() or not good.any():

@@ -150,18 +150,7 @@ def fit_kinetics(
 
 
 def configured_frame_rate(path: Path) -> float | None:
-    """Read the frame rate off the configuration that lies beside a table.
-
-    Parameters
-    ----------
-    path : Path
-        The table, or its folder.
-
-    Returns
-    -------
-    float or None
-        Frames per second; None where none is known.
-    """
+    """Read the frame rate off the configuration that lies beside a table."""
     folder = path if path.is_dir() else path.parent
     try:
         text = (folder / "config.toml").read_text(encoding="utf-8")

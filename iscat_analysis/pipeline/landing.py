@@ -47,28 +47,7 @@ POSTERIORS = 20
 
 
 def find_landings(ready: Prepared, run: Run) -> Found:
-    """Find what lands or leaves between windows that slide over a movie.
-
-    Parameters
-    ----------
-    ready : Prepared
-        The movie.
-    run : Run
-        Is told what the user should know.
-
-    Returns
-    -------
-    Found
-        As `analyse_landings` gives it.
-
-    Raises
-    ------
-    FloodError
-        Noise passes the threshold everywhere; where the movie seems to be of another kind, it says
-        that instead.
-    DataError
-        As for `analyse_landings`.
-    """
+    """Find what lands or leaves between windows that slide over a movie."""
     for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
         run.notify(remark)
     try:
@@ -109,45 +88,7 @@ def analyse_landings(
     place: Place | None = None,
     opening: Opening | None = None,
 ) -> Found:
-    """Find and fit every particle that lands or leaves.
-
-    Parameters
-    ----------
-    movie : CountSource
-        The movie.
-    config : Config
-        Resolved, with ``background.method = "sliding"``.
-    camera : Camera
-        Counts → photoelectrons.
-    tell : callable
-        Told what the user should know, one line each.
-    progress : Progress
-        Told how many frames are done.
-    prepare : callable
-        Given the models before the first fit.
-    partial : Path, optional
-        Folder that keeps finished chunks; who gave it removes it once the result is safe.
-    identity : str
-        What tells the movie's content from another's; finished chunks of another are not used.
-    lines : Lines, optional
-        Rows and columns that flicker; they are divided by their light as frames are read.
-    place : Place, optional
-        Where the chunks are analysed; default in this process.
-    opening : Opening, optional
-        Of the movie without the flicker of `lines`, where it was judged.
-
-    Returns
-    -------
-    Found
-        One row per step, in order of frame; views of the first `VIEWS` events; the light of every
-        frame.  An interrupt keeps the chunks that are finished.
-
-    Raises
-    ------
-    DataError
-        The movie is shorter than two windows, a frame is impossible, or the chunks do not fit into
-        ``compute.memory_limit_mb``.
-    """
+    """Find and fit every particle that lands or leaves."""
     place = place or Here()
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)

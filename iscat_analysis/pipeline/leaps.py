@@ -20,18 +20,7 @@ _LEAP = 5.0  # root mean squares of the distance from there; further are 1 in 10
 
 
 def brought_back(rows: Rows) -> Rows:
-    """Put rows that leap aside among those before and after them.
-
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    Rows
-        The same, as starts of a fit; those that were put back have the median amplitude.
-    """
+    """Put rows that leap aside among those before and after them."""
     theta = rows.theta.copy()
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)

@@ -70,36 +70,7 @@ def learn_optics(
     notify: Callable[[str], None] = unheard,
     opening: Opening | None = None,
 ) -> tuple[Config, dict[str, Any]]:
-    """Test the configured optics on the brightest particles, and learn them where they fail.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, or one with background frames.
-    config : Config
-        Resolved; ``optics.calibrate`` says what is wanted.
-    camera : Camera
-        Counts → photoelectrons.
-    tell : callable
-        Told in one line what was found, unless the configured optics are fine.
-    notify : callable
-        Told that they are being learned, which may take minutes.
-    opening : Opening, optional
-        As in `bright_sights`.
-
-    Returns
-    -------
-    config : Config
-        With the learned optics and ``calibrate = "never"``, so that it repeats the analysis; or as
-        it was.
-    summary : dict
-        What ``summary.json`` says of it; empty where nothing was tested.
-
-    Raises
-    ------
-    DataError
-        The frames are impossible, for the analysis too.
-    """
+    """Test the configured optics on the brightest particles, and learn them where they fail."""
     optics = config.optics
     reason = why_not(config)
     if reason and optics.calibrate == "always":
@@ -170,18 +141,7 @@ def learn_optics(
 
 
 def why_not(config: Config) -> str:
-    """Say of what movies, or with what configuration, no optics are learned.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved.
-
-    Returns
-    -------
-    str
-        Some words; empty where they can be learned.
-    """
+    """Say of what movies, or with what configuration, no optics are learned."""
     optics, mode, way = config.optics, config.fit.mode, way_of(config)
     tracks = mode == "track"
     reasons = (
@@ -202,22 +162,7 @@ def why_not(config: Config) -> str:
 
 
 def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
-    """Say that too few particles stand alone.
-
-    Parameters
-    ----------
-    name : str
-        Of the movie.
-    number : int
-        How many do.
-    by_noise : bool
-        Whether they are told by a noise that is not what it seems.
-
-    Returns
-    -------
-    str
-        One line.
-    """
+    """Say that too few particles stand alone."""
     said = (
         f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
         f"needed to test the optics, {LEAST_SIGHTS} to learn them"
@@ -236,30 +181,7 @@ def taken(
     pictures_of: str = "particles",
     tell: Callable[[str], None],
 ) -> tuple[Config, dict[str, Any]]:
-    """Take what was learned, where it may be used, and say so.
-
-    Parameters
-    ----------
-    found : OpticsCalibration
-        What was learned.
-    config : Config
-        As configured.
-    tested : mapping
-        What ``summary.json`` says of the test.
-    verdict : str
-        What the test found, for where nothing is taken.
-    pictures_of : str
-        What was looked at, in the plural.
-    tell : callable
-        Told what the user should know.
-
-    Returns
-    -------
-    config : Config
-        With the learned optics and ``calibrate = "never"``, or as it was.
-    summary : dict
-        What ``summary.json`` says.
-    """
+    """Take what was learned, where it may be used, and say so."""
     learned, why = usable(found, config)
     if learned is None:
         tell(f"{verdict}: {why}; the analysis goes on as configured")
@@ -295,36 +217,7 @@ def calibrate_movie(
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
 ) -> OpticsCalibration:
-    """Measure the optics of an open movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, one with frames before the particles bound, or a scan of the focus.
-    config : Config
-        The microscope as far as it is known; `iscat_analysis.pipeline.analyse` reads it likewise.
-    free : str or sequence of str, optional
-        What may change: some of ``focus, na, phase, mask, zernike, polarization``; default all.
-    focus_step_nm : float, optional
-        The movie is a scan of immobile particles, and from frame to frame the focus rises by about
-        this [nm]; where the focus is free, the step is measured too.
-    progress : Progress
-        Told how far it is.
-    notify : callable
-        Told what the user should know, one line at a time.
-
-    Returns
-    -------
-    OpticsCalibration
-        What was found; `OpticsCalibration.accepted` says whether it may be used.
-
-    Raises
-    ------
-    DataError
-        The movie shows too few bright, isolated particles.
-    ConfigError
-        The configuration cannot be calibrated.
-    """
+    """Measure the optics of an open movie."""
     groups = free_groups(free)
     if focus_step_nm is not None:
         _check_step(focus_step_nm, movie.shape[0])
@@ -377,37 +270,7 @@ def learned_from(
     source: Mapping[str, str],
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
-    """Learn the optics from particles that stand alone, or where these do not suffice from all.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Those that stand alone.
-    others : sequence of Sight
-        Every particle that `Sight.neighbours` counts.
-    movie : Stack
-        The movie.
-    config : Config
-        Resolved; with the optics where the search begins.
-    camera : Camera
-        Counts → photoelectrons.
-    groups : sequence of str
-        As for `calibrate_sights`.
-    source : mapping of str to str
-        As for `calibrate_sights`.
-    pool : ThreadPoolExecutor
-        Runs the fits.
-
-    Returns
-    -------
-    OpticsCalibration
-        What was found.
-
-    Raises
-    ------
-    DataError
-        There are too few particles.
-    """
+    """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     way = way_of(config)
     crowded = way == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
@@ -426,22 +289,7 @@ def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
 
 
 def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
-    """Tell whether the first frames repeat each other, or have not the noise of p-values.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Resolved.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    bool
-        Whether p-values cannot be right.
-    """
+    """Tell whether the first frames repeat each other, or have not the noise of p-values."""
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
@@ -473,22 +321,7 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
 
 
 def usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
-    """Give the configuration with the learned optics, or why there is none.
-
-    Parameters
-    ----------
-    found : OpticsCalibration
-        What was learned.
-    config : Config
-        As configured.
-
-    Returns
-    -------
-    config : Config or None
-        With the learned optics and ``calibrate = "never"``.
-    reason : str
-        Why there is none.
-    """
+    """Give the configuration with the learned optics, or why there is none."""
     if not found.accepted:
         return None, "; ".join(found.measured.refusals)
     return with_sign(config.model_copy(update={"optics": found.config.optics}))

@@ -34,19 +34,7 @@ _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
 class Pair(NamedTuple):
-    """Frames next to each other, and others a window later.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first of them.
-    before : ndarray, shape (t, y, x)
-        The good ones among them [counts].
-    later : int
-        Number of the first of the others.
-    after : ndarray, shape (t, y, x)
-        The good ones among these [counts].
-    """
+    """Frames next to each other, and others a window later."""
 
     first: int
     before: NDArray[Any]
@@ -56,19 +44,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class JudgedLight:
-    """A movie whose light and pixels were looked at.
-
-    Attributes
-    ----------
-    movie : Stack
-        Without the pixels that are unsteady.
-    lines : Lines or None
-        What of the light may be divided out.
-    messages : tuple of str
-        What the user should know, one line each.
-    steady : Stack
-        The movie with `lines` divided out.
-    """
+    """A movie whose light and pixels were looked at."""
 
     movie: Stack
     lines: Lines | None
@@ -77,22 +53,7 @@ class JudgedLight:
 
 
 def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
-    """Look for pixels and for parts of the light that are unsteady.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Says which frames are compared with which.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    JudgedLight
-        Of dark field the movie itself: its particles are few pixels in the dark.
-    """
+    """Look for pixels and for parts of the light that are unsteady."""
     if config.optics.scheme == "darkfield":
         return JudgedLight(movie, None, (), movie)
     pairs, window = _pairs(movie, config, camera)
@@ -116,30 +77,7 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
 def judge_lines(
     movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
 ) -> Lines | None:
-    """Look for rows, columns and a smooth part of the light that may be divided out.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Lines are looked for in its background frames, or in the first that are analysed; smooth
-        changes in all of them.  Nothing is where ``background.power_normalization`` is false, the
-        background is dark or known, or the fixed pattern is followed as it moves: it changes the
-        light of the lines far more than flicker, as nanoparticles that move in a volume do, which
-        are there in every frame.
-    camera : Camera
-        Counts → photoelectrons.
-    pairs : sequence of Pair
-        Frames, and others a window later.
-    window : int
-        Frames that are compared with as many others.
-
-    Returns
-    -------
-    Lines or None
-        None where there is nothing to correct.
-    """
+    """Look for rows, columns and a smooth part of the light that may be divided out."""
     background = config.background
     way = way_of(config)
     if (

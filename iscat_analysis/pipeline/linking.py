@@ -43,29 +43,7 @@ def linked(
 ) -> Rows:
     """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place.
 
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    rows : Rows
-        Particles, in any tracks or none.
-    places : ndarray, shape (n, axes)
-        From `mass_places`.
-    bridged : bool
-        Join tracks of slow particles over gaps longer than the memory too.
-    inner : (int, int), optional
-        Half-open range of frames; a track that reaches out of it may go on in the next block of
-        frames, and is kept however short it is here.
-
-    Returns
-    -------
-    Rows
-        With tracks of `track.min_frames` and more, numbered by first frame and place.
-
-    Raises
-    ------
-    DataError
-        Particles and background did not settle.
+    Shapes: `places` (n, axes).
     """
     if not np.isfinite(places).all():
         raise DataError(
@@ -104,17 +82,7 @@ def mass_places(config: Config, rows: Rows) -> FloatArray:
     A step of the mass by its own error counts as much as one of `_STEP` of the farthest that a
     particle goes, so that particles of unlike mass keep their numbers where they cross.
 
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    rows : Rows
-        Particles, fitted but for a few.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        As lengths [nm].
+    Shapes: result (n, 3).
     """
     if not len(rows.frame):
         return rows.theta[:, :2]
@@ -124,41 +92,14 @@ def mass_places(config: Config, rows: Rows) -> FloatArray:
 def with_mass(config: Config, rows: Rows, error: float) -> FloatArray:
     """Add the mass to the places, as a length.
 
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    rows : Rows
-        Particles.
-    error : float
-        Of the amplitude in a frame, from `typical_error`.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        As lengths [nm].
+    Shapes: result (n, 3).
     """
     length = _STEP * config.track.max_step_nm / mass_error(config, rows, error)
     return np.column_stack([rows.theta[:, :2], rows.theta[:, 3] * length])
 
 
 def mass_error(config: Config, rows: Rows, error: float) -> float:
-    """Say by how much the amplitude of one particle may change from frame to frame.
-
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    rows : Rows
-        Particles.
-    error : float
-        Of the amplitude in a frame, from `typical_error`.
-
-    Returns
-    -------
-    float
-        More where z is free: motion along z, and a fringe that is not decided yet, change it.
-    """
+    """Say by how much the amplitude of one particle may change from frame to frame."""
     if config.track.free == "joint" and len(rows.frame):
         return max(error, _UNSURE * float(np.median(rows.theta[:, 3])))
     return error
@@ -167,32 +108,13 @@ def mass_error(config: Config, rows: Rows, error: float) -> float:
 def typical_error(fisher: FloatArray) -> float:
     """Give the error of an amplitude in one frame, at known places.
 
-    Parameters
-    ----------
-    fisher : ndarray, shape (n, 4, 4)
-        Information of all rows in (x, y, z, a); NaN where it is not known.
-
-    Returns
-    -------
-    float
-        1/√F, F the median information.
+    Shapes: `fisher` (n, 4, 4).
     """
     return 1 / math.sqrt(max(float(np.nanmedian(fisher[:, 3, 3])), 1e-300))
 
 
 def typical(rows: Rows) -> Rows:
-    """Give every row the median amplitude of its track.
-
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    Rows
-        At the same places.
-    """
+    """Give every row the median amplitude of its track."""
     theta = rows.theta.copy()
     for k in np.unique(rows.track):
         mine = rows.track == k
@@ -206,22 +128,7 @@ def alone(
     *,
     inner: tuple[int, int] | None = None,
 ) -> Rows:
-    """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours.
-
-    Parameters
-    ----------
-    scene : Scene
-        Configuration and threshold.
-    rows : Rows
-        Particles with their tracks, fitted but for a few.
-    inner : (int, int), optional
-        As in `linked`.
-
-    Returns
-    -------
-    Rows
-        Of the tracks that are kept, numbered anew.
-    """
+    """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
     config = scene.config
     if not len(rows.frame):
         return rows
@@ -235,17 +142,7 @@ def alone(
 def seen(scene: Scene, rows: Rows) -> BoolArray:
     """Tell which tracks are seen in most of the frames in which they are fitted.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its threshold.
-    rows : Rows
-        Particles with their tracks, fitted but for a few.
-
-    Returns
-    -------
-    ndarray of bool, shape (tracks,)
-        True for each that is.
+    Shapes: result (tracks,).
     """
     fitted = rows.only(np.isfinite(rows.snr))
     snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
@@ -256,24 +153,7 @@ def seen(scene: Scene, rows: Rows) -> BoolArray:
 
 
 def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
-    """Let slow particles stay where they were before and after they were seen, to be tried.
-
-    Parameters
-    ----------
-    config : Config
-        Its ``[track]``.
-    field : MovingField
-        The movie.
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    rows : Rows
-        With the frames to be tried.
-    tried : int
-        How many.
-    """
+    """Let slow particles stay where they were before and after they were seen, to be tried."""
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
     for k in np.unique(rows.track):
@@ -296,18 +176,7 @@ def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
 
 
 def trimmed(rows: Rows) -> Rows:
-    """Cut tracks where they begin and end with frames that hold too little of their mass.
-
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    Rows
-        Those that are kept.
-    """
+    """Cut tracks where they begin and end with frames that hold too little of their mass."""
     kept = np.ones(len(rows.frame), dtype=bool)
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)
@@ -321,17 +190,7 @@ def trimmed(rows: Rows) -> Rows:
 def shares_mass(rows: Rows, judged: Judged) -> BoolArray:
     """Tell which rows differ so much from their track's mass that they hold part of another's.
 
-    Parameters
-    ----------
-    rows : Rows
-        Particles, at their estimates.
-    judged : Judged
-        Of these rows.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        Where the mass is `OUTLYING` standard deviations, as its track scatters, from the median.
+    Shapes: result (n,).
     """
     error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
     return unlike(rows.track, rows.theta[:, 3], error)
@@ -340,17 +199,7 @@ def shares_mass(rows: Rows, judged: Judged) -> BoolArray:
 def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
     """Tell which rows have a mass that is not that of their track.
 
-    Parameters
-    ----------
-    track : ndarray of int, shape (n,)
-        Of each row.
-    mass, error : ndarray, shape (n,)
-        Its mass, or amplitude, and the error of that.
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        Where it is `OUTLYING` standard deviations, as the track scatters, from the median.
+    Shapes: `track` (n,), `mass, error` (n,), result (n,).
     """
     out = np.zeros(len(track), dtype=bool)
     for k in np.unique(track):
@@ -364,17 +213,7 @@ def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
 def crowded(rows: Rows, limit_nm: float) -> BoolArray:
     """Tell which rows have another particle of their frame nearer than a limit.
 
-    Parameters
-    ----------
-    rows : Rows
-        Particles.
-    limit_nm : float
-        Distance [nm].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        True for both of a pair.
+    Shapes: result (n,).
     """
     out = np.zeros(len(rows.frame), dtype=bool)
     out[rows.pairs_within(limit_nm)] = True
@@ -386,17 +225,7 @@ def meeting(rows: Rows, limit_nm: float) -> BoolArray:
 
     While two are so near that one fit takes the light of both, the other has no row beside it.
 
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-    limit_nm : float
-        Distance within which they are crowded [nm].
-
-    Returns
-    -------
-    ndarray of bool, shape (n,)
-        True where a row of the same track, at most `_MEETING` frames away, is crowded.
+    Shapes: result (n,).
     """
     near = crowded(rows, limit_nm)
     apart = _MEETING + 1  # between tracks, so that frames of one are not near those of another
@@ -416,17 +245,7 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     What moves slowly hides in the first background, which is that of most of the frames; it is seen
     again near where it was.  In the gap it must not have gone farther than a resolution.
 
-    Parameters
-    ----------
-    config : Config
-        Its optics.
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        Track of each row.
+    Shapes: result (n,).
     """
     reach = config.optics.wavelength_nm / config.optics.na
     tracks = [np.flatnonzero(rows.track == k) for k in np.unique(rows.track)]
@@ -456,32 +275,13 @@ def _step_nm2(rows: Rows, mine: IntArray) -> float:
 def mean_square(steps: FloatArray) -> float:
     """Give the mean square of normal steps, from its median, to which stray ones do little.
 
-    Parameters
-    ----------
-    steps : ndarray, shape (n, 2)
-        At least one, in a plane.
-
-    Returns
-    -------
-    float
-        Along both axes together.
+    Shapes: `steps` (n, 2).
     """
     return float(np.median((steps**2).sum(axis=1)) / np.log(2))
 
 
 def numbered(rows: Rows) -> Rows:
-    """Give tracks numbers by their first frame and place.
-
-    Parameters
-    ----------
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    Rows
-        The same, tracks numbered from 0.
-    """
+    """Give tracks numbers by their first frame and place."""
     _, first = np.unique(rows.track, return_index=True)
     numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)
     order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))

@@ -129,19 +129,7 @@ class Search(Protocol):
 
 
 class LandingSearch:
-    """What lands or leaves between two windows of a landing movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Resolved.
-    camera : Camera
-        Counts → photoelectrons.
-    lines : Lines or None
-        Rows and columns that flicker.
-    """
+    """What lands or leaves between two windows of a landing movie."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self.frames = first, last = fitted_frames(movie, config)
@@ -215,19 +203,7 @@ class LandingSearch:
 
 
 class BoundSearch:
-    """What is there in some frames and was not in the background.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Resolved.
-    camera : Camera
-        Counts → photoelectrons.
-    lines : Lines or None
-        Rows and columns that flicker.
-    """
+    """What is there in some frames and was not in the background."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -295,19 +271,7 @@ class BoundSearch:
 
 
 class MovingSearch:
-    """What is in one frame and not in the median of the frames around it.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Resolved.
-    camera : Camera
-        Counts → photoelectrons.
-    lines : Lines or None
-        Rows and columns that flicker.
-    """
+    """What is in one frame and not in the median of the frames around it."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -378,23 +342,7 @@ def _listed(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
 
 
 def positive(threshold: float) -> float:
-    """Refuse a threshold that is none.
-
-    Parameters
-    ----------
-    threshold : float
-        Signal-to-noise ratio.
-
-    Returns
-    -------
-    float
-        The same.
-
-    Raises
-    ------
-    ConfigError
-        It is not a positive number.
-    """
+    """Refuse a threshold that is none."""
     if not (math.isfinite(threshold) and threshold > 0):
         raise ConfigError(f"threshold = {threshold:g} must be a positive signal-to-noise ratio")
     return threshold

@@ -45,13 +45,7 @@ class Done:
 
 
 class Merged:
-    """Finished chunks, in order.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    """
+    """Finished chunks, in order."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
         self._done: list[Done] = []

@@ -41,18 +41,7 @@ _MODELS_KEPT = 24
 
 
 def refuse_uncalibratable(config: Config) -> None:
-    """Refuse what has no reference to interfere with, or no derivative.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved.
-
-    Raises
-    ------
-    ConfigError
-        The scheme is dark field, or the convention the paper's.
-    """
+    """Refuse what has no reference to interfere with, or no derivative."""
     if config.optics.scheme == "darkfield":
         raise ConfigError(
             'optics.scheme = "darkfield" has no reference, and the optics are learned from the '
@@ -74,40 +63,7 @@ def calibrate_sights(
     known: Settings | None = None,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
-    """Measure the optics from pictures.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        The pictures.
-    others : sequence of Sight
-        Every particle that `Sight.neighbours` counts.
-    config : Config
-        Resolved.
-    groups : sequence of str
-        From `free_groups`.
-    source : mapping of str to str
-        Where the pictures came from.
-    focus_step_nm : float, optional
-        Of a scan: rise of the focus from frame to frame, from which the search starts [nm].
-    least : int
-        Pictures needed.
-    known : mapping, optional
-        As for `measure_microscope`; with `FOCUS_DRIFT`, which is then measured too, of pictures
-        whose `Sight.focus_steps` count frames.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    OpticsCalibration
-        What was found.
-
-    Raises
-    ------
-    DataError
-        There are too few pictures.
-    """
+    """Measure the optics from pictures."""
     if len(sights) < least:
         raise DataError(
             f"{source['movie']}: shows {count(len(sights), 'bright particle')} standing alone, and "
@@ -144,20 +100,7 @@ def calibrate_sights(
 
 
 def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
-    """Make models of changing optics, and keep the last few.
-
-    Parameters
-    ----------
-    config : Config
-        What does not change.
-    reach_nm : float
-        As in `forward_model` [nm].
-
-    Returns
-    -------
-    callable
-        Settings → model.
-    """
+    """Make models of changing optics, and keep the last few."""
     latest = threading.local()  # neighbours in a search often share their tables
 
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
@@ -171,38 +114,12 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
 
 
 def rings_of(config: Config, sight: Sight) -> Callable[[Settings], ForwardModel]:
-    """Make models as far as rings of neighbours matter.
-
-    Parameters
-    ----------
-    config : Config
-        What does not change.
-    sight : Sight
-        One of the pictures, for its size.
-
-    Returns
-    -------
-    callable
-        Settings → model.
-    """
+    """Make models as far as rings of neighbours matter."""
     return microscopes(config, RINGS_NM + sight.grid.diagonal_nm)
 
 
 def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:
-    """Reduced χ² and p-value of a fitted picture.
-
-    Parameters
-    ----------
-    sight : Sight
-        With its own unknowns fitted.
-    model : ForwardModel
-        The microscope.
-
-    Returns
-    -------
-    chi2_reduced, p_value : float
-        From `goodness_of_fit`.
-    """
+    """Reduced χ² and p-value of a fitted picture."""
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
     return goodness_of_fit(likelihood, sight.private, sight.free)
 
@@ -212,18 +129,6 @@ def with_sign(config: Config) -> tuple[Config | None, str]:
 
     A line between contrast and mass fixes that sign, and with it the reference phase of two that
     differ by half a turn.
-
-    Parameters
-    ----------
-    config : Config
-        With the learned optics.
-
-    Returns
-    -------
-    config : Config or None
-        With one of both phases, and ``calibrate = "never"``; None where neither has that sign.
-    reason : str
-        Why there is none.
     """
     phase = config.optics.reference_phase_deg
     reason = ""

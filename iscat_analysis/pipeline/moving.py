@@ -83,31 +83,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Moving:
-    """What was found in a movie.
-
-    Attributes
-    ----------
-    rows : Rows
-        Every particle in every frame of its life.
-    ground : Ground
-        The light without them.
-    judged : Judged
-        What the likelihood says of each row.
-    converged : ndarray of bool, shape (n,)
-        Which fits did.
-    close : ndarray of bool, shape (n,)
-        Which rows are so near to another, or so unlike their track, that masses may be shared.
-    variances_nm2 : ndarray, shape (groups,)
-        Variance of the path about its mean, of every group of rows.
-    diffusion : ndarray, shape (tracks, 2)
-        D and its standard error, as the blur was made of [µm²/s].
-    field : MovingField
-        The movie.
-    shared : ndarray, shape (n, 4, 4)
-        Covariance of (x, y, z, a) of each row that its background adds.
-    common : CommonAmplitudes
-        One amplitude for each track.
-    """
+    """What was found in a movie."""
 
     rows: Rows
     ground: Ground
@@ -138,41 +114,7 @@ def follow(
     inner: tuple[int, int] | None = None,
     cautious: bool = False,
 ) -> Moving:
-    """Find and fit every particle in every frame.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`.
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames; the result does not depend on its size.
-    progress : Progress
-        Told the stages.
-    inner : (int, int), optional
-        Frames of the span, counted from its first, beyond which tracks may go on in other spans: a
-        track that reaches out of them is kept however short it is.
-    cautious : bool
-        Follow only what stands alone, as it is seen: through optics that are very wrong what they
-        leave over would be taken for particles.
-
-    Returns
-    -------
-    Moving
-        Tracks, numbered in the order of their first frames.
-
-    Raises
-    ------
-    DataError
-        The span is too short, or more is found in it than particles.
-    """
+    """Find and fit every particle in every frame."""
     config = scene.config
     field = load_field(scene, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
@@ -276,13 +218,7 @@ def follow(
 
 
 def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:
-    """Refuse more rows in a frame than particles that could be told apart, before all are fitted.
-
-    Raises
-    ------
-    DataError
-        There are.
-    """
+    """Refuse a frame with more rows than particles that could be told apart."""
     side_um = field.pixel_nm / 1e3
     area = side_um**2 * float(field.used.sum())
     resolution = config.optics.wavelength_nm / config.optics.na / 1e3
@@ -356,19 +292,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
 
     Places in a meeting are off by more than their errors say, and would count as steps.
 
-    Parameters
-    ----------
-    config : Config
-        Frame rate, exposure, and how near particles are too near.
-    free : ndarray of bool, shape (5,)
-        Fitted parameters.
-    rows : Rows
-        Particles with their tracks.
-
-    Returns
-    -------
-    ndarray, shape (tracks, 2)
-        D and its standard error [µm²/s]; 0 where a track is too short to tell.
+    Shapes: `free` (5,), result (tracks, 2).
     """
     tracks = int(rows.track.max(initial=-1)) + 1
     out = np.zeros((tracks, 2))
@@ -394,21 +318,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
 def blurred_rows(rows: Rows, diffusion: FloatArray, exposure_s: float) -> tuple[Rows, FloatArray]:
     """Give the blurs of tracks numbers, those that hardly differ the same.
 
-    Parameters
-    ----------
-    rows : Rows
-        With their tracks.
-    diffusion : ndarray, shape (tracks, 1 or more)
-        D of each track first [µm²/s].
-    exposure_s : float
-        Of a frame [s].
-
-    Returns
-    -------
-    rows : Rows
-        With the numbers of their blurs.
-    variances_nm2 : ndarray, shape (groups,)
-        As for `MovingField.set_blurs`.
+    Shapes: `diffusion` (tracks, 1 or more), `variances_nm2` (groups,).
     """
     d = np.nan_to_num(diffusion[:, 0])
     q = np.array([path_variance_nm2(float(v), exposure_s) for v in d]).reshape(-1)

@@ -42,19 +42,7 @@ _BLOCK = 16  # frames that are read or searched at a time; what more of them nee
 
 
 def exposure_of(config: Config) -> tuple[float, float]:
-    """Give the frame rate and the exposure.
-
-    Parameters
-    ----------
-    config : Config
-        Its camera.
-
-    Returns
-    -------
-    rate_hz, exposure_s : float
-        Where the rate is not known one frame is the unit of time, which it lasts as a whole: how
-        far a particle goes in it, and so its blur, is seen all the same.
-    """
+    """Give the frame rate and the exposure."""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
         return 1.0, 1.0
@@ -64,44 +52,14 @@ def exposure_of(config: Config) -> tuple[float, float]:
 def track_scene(
     config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
 ) -> Scene:
-    """Make models and matched filter for single frames.
-
-    Parameters
-    ----------
-    config : Config
-        In mode track.
-    field_px : (int, int)
-        Rows and columns.
-    frames : int
-        They share the expected false alarms.
-    lines : Lines, optional
-        What was divided out of the frames.
-
-    Returns
-    -------
-    Scene
-        In mode mass or joint, as `track.free` says.
-    """
+    """Make models and matched filter for single frames."""
     fit = config.fit.model_copy(update={"mode": config.track.free})
     tracked = config.model_copy(update={"fit": fit})
     return make_scene(tracked, field_px, searches=frames, lines=lines)
 
 
 def opening_ground(config: Config, field: MovingField) -> Ground:
-    """Give the background before there are tracks; of all frames together, it remains so.
-
-    Parameters
-    ----------
-    config : Config
-        ``background.method``: a mean where that is ``"fixed"``, else a median.
-    field : MovingField
-        The movie.
-
-    Returns
-    -------
-    Ground
-        Level and power.
-    """
+    """Give the background before there are tracks; of all frames together, it remains so."""
     ground = first_ground(field, follow_power=config.background.power_normalization)
     if config.background.method == "fixed":
         ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
@@ -117,35 +75,7 @@ def load_field(
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> MovingField:
-    """Read the frames, which stay as they are stored where that takes less memory.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`.
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames.
-    progress : Progress
-        Told how many frames are read.
-
-    Returns
-    -------
-    MovingField
-        All frames of the span.
-
-    Raises
-    ------
-    DataError
-        The span is too short.
-    """
+    """Read the frames, which stay as they are stored where that takes less memory."""
     first, last = span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     if frames < LEAST_FRAMES:
@@ -199,23 +129,6 @@ def give_back(
 
     A particle is part of the light of its lines, and of whatever else each frame was divided by.
     Where it is known, that light is known without it.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`; where nothing was divided out, nothing is done.
-    field : MovingField
-        From `load_field`; its frames are changed.
-    movie : CountSource
-        The movie, as it was divided.
-    camera : Camera
-        Counts → photoelectrons.
-    first : int
-        Number of the field's first frame.
-    ground : Ground
-        The light without particles.
-    rows : Rows
-        Particles.
     """
     lines = scene.lines
     if lines is None or not len(rows.frame):
@@ -270,33 +183,7 @@ def search_frames(
     enough: int = 0,
     cautious: bool = False,
 ) -> Sightings:
-    """Find candidates in what the rows leave over.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `track_scene`.
-    field : MovingField
-        The frames.
-    ground : Ground
-        The light without particles.
-    rows : Rows
-        Particles that are known.
-    pool : ThreadPoolExecutor
-        Runs blocks of frames; the result does not depend on its size.
-    frames : (int, int), optional
-        Which of the field's frames, half-open; default all.
-    enough : int
-        Candidates in all frames, up to which none are worth it: where one of `_SAMPLED` blocks of
-        frames tells that there are no more, the others are not searched.
-    cautious : bool
-        As in `FrameFilter`.
-
-    Returns
-    -------
-    Sightings
-        Above the threshold.
-    """
+    """Find candidates in what the rows leave over."""
     side = scene.roi_px
     if scene.mode == "joint":
         side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)

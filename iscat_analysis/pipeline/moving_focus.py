@@ -20,15 +20,7 @@ _KEPT = 64  # models at hand, of some MB each
 
 
 class MovingFocus:
-    """Models of one movie, by frame.
-
-    Parameters
-    ----------
-    config : Config
-        With ``optics.focus_drift_nm`` and the frame at which the focus is ``optics.focus_nm``.
-    model : ForwardModel
-        At that focus; a mass is the same amplitude at all others.
-    """
+    """Models of one movie, by frame."""
 
     def __init__(self, config: Config, model: ForwardModel) -> None:
         self._optics = config.optics
@@ -51,18 +43,7 @@ class MovingFocus:
 
 
 def refuse_moving_focus(config: Config) -> None:
-    """Refuse a focus that moves where pictures are those of one focus.
-
-    Parameters
-    ----------
-    config : Config
-        Of a movie that is not searched for landings, or of a measured picture.
-
-    Raises
-    ------
-    ConfigError
-        It moves.
-    """
+    """Refuse a focus that moves where pictures are those of one focus."""
     if config.optics.focus_drift_nm:
         raise ConfigError(
             f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g} is known only of landing "

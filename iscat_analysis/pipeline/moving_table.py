@@ -34,22 +34,6 @@ _APART = 0.05  # relative step of a blur
 def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame:
     """Make a line of ``fits.csv`` for every row, without its number and its verdict.
 
-    Parameters
-    ----------
-    scene : Scene
-        From `iscat_analysis.pipeline.moving.track_scene`.
-    moving : Moving
-        From `iscat_analysis.pipeline.moving.follow`.
-    first_frame : int
-        Number in the movie of the first frame that was analysed.
-
-    Returns
-    -------
-    pandas.DataFrame
-        In the order of the rows, those outside the field too; ``track`` is the number in these
-        frames, and ``flags`` what is remarked on the row itself.  `table_of_tracks` makes the
-        columns `EVENT_COLUMNS` of it.
-
     Notes
     -----
     Errors hold what is not known of the path in a single frame, on a membrane that of the mass,
@@ -103,25 +87,7 @@ def table_of_tracks(
 ) -> pd.DataFrame:
     """Judge the lines of a movie, number them, and keep those of tracks seen long enough.
 
-    Parameters
-    ----------
-    lines : pandas.DataFrame
-        From `moving_table`, of all blocks.
-    track : ndarray of int, shape (n,)
-        Number in the movie of the track of each line.
-    inside : ndarray of bool, shape (n,)
-        Which particles are in the field: the others were fitted for the sake of these.
-    min_frames : int
-        Lines of a track in the field, at least.
-    parted : bool
-        Whether there are several blocks: each has compared the masses of its part of a track, and
-        here they are compared with those of the whole.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `EVENT_COLUMNS`, and ``track``, which is the number of the event too; track by
-        track, in the order of the frames.
+    Shapes: `track` (n,), `inside` (n,).
     """
     table = lines.assign(event=track, track=track)[inside]
     seen = table.groupby("track")["frame"].transform("size")
@@ -146,23 +112,7 @@ def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
 
 
 def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
-    """Give the mass of each track that the exact likelihood of all its frames has.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `iscat_analysis.pipeline.moving.track_scene`.
-    moving : Moving
-        From `iscat_analysis.pipeline.moving.follow`.
-
-    Returns
-    -------
-    pandas.DataFrame
-        By track: ``mass_kda``, ``sigma_mass_kda`` and ``crb_mass_kda``.  The errors hold what the
-        background takes, the paths of single frames and the error of D, which sets the blur.
-        ``blur`` is 1 where D, and with it the blur, was told from 0, else 0; ``told`` is the share
-        of the information on the mass that the background leaves.
-    """
+    """Give the mass of each track that the exact likelihood of all its frames has."""
     common, scale = moving.common, scene.model.scale
     known = np.isfinite(common.amplitude)
     amplitude = np.where(known, common.amplitude, 1.0)
@@ -191,18 +141,7 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
 def losses_to_blur(scene: Scene, moving: Moving) -> FloatArray:
     """Share of the mass that the blur of each group takes, to first order: −d ln m / d ln q.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its model is the sharp one.
-    moving : Moving
-        Knows the blurs.
-
-    Returns
-    -------
-    ndarray, shape (groups,)
-        Where the variance of the path changes by a small share, the fitted mass does by this times
-        that.
+    Shapes: result (groups,).
     """
     model, grid = scene.model, PixelGrid.centred(scene.roi_px | 1, scene.pixel_nm)
     z, amplitude = model.height_nm, model.scale.amplitude(model.material.mass_kda)

@@ -37,29 +37,7 @@ _WEAK = 0.05  # contrast up to which several add up
 
 @dataclass(frozen=True)
 class Step:
-    """One particle that lands or leaves.
-
-    Attributes
-    ----------
-    sign : int
-        1 where it lands, −1 where it leaves.
-    at : StepFrame
-        When.
-    start : Candidate
-        Where, and its mass (positive); `snr` is that of the search.
-    corner : (int, int)
-        Row and column of the first pixel of `image`.
-    image : ndarray, shape (y, x)
-        Its contrast around it.
-    slopes : ndarray, shape (5, y, x), or None
-        Derivatives of `image` by y, x, yy, yx and xx [1/pixel]; None where nothing moves.
-    theta : ndarray, shape (5,), or None
-        Latest estimate.
-    snr : float
-        √(2 Δℓ) of it against no particle, with the neighbours in place.
-    excess : float
-        χ² that its best fit left above the expected; 0 where that may be noise.
-    """
+    """One particle that lands or leaves."""
 
     sign: int
     at: StepFrame
@@ -73,19 +51,7 @@ class Step:
 
 
 class Neighbours:
-    """Which steps see each other, and how.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models; `wide` reaches over a step's image.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-    pattern : MovingPattern, optional
-        Of the same chunk, where its motion is corrected.
-    """
+    """Which steps see each other, and how."""
 
     def __init__(
         self, scene: Scene, chunk: Chunk, window: int, pattern: MovingPattern | None = None
@@ -113,23 +79,7 @@ class Neighbours:
     ) -> Step:
         """Make a step, with its contrast drawn where it is.
 
-        Parameters
-        ----------
-        sign : int
-            1 where it lands, −1 where it leaves.
-        at : StepFrame
-            When.
-        start : Candidate
-            Where, and its mass (positive).
-        theta : ndarray, shape (5,), optional
-            Latest estimate.
-        snr, excess : float
-            Of that estimate; not known before the first.
-
-        Returns
-        -------
-        Step
-            As its neighbours see it.
+        Shapes: `theta` (5,).
         """
         scene, half = self._scene, self._half(start)
         sides = []
@@ -303,16 +253,5 @@ def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:
 
 
 def distance_px(one: Step, two: Step) -> float:
-    """Distance between two steps.
-
-    Parameters
-    ----------
-    one, two : Step
-        The steps.
-
-    Returns
-    -------
-    float
-        In the plane [pixels].
-    """
+    """Distance between two steps."""
     return math.hypot(one.start.x_px - two.start.x_px, one.start.y_px - two.start.y_px)

@@ -55,21 +55,7 @@ _LESS = 0.75  # of the noise, which small pictures leave over by chance at least
 
 @dataclass(frozen=True)
 class Noise:
-    """What some frames without particles, or nearly so, say of the noise.
-
-    Attributes
-    ----------
-    messages : tuple of str
-        One line for each number of the camera that the noise does not agree with.
-    differs : bool
-        Whether p-values, which rest on the camera's numbers, cannot be right.
-    excess : ExcessNoise or None
-        None where the noise is as expected.
-    spectrum : NoiseSpectrum or None
-        Of the noise between neighbouring frames, where it is not white and of the expected size.
-    shakes : bool
-        Whether the noise beyond the light's is that of a fixed pattern that shakes.
-    """
+    """What some frames without particles, or nearly so, say of the noise."""
 
     messages: tuple[str, ...] = ()
     differs: bool = False
@@ -78,18 +64,7 @@ class Noise:
     shakes: bool = False
 
     def said(self, name: str) -> Iterator[str]:
-        """Give what the user should know.
-
-        Parameters
-        ----------
-        name : str
-            What messages call the movie.
-
-        Yields
-        ------
-        str
-            One line each.
-        """
+        """Give what the user should know."""
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
         yield from self.messages
@@ -100,15 +75,7 @@ class Noise:
         Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
         what a wrong model leaves over of rings, or the blur of motion.
 
-        Parameters
-        ----------
-        chi2 : ndarray, shape (n,)
-            Reduced χ² of the fits.
-
-        Returns
-        -------
-        Noise
-            Silent where fits contradict it.
+        Shapes: `chi2` (n,).
         """
         known = chi2[np.isfinite(chi2)]
         if self.excess is None or len(known) < _ENOUGH_FITS:
@@ -133,27 +100,7 @@ def judge_counts(
 ) -> Noise:
     """Compare the noise between neighbouring frames with the camera's.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames; the gain is judged on the first of them.
-    camera : Camera
-        Counts → photoelectrons.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out.
-    additive : bool
-        Whether particles add light to a background that says nothing of their masses; its zero is
-        then not looked for.
-    follows : bool, optional
-        Whether the motion of the fixed pattern is divided out of the frames before they are fitted,
-        where it can be.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Noise
-        Silent of the camera where it is too dark to tell.
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
     try:
@@ -203,27 +150,7 @@ def _filtered(shared: float) -> str:
 def judge_background(
     movie: Stack, camera: Camera, windows: Windows, *, still: bool, additive: bool
 ) -> Noise:
-    """Judge the noise of the background frames; where it is known, of those with the particles.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background, and the frames after it.
-    still : bool
-        Whether particles stay where they are in these; otherwise nothing is judged where the
-        background is known, and `judge_beside` does once they are found.
-    additive : bool
-        As in `judge_counts`.
-
-    Returns
-    -------
-    Noise
-        Silent where there is no shot noise to look at.
-    """
+    """Judge the noise of the background frames; where it is known, of those with the particles."""
     frames = windows.n_before or (windows.n_after if still else 0)
     if frames < 2 or not is_lit(windows):
         return Noise()
@@ -248,28 +175,7 @@ def judge_beside(
     out; farther away their rings are taken off as they were fitted, and where a fit went astray
     that adds as well: a number is called wrong only where one seems so with the rings and without.
 
-    Parameters
-    ----------
-    scene : Scene
-        Size of a pixel, and resolution.
-    movie : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames; the first of them are looked at, fewer where particles go
-        everywhere in them.
-    seen : (ndarray of int, shape (n,), ndarray, shape (n, 2))
-        Frame of the movie and place x, y [nm] of every particle in every frame, as it was fitted.
-    used : ndarray of bool, shape (y, x)
-        Pixels that may be used.
-    without : callable
-        Number of frames → the first of the span without the light of the particles [e].
-
-    Returns
-    -------
-    Noise
-        Without its spectrum; silent where particles leave too few pixels free.
+    Shapes: `seen` (n,), `used` (y, x).
     """
     optics = scene.config.optics
     away = _AWAY * optics.wavelength_nm / optics.na
@@ -293,19 +199,7 @@ def judge_beside(
 
 @dataclass(frozen=True)
 class Opening:
-    """What the first frames of a landing movie say, and the frames themselves.
-
-    Attributes
-    ----------
-    reader : Reader
-        The frames.
-    noise : Noise
-        Of the first good ones, in which little has landed.
-    curve : NoiseCurve
-        Noise against averaging, of these.
-    window : int
-        Frames before, and as many after, each step.
-    """
+    """What the first frames of a landing movie say, and the frames themselves."""
 
     reader: Reader
     noise: Noise
@@ -314,25 +208,7 @@ class Opening:
 
 
 def judge_opening(reader: Reader, config: Config) -> Opening:
-    """Judge the noise of a landing movie, and choose how many frames around a step are summed.
-
-    Parameters
-    ----------
-    reader : Reader
-        The frames.
-    config : Config
-        ``background.window_frames`` wins where it is given.
-
-    Returns
-    -------
-    Opening
-        The noise, and the window.
-
-    Raises
-    ------
-    DataError
-        The movie is shorter than two windows, or holds no two frames that differ.
-    """
+    """Judge the noise of a landing movie, and choose how many frames around a step are summed."""
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
         mapper = over_frames(pool, reader.shape)
@@ -357,28 +233,7 @@ def judge_window(
 ) -> tuple[NDArray[Any], NoiseCurve, int]:
     """Choose how many frames around a step are summed.
 
-    Parameters
-    ----------
-    reader : Reader
-        The frames.
-    config : Config
-        ``background.window_frames`` wins where it is given.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    opening : ndarray, shape (t, y, x)
-        Good frames among the first.
-    curve : NoiseCurve
-        Noise against averaging, of these.
-    window : int
-        Frames before, and as many after, each step.
-
-    Raises
-    ------
-    DataError
-        The movie is shorter than two windows, or holds no two frames that differ.
+    Shapes: `opening` (t, y, x).
     """
     frames = reader.last - reader.first
     given = config.background.window_frames
@@ -404,37 +259,14 @@ def judge_window(
 def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
     """Read the first background frames, or those after it where it is known.
 
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    windows : Windows
-        The background.
-    most : int
-        Frames, at most.
-
-    Returns
-    -------
-    ndarray, shape (t, y, x)
-        Counts.
+    Shapes: result (t, y, x).
     """
     start, stop = windows.frames_before if windows.n_before else windows.frames_after
     return movie.read(start, min(stop, start + most))
 
 
 def is_lit(windows: Windows) -> bool:
-    """Tell whether there is light in the background, beyond the read noise.
-
-    Parameters
-    ----------
-    windows : Windows
-        The background.
-
-    Returns
-    -------
-    bool
-        Of the pixels in use together.
-    """
+    """Tell whether there is light in the background, beyond the read noise."""
     used = ~windows.masked
     light, read = windows.before_e[used], windows.read_variance_before_e2[used]
     return bool(light.sum() > read.sum())

@@ -33,27 +33,7 @@ def frame_warnings(
 ) -> Iterator[str]:
     """Say what is odd about the frames.
 
-    Parameters
-    ----------
-    name : str
-        What the lines call the movie.
-    merged : Merged
-        The chunks.
-    drift : list of float or None
-        Of their pattern, from `Merged.drift`.
-    light : ndarray, shape (t,)
-        Light of every frame; NaN where it was left out.
-    first : int
-        Number of the first frame.
-    window : int
-        Frames before and after a step.
-    corrected : bool
-        Whether the motion of the fixed pattern was to be divided out.
-
-    Yields
-    ------
-    str
-        One line each.
+    Shapes: `light` (t,).
     """
     missing = merged.repeats() + first
     if missing.size:

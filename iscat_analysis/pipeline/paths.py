@@ -37,17 +37,7 @@ _STEP_NM = 2.0  # along z, of differences
 def path_covariances(scene: Scene, moving: Moving) -> FloatArray:
     """Give the errors of rows that the unknown paths of their exposures make.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its model is the sharp one.
-    moving : Moving
-        Particles that move along z too, and their blurs.
-
-    Returns
-    -------
-    ndarray, shape (n, 4, 4)
-        Covariance of (x, y, z, a) of each row.
+    Shapes: result (n, 4, 4).
     """
     rows = moving.rows
     out = np.zeros((len(rows.frame), 4, 4))
@@ -84,25 +74,7 @@ def path_covariance(
 ) -> FloatArray:
     """Covariance of one fit that the unknown path of its exposure makes.
 
-    Parameters
-    ----------
-    model : ForwardModel
-        Blurred.
-    roi_px : int
-        Side of the fitted square [pixels].
-    pixel_nm : float
-        Side of a pixel [nm].
-    z_nm, amplitude : float
-        Of the particle [nm].
-    variance_nm2 : float
-        Mean variance of paths along each axis [nm²].
-    read_share : float
-        Variance of the read noise over that of the counts.
-
-    Returns
-    -------
-    ndarray, shape (4, 4)
-        Of (x, y, z, a).
+    Shapes: result (4, 4).
     """
     grid, q = PixelGrid.centred(roi_px | 1, pixel_nm), variance_nm2
     signal, slopes, second = model.amplitude_hessian(grid, 0.0, 0.0, z_nm, amplitude)

@@ -38,20 +38,7 @@ _REACH = SPAN * STRIDES
 
 
 def follow(chunk: Chunk, mapper: Mapper = map) -> Trajectory | None:
-    """Follow the fixed pattern of a chunk.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        The sums.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Trajectory or None
-        In frames of the movie; None where there is no pattern to follow.
-    """
+    """Follow the fixed pattern of a chunk."""
     light = np.add.reduceat(chunk.power, chunk.edges[:-1])
     moment = np.add.reduceat(chunk.power * np.arange(len(chunk.power)), chunk.edges[:-1])
     frames = chunk.first + moment / np.where(light > 0, light, 1.0)
@@ -62,24 +49,7 @@ def follow(chunk: Chunk, mapper: Mapper = map) -> Trajectory | None:
 def corrected(
     chunk: Chunk, *, wanted: bool, mapper: Mapper = map
 ) -> tuple[Chunk, MovingPattern | None]:
-    """Follow the fixed pattern of a chunk where its motion is to be divided out.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        The sums.
-    wanted : bool
-        Whether it is.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    chunk : Chunk
-        Without the pixels at which a moved pattern is not known.
-    pattern : MovingPattern or None
-        None where it is not wanted, or there is no pattern to follow.
-    """
+    """Follow the fixed pattern of a chunk where its motion is to be divided out."""
     trajectory = follow(chunk, mapper) if wanted else None
     if trajectory is None:
         return chunk, None
@@ -89,19 +59,7 @@ def corrected(
 
 @dataclass(frozen=True)
 class LocalPattern:
-    """The pattern of a region, made of the blocks around a step.
-
-    Attributes
-    ----------
-    mover : Mover
-        Of the region and a margin.
-    spectrum : ndarray
-        Of its light per frame of unit power, in the frame of the sample.
-    inner : tuple of slice
-        The region inside its margin.
-    still : ndarray, shape (y, x)
-        The light that stays, in the region.
-    """
+    """The pattern of a region, made of the blocks around a step."""
 
     mover: Mover
     spectrum: ComplexArray
@@ -110,26 +68,7 @@ class LocalPattern:
 
 
 class MovingPattern:
-    """Where the pattern of a chunk is in every frame, and what it looks like from there.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        The sums.
-    trajectory : Trajectory
-        From `follow`, of the same chunk.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Attributes
-    ----------
-    trajectory : Trajectory
-        The same.
-    chunk : Chunk
-        The same, without the pixels at which a moved pattern is not known.
-    contrast : ndarray of float32, shape (k − 1, y, x)
-        What the pattern's motion makes between the windows at every boundary between blocks.
-    """
+    """Where the pattern of a chunk is in every frame, and what it looks like from there."""
 
     def __init__(self, chunk: Chunk, trajectory: Trajectory, mapper: Mapper = map) -> None:
         self.trajectory = trajectory

@@ -50,23 +50,7 @@ _CLEAR_NM = 600.0  # from the edge of a picture to the nearest other particle
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPicture:
-    """A template, and how it describes pictures that did not make it.
-
-    Attributes
-    ----------
-    config : Config
-        As it was given, resolved.
-    fit : PictureFit
-        The template, from all pictures.
-    judgement : Judgement
-        Of the pictures that were held out, with a template from the others.
-    contaminated : int
-        Pictures that were left out, because something else happened in them.
-    source : mapping of str to str
-        Where the pictures came from.
-    refusals : tuple of str
-        Why the template must not be used; empty where it may.
-    """
+    """A template, and how it describes pictures that did not make it."""
 
     config: Config
     fit: PictureFit
@@ -96,13 +80,7 @@ class MeasuredPicture:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``template.json`` holds.
-
-        Returns
-        -------
-        dict
-            Nested plain values.
-        """
+        """Give what ``template.json`` holds."""
         found, judged = self.template, self.judgement
         return {
             "accepted": self.accepted,
@@ -122,20 +100,7 @@ class MeasuredPicture:
         }
 
     def to_toml(self, template: str, checksum: str) -> str:
-        """Write what ``[optics] file`` reads.
-
-        Parameters
-        ----------
-        template : str
-            Name of the template's file, beside this one.
-        checksum : str
-            Its SHA-256.
-
-        Returns
-        -------
-        str
-            Tables ``[optics]``, ``[template]`` and ``[provenance]``.
-        """
+        """Write what ``[optics] file`` reads."""
         lines = [
             "# Template measured by `iscat calibrate optics --measured`",
             "", "[optics]", 'psf = "measured"', f'template = "{template}"',
@@ -155,31 +120,7 @@ def measure_template(
     progress: Progress = silent,
     notify: Callable[[str], None] | None = None,
 ) -> MeasuredPicture:
-    """Measure the picture of a particle in an open movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, or one with frames before the particles bound.
-    config : Config
-        The microscope as far as it is known; wavelength, scale and pixels are used.
-    progress : Progress
-        Told how far it is.
-    notify : callable
-        Told what the user should know, one line at a time.
-
-    Returns
-    -------
-    MeasuredPicture
-        What was found; `MeasuredPicture.accepted` says whether it may be used.
-
-    Raises
-    ------
-    DataError
-        The movie shows too few bright particles that stand alone.
-    ConfigError
-        The configuration has no such picture: dark field, or a free height.
-    """
+    """Measure the picture of a particle in an open movie."""
     config, notes = resolve_metadata(config, movie.metadata)
     for note in notes:
         if notify is not None:

@@ -46,31 +46,7 @@ _OPENING = 64  # frames that are looked at before anything else
 
 @dataclass(frozen=True)
 class Prepared:
-    """A movie that can be searched.
-
-    Attributes
-    ----------
-    movie : Stack
-        As it was opened, without pixels that are unsteady.
-    steady : Stack
-        The same without the flicker of lines.
-    config : Config
-        Resolved: with what the metadata say, and with the optics that were learned.
-    camera : Camera
-        Counts → photoelectrons.
-    way : {"fixed", "sliding", "tracks"}
-        Which frames stand against which.
-    lines : Lines or None
-        Rows and columns that flicker.
-    opening : Opening or None
-        Of a landing movie; its reader holds frames that were looked at.
-    other_kind : str
-        Says that the movie seems to be of another kind than configured; else empty.
-    digest : Future of str
-        SHA-256 of the movie's bytes, which takes a while.
-    summary : mapping
-        What ``summary.json`` says of ``lines``, ``optics`` and ``changes``.
-    """
+    """A movie that can be searched."""
 
     movie: Stack
     steady: Stack
@@ -90,29 +66,7 @@ class Prepared:
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
-    """Load and calibrate a movie.
-
-    Parameters
-    ----------
-    movie : Stack
-        From `iscat_analysis.movie.open_stack`.
-    config : Config
-        What to do.
-    run : Run
-        Is told what the user should know.
-
-    Returns
-    -------
-    Prepared
-        Ready to be searched.
-
-    Raises
-    ------
-    ConfigError
-        The configuration does not suit the movie.
-    DataError
-        The frames are impossible.
-    """
+    """Load and calibrate a movie."""
     if config.optics.scheme == "darkfield":
         darkfield_photons(config.particle)
     config, notes = resolve_metadata(config, movie.metadata)

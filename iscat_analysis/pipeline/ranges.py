@@ -19,29 +19,7 @@ from iscat_analysis.units import count
 
 
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
-    """Which frames are background and which are fitted.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        ``background.frames``, ``background.method`` and ``fit.frames``.
-
-    Returns
-    -------
-    before : (int, int) or None
-        None where the background is known.
-    after : (int, int)
-        Half-open.
-
-    Raises
-    ------
-    ConfigError
-        The background frames are not given.
-    DataError
-        The background leaves no frame to fit.
-    """
+    """Which frames are background and which are fitted."""
     before = config.background.recorded
     if config.background.method == "known":
         before = None
@@ -78,27 +56,7 @@ def _without_frames_before(config: Config) -> str:
 def fitted_frames(
     movie: FrameSource, config: Config, before: tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """Which frames are looked at: ``fit.frames``, or all after the background.
-
-    Parameters
-    ----------
-    movie : FrameSource
-        The movie.
-    config : Config
-        ``fit.frames``.
-    before : (int, int), optional
-        The background's frames, where it has some.
-
-    Returns
-    -------
-    (int, int)
-        Half-open; it may be empty.
-
-    Raises
-    ------
-    DataError
-        ``fit.frames`` reaches beyond the movie.
-    """
+    """Which frames are looked at: ``fit.frames``, or all after the background."""
     first, last = config.fit.frames or (before[1] if before else 0, movie.shape[0])
     if last > movie.shape[0]:
         raise DataError(
@@ -109,39 +67,13 @@ def fitted_frames(
 
 
 def tracked_frames(movie: Stack, config: Config) -> int:
-    """Count the frames in which mode ``track`` looks for particles.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Its ranges may be left open.
-
-    Returns
-    -------
-    int
-        At least 0.
-    """
+    """Count the frames in which mode ``track`` looks for particles."""
     first, last = fitted_frames(movie, config, config.background.recorded)
     return max(last - first, 0)
 
 
 def checked(movie: FrameSource, camera: Camera) -> Check:
-    """Give what refuses the impossible counts of a movie.
-
-    Parameters
-    ----------
-    movie : FrameSource
-        Named in messages.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    callable
-        Given counts and the number of their first frame.
-    """
+    """Give what refuses the impossible counts of a movie."""
     return partial(check_counts, name=movie.name, camera=camera)
 
 
@@ -154,33 +86,7 @@ def measured_windows(
     *,
     progress: Progress = silent,
 ) -> Windows:
-    """Sum the background and the frames after it, as configured.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie.
-    config : Config
-        Its ``[background]``.
-    camera : Camera
-        Counts → photoelectrons.
-    before : (int, int) or None
-        Frames of the background; None where it is known.
-    after : (int, int)
-        Frames that stand against it.
-    progress : Progress
-        Told the frames.
-
-    Returns
-    -------
-    Windows
-        Of the whole field.
-
-    Raises
-    ------
-    DataError
-        A frame is impossible; those that `cut_off` names are not looked at.
-    """
+    """Sum the background and the frames after it, as configured."""
     background, refuse = config.background, checked(movie, camera)
 
     def check(counts: NDArray[Any], first: int) -> None:

@@ -36,24 +36,7 @@ DOUBT = 0.03
 def look_at_changes(
     movie: FrameSource, config: Config, camera: Camera, span: tuple[int, int]
 ) -> Changes:
-    """Find what changes in the first frames of a movie.
-
-    Parameters
-    ----------
-    movie : FrameSource
-        The movie.
-    config : Config
-        Its optics and pixel size.
-    camera : Camera
-        Counts → photoelectrons.
-    span : (int, int)
-        Half-open range of frames.
-
-    Returns
-    -------
-    Changes
-        Of blocks of `BLOCK` frames, whatever light each had.
-    """
+    """Find what changes in the first frames of a movie."""
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away
@@ -80,20 +63,7 @@ def look_at_changes(
 
 
 def as_landing(changes: Changes, name: str) -> str:
-    """Say that a movie in mode ``track`` shows landings.
-
-    Parameters
-    ----------
-    changes : Changes
-        From `look_at_changes`.
-    name : str
-        What messages call the movie.
-
-    Returns
-    -------
-    str
-        One line; empty where it does not.
-    """
+    """Say that a movie in mode ``track`` shows landings."""
     if _chance(changes.number, changes.staying, MOST_STAYING) > DOUBT:
         return ""
     return (
@@ -104,20 +74,7 @@ def as_landing(changes: Changes, name: str) -> str:
 
 
 def as_moving(changes: Changes, name: str) -> str:
-    """Say that a movie with sliding windows shows particles that move.
-
-    Parameters
-    ----------
-    changes : Changes
-        From `look_at_changes`.
-    name : str
-        What messages call the movie.
-
-    Returns
-    -------
-    str
-        One line; empty where it does not.
-    """
+    """Say that a movie with sliding windows shows particles that move."""
     clear = _chance(changes.number, changes.moving, MOST_MOVING) <= DOUBT
     if not (clear and changes.moving >= LEAST_MOVING):
         return ""
@@ -134,16 +91,5 @@ def _chance(number: int, share: float, most: float) -> float:
 
 
 def changes_summary(changes: Changes) -> dict[str, Any]:
-    """Give what ``summary.json`` says of changes.
-
-    Parameters
-    ----------
-    changes : Changes
-        From `look_at_changes`.
-
-    Returns
-    -------
-    dict
-        Plain values.
-    """
+    """Give what ``summary.json`` says of changes."""
     return {"number": changes.number, "staying": changes.staying, "moving": changes.moving}

@@ -73,26 +73,7 @@ def redraw(
     tracks: pd.DataFrame | None,
     summary: Mapping[str, Any],
 ) -> Redraw:
-    """Prepare to draw the rows of a result.
-
-    Parameters
-    ----------
-    movie : Stack
-        The movie that was analysed; it must stay open.
-    config : Config
-        Resolved, as it was analysed.
-    table : pandas.DataFrame
-        The rows of ``fits.csv``.
-    tracks : pandas.DataFrame or None
-        Mode ``track``: the rows of ``tracks.csv``.
-    summary : mapping
-        What ``summary.json`` holds.
-
-    Returns
-    -------
-    callable
-        Position of a row → `EventView`.
-    """
+    """Prepare to draw the rows of a result."""
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     judged = judge_light(movie, config, camera)
     movie, lines = judged.movie, judged.lines

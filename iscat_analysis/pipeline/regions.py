@@ -36,22 +36,7 @@ class Region:
 
 
 def region_around(side: int, shape: tuple[int, ...], start: Candidate) -> Region:
-    """Place the square that is fitted.
-
-    Parameters
-    ----------
-    side : int
-        Its side [pixels].
-    shape : (int, int)
-        Rows and columns of the field.
-    start : Candidate
-        Its centre.
-
-    Returns
-    -------
-    Region
-        Cut at the edges of the field.
-    """
+    """Place the square that is fitted."""
     sides = []
     for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
         first = round(centre - (side - 1) / 2)
@@ -60,20 +45,7 @@ def region_around(side: int, shape: tuple[int, ...], start: Candidate) -> Region
 
 
 def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
-    """Likelihood of the whole field.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-
-    Returns
-    -------
-    Likelihood
-        For the matched filter.
-    """
+    """Likelihood of the whole field."""
     rows, columns = windows.after_e.shape
     return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
 
@@ -81,17 +53,7 @@ def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
 def contrast_image(scene: Scene, windows: Windows) -> FloatArray:
     """Give what the frames after show and those before do not.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Contrast; in dark field photoelectrons above the background.
+    Shapes: result (y, x).
     """
     if scene.additive:
         return windows.after_e - windows.power_ratio * windows.before_e
@@ -105,19 +67,7 @@ def search_likelihood(scene: Scene, windows: Windows, explained: FloatArray) -> 
     chance, and there the particles seem to have landed.  Counts before and after together say as
     much of the noise and nothing of the change.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-    explained : ndarray, shape (y, x)
-        Signal of the particles that are known.
-
-    Returns
-    -------
-    Likelihood
-        For the matched filter.
+    Shapes: `explained` (y, x).
     """
     whole = field_likelihood(scene, windows)
     if not scene.additive or not windows.n_before:
@@ -139,21 +89,7 @@ def region_likelihood(
 ) -> Likelihood:
     """Likelihood of a region, with the signal of other particles as part of its background.
 
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Sums before and after.
-    region : Region
-        Which pixels.
-    others : ndarray, shape (rows, columns), optional
-        Signal of the other particles there.
-
-    Returns
-    -------
-    Likelihood
-        Conditional where a measured background is divided out, Poisson otherwise.
+    Shapes: `others` (rows, columns).
     """
     cut = region.slices
     config = scene.config
@@ -177,20 +113,6 @@ def noise_cumulants(
 ) -> tuple[FloatArray, FloatArray] | None:
     """Third and fourth cumulants of the counts against their background.
 
-    Parameters
-    ----------
-    scene : Scene
-        Its background says which counts are compared.
-    windows : Windows
-        Sums before and after.
-    likelihood : Likelihood
-        From `search_likelihood`, whose noise it is.
-
-    Returns
-    -------
-    (ndarray, ndarray) or None
-        Of each pixel [e³, e⁴]; None in interferometric schemes, where the counts are many.
-
     Notes
     -----
     Of a Poisson count μ every cumulant is μ; of a − ρ b the k-th is μ_a + (−ρ)ᵏ μ_b.  Read noise
@@ -208,20 +130,7 @@ def noise_cumulants(
 
 
 def photons_scale(scene: Scene, windows: Windows) -> float:
-    """Scale of the signal in dark field.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    windows : Windows
-        Frames and laser power.
-
-    Returns
-    -------
-    float
-        Photoelectrons per pixel for unit |E_sca|², summed over the frames after.
-    """
+    """Scale of the signal in dark field."""
     photons = darkfield_photons(scene.config.particle)
     per_frame = photons_per_intensity(scene.model, photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)

@@ -49,13 +49,7 @@ _PIXEL_NM = 50.0
 
 
 def rehearse(needs: Collection[str]) -> None:
-    """Run what an analysis runs, from its end.
-
-    Parameters
-    ----------
-    needs : collection of str
-        As from `iscat_analysis.pipeline.compilation.needs_of`.
-    """
+    """Run what an analysis runs, from its end."""
     model = forward_model(Config(), _REACH_NM)
     if "tracks" in needs:
         _track(model, free_z="heights" in needs)

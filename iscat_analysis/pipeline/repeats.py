@@ -43,18 +43,7 @@ _BLOCK_BYTES = 16 * 2**20
 
 
 def nothing_repeated(mode: str) -> FloatArray:
-    """Give what is known of an event whose frames could not be compared.
-
-    Parameters
-    ----------
-    mode : str
-        Key of `FREE_PARAMETERS`.
-
-    Returns
-    -------
-    ndarray
-        As `repeats_of` returns it, zero throughout.
-    """
+    """Give what is known of an event whose frames could not be compared."""
     empty = Series(np.zeros((len(FREE_PARAMETERS[mode]), 0)), *(np.zeros(0) for _ in range(3)))
     return repeats_of((empty,))
 
@@ -71,30 +60,7 @@ def step_repeats(
     neighbours: Neighbours,
     pattern: MovingPattern | None,
 ) -> FloatArray:
-    """Compare parts of the frames of one landing or leaving.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        The frames.
-    patch : Patch
-        Those of the particle's region.
-    event : Event
-        The particle.
-    step : Step
-        When and where.
-    others : sequence of Step
-        Those that its fit knows of; what lands or leaves in the windows is taken off.
-    neighbours : Neighbours
-        Of the chunk.
-    pattern : MovingPattern, optional
-        Of the chunk, where its motion is corrected.
-
-    Returns
-    -------
-    ndarray
-        From `repeats_of`.
-    """
+    """Compare parts of the frames of one landing or leaving."""
     region, windows = event.region, event.windows
     response = _response(event)
     if response is None:
@@ -165,28 +131,7 @@ def step_controls(
     steps: Sequence[Step],
     neighbours: Neighbours,
 ) -> EmptySpread | None:
-    """Look at the windows of some events where nothing lands or leaves.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-    events : sequence of Event
-        At whose times, heights and masses the noise is looked at.
-    steps : sequence of Step
-        All that are known.
-    neighbours : Neighbours
-        Of the chunk.
-
-    Returns
-    -------
-    EmptySpread or None
-        None without events whose windows lie in the chunk.
-    """
+    """Look at the windows of some events where nothing lands or leaves."""
     times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
@@ -266,28 +211,7 @@ class _Own:
 def field_repeats(
     scene: Scene, movie: Stack, camera: Camera, windows: Windows, events: Sequence[Event]
 ) -> tuple[list[FloatArray], EmptySpread | None]:
-    """Compare parts of the frames before and after, at the events and where there are none.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    movie : Stack
-        Is read once more.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The sums, with the final laser power.
-    events : sequence of Event
-        Fitted particles.
-
-    Returns
-    -------
-    own : list of ndarray
-        From `repeats_of`, of each event.
-    empty : EmptySpread or None
-        None where the background is known, or there are no events.
-    """
+    """Compare parts of the frames before and after, at the events and where there are none."""
     if not events:
         return [], None
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])

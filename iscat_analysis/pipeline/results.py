@@ -30,19 +30,7 @@ from iscat_analysis.search.empty import EmptySpread
 
 @dataclass(frozen=True)
 class Compared:
-    """Which frames of a movie stand against which.
-
-    Attributes
-    ----------
-    frames_before, frames_after : (int, int)
-        Half-open ranges; nothing before where the background is known or the windows slide.
-    power_ratio : float
-        Light after over light before; 1 where each frame is weighed by its own.
-    power : ndarray, shape (t,)
-        Relative light of every frame of both ranges, before first; NaN where one was left out.
-    masked_pixels : int
-        Pixels that are not used.
-    """
+    """Which frames of a movie stand against which."""
 
     frames_before: tuple[int, int]
     frames_after: tuple[int, int]
@@ -52,18 +40,7 @@ class Compared:
 
     @classmethod
     def of(cls, windows: Windows) -> Compared:
-        """Describe the sums of two ranges of frames.
-
-        Parameters
-        ----------
-        windows : Windows
-            The sums.
-
-        Returns
-        -------
-        Compared
-            Without their images.
-        """
+        """Describe the sums of two ranges of frames."""
         return cls(
             windows.frames_before, windows.frames_after, windows.power_ratio, windows.power,
             int(windows.masked.sum()),
@@ -72,18 +49,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Followed:
-    """What the tracks of a movie are described with, beside their rows.
-
-    Attributes
-    ----------
-    windows : Windows
-        The background, and all frames in which particles were followed.
-    parts : tuple of Windows
-        The backgrounds of blocks of frames, where there are several.
-    masses : pandas.DataFrame or None
-        Over a background that was learnt with the tracks: ``mass_kda``, ``sigma_mass_kda`` and
-        ``crb_mass_kda`` by the exact likelihood of all frames, indexed by track.
-    """
+    """What the tracks of a movie are described with, beside their rows."""
 
     windows: Windows
     parts: tuple[Windows, ...] = ()
@@ -92,40 +58,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class Found:
-    """What was found in a movie, whichever frames stand against which.
-
-    Attributes
-    ----------
-    scene : Scene
-        Models, threshold and the configuration as it was used.
-    fits : pandas.DataFrame
-        Columns `EVENT_COLUMNS`, with the errors of the likelihoods alone; of a landing movie also
-        `FRAME_COLUMN`, of one in mode ``track`` also ``track``.
-    views : tuple of EventView
-        Images, in the order of the fits, or one per track; of the first events only, where there
-        are many.
-    image : ndarray, shape (y, x)
-        Contrast of the field; of a landing movie that of the strongest step at each pixel.
-    compared : Compared
-        Frames and their light.
-    heading : str
-        Under which ``summary.json`` has `summary`.
-    summary : mapping
-        What was learnt of the background; empty where there is nothing to say.
-    repeats : tuple of ndarray
-        What parts of the frames of each row say, from `iscat_analysis.inference.repeats`; of
-        single frames, what they say where there is no particle.
-    empty : EmptySpread or None
-        The noise of whole windows, or of single frames, where there is no particle.
-    followed : Followed or None
-        Mode ``track``.
-    trajectory : Trajectory or None
-        Of the fixed pattern, where its motion was divided out.
-    optics : mapping
-        What the test of the optics found, where the tracks themselves made it.
-    interrupted : bool
-        Whether the user stopped it; what was finished is kept.
-    """
+    """What was found in a movie, whichever frames stand against which."""
 
     scene: Scene
     fits: pd.DataFrame
@@ -143,20 +76,7 @@ class Found:
 
 
 def collected_photons(scene: Scene, event: Event) -> float:
-    """Scattered photons that the pupil collected from one particle in the frames after.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    event : Event
-        The particle, and the sums that give the background light.
-
-    Returns
-    -------
-    float
-        Photoelectrons (the quantum efficiency counts as part of the collection).
-    """
+    """Scattered photons that the pupil collected from one particle in the frames after."""
     windows = event.windows
     area = collected_area_nm2(scene.model, event.fit.z_nm, event.fit.mass_kda)
     if scene.additive:
@@ -169,22 +89,7 @@ def collected_photons(scene: Scene, event: Event) -> float:
 def lines_of(
     scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> list[dict[str, Any]]:
-    """Make the lines of ``fits.csv``.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    events : sequence of Event
-        The events.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    list of dict
-        As from `line_of`; with `FRAME_COLUMN`, where steps were dated.
-    """
+    """Make the lines of ``fits.csv``."""
     heights = {event.fit.estimate[2] for event in events}
     known = {}
     if len(heights) == 1 and not scene.model.is_measured:  # of heights that are not fitted
@@ -203,20 +108,7 @@ def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> 
 
 
 def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
-    """Make a table of events whose frames are given.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    events : sequence of Event
-        The events, in their order.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    """
+    """Make a table of events whose frames are given."""
     return numbered(lines_from(lines_of(scene, events)), range(len(events)))
 
 
@@ -228,24 +120,7 @@ def view_of(
     trace: Trace | None = None,
     clip: Clip | None = None,
 ) -> EventView:
-    """Images of one event for the report.
-
-    Parameters
-    ----------
-    number : int
-        Of the event.
-    fitted : Fitted
-        The event.
-    posterior : PosteriorResult, optional
-        Its chain, where sampled.
-    trace, clip : Trace, Clip, optional
-        Of landing movies.
-
-    Returns
-    -------
-    EventView
-        Measured signal, model and residuals.
-    """
+    """Images of one event for the report."""
     likelihood, theta = fitted.likelihood, fitted.fit.theta
     unit = likelihood.data[2] if not likelihood.model.rho else 1.0
     return EventView(

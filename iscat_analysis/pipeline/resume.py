@@ -31,28 +31,7 @@ _NO_CLIP = (0,) * 4
 
 
 class Shelf:
-    """Tables and arrays of finished parts on disk.
-
-    Parameters
-    ----------
-    folder : Path or None
-        Where they are kept; None keeps nothing.
-    config : Config
-        Part of the key, but for the number of workers.
-    identity : str
-        Hash of the movie; empty keeps nothing.
-    shape : (int, int)
-        Rows and columns.
-    span : (int, int)
-        Frames analysed.
-    camera : Camera
-        Part of the key: a map may have changed under its name.
-
-    Attributes
-    ----------
-    kept : int
-        Parts that this object found there or put there.
-    """
+    """Tables and arrays of finished parts on disk."""
 
     def __init__(
         self,
@@ -77,18 +56,7 @@ class Shelf:
         self._key = digest.hexdigest()[:32]
 
     def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
-        """Give the table and the arrays of a finished part, or None.
-
-        Parameters
-        ----------
-        number : int
-            Of the part.
-
-        Returns
-        -------
-        (pandas.DataFrame, dict of str to ndarray) or None
-            None where it was never finished, or cut short.
-        """
+        """Give the table and the arrays of a finished part, or None."""
         if self._folder is None:
             return None
         table_path, path = self._paths(number)
@@ -101,17 +69,7 @@ class Shelf:
         return found
 
     def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
-        """Keep a finished part; a full disk costs the resumption, not the run.
-
-        Parameters
-        ----------
-        number : int
-            Of the part.
-        table : pandas.DataFrame
-            One of its tables.
-        arrays : mapping of str to ndarray
-            Everything else.
-        """
+        """Keep a finished part; a full disk costs the resumption, not the run."""
         if self._folder is None:
             return
         table_path, path = self._paths(number)
@@ -181,18 +139,7 @@ class Store(Shelf):
 
 
 def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
-    """Put images into arrays that a file holds.
-
-    Parameters
-    ----------
-    views : sequence of EventView
-        Without posteriors.
-
-    Returns
-    -------
-    dict of str to ndarray
-        For `unpacked_views`.
-    """
+    """Put images into arrays that a file holds."""
     flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
     traces = [v.trace for v in views]
     clips = [v.clip for v in views]
@@ -213,18 +160,7 @@ def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
 
 
 def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
-    """Take images out of such arrays.
-
-    Parameters
-    ----------
-    data : mapping of str to ndarray
-        From `packed_views`.
-
-    Returns
-    -------
-    tuple of EventView
-        Numbered from 0.
-    """
+    """Take images out of such arrays."""
     views, at = [], 0
     traces, clips = _traces(data), _clips(data)
     for i, (row, column) in enumerate(data["corners"]):
@@ -285,58 +221,18 @@ def _trajectory(columns: FloatArray) -> Trajectory | None:
 
 
 def partial_folder(folder: Path) -> Path:
-    """Name the folder of an output folder's finished chunks: hidden, beside it.
-
-    Parameters
-    ----------
-    folder : Path
-        The output folder.
-
-    Returns
-    -------
-    Path
-        It need not exist.
-    """
+    """Name the folder of an output folder's finished chunks: hidden, beside it."""
     return folder.with_name(f".{folder.name}.partial")
 
 
 def saying(stop: KeyboardInterrupt, what: str) -> KeyboardInterrupt:
-    """Add to what an interrupt says.
-
-    Parameters
-    ----------
-    stop : KeyboardInterrupt
-        It may say by which signal it came.
-    what : str
-        What became of what was done.
-
-    Returns
-    -------
-    KeyboardInterrupt
-        To be raised in its place.
-    """
+    """Add to what an interrupt says."""
     return KeyboardInterrupt("; ".join(filter(None, [str(stop), what])))
 
 
 @contextmanager
 def parts_kept(folder: Path | None) -> Iterator[None]:
-    """Say in an interrupt that finished parts are kept, when all of them are.
-
-    Parameters
-    ----------
-    folder : Path or None
-        Where they are; None, or a folder without any, says nothing.
-
-    Yields
-    ------
-    None
-        The block gathers or draws what was found in them.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        The block was interrupted.
-    """
+    """Say in an interrupt that finished parts are kept, when all of them are."""
     try:
         yield
     except KeyboardInterrupt as stop:
@@ -346,18 +242,7 @@ def parts_kept(folder: Path | None) -> Iterator[None]:
 
 
 def is_resumable(folder: Path) -> bool:
-    """Whether a folder holds what an interrupted run left, and its chunks, if it finished any.
-
-    Parameters
-    ----------
-    folder : Path
-        The output folder.
-
-    Returns
-    -------
-    bool
-        Whether a run into it would go on where the last one stopped, and nothing is lost.
-    """
+    """Whether a folder holds what an interrupted run left, and its chunks, if it finished any."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         goes_on = partial_folder(folder).is_dir() or not summary["events"]

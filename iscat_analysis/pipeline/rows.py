@@ -19,21 +19,7 @@ from iscat_analysis.records import FloatArray
 
 
 def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
-    """Make the rows of all events of a movie.
-
-    Parameters
-    ----------
-    found : Found
-        Fits, with the errors of their likelihoods.
-
-    Returns
-    -------
-    rows : pandas.DataFrame
-        The columns of `Found.fits`; after ``flags`` ``systematic_*``, where they are known, and at
-        the end ``repeat_*``, where the frames could be compared.
-    achieved : dict of str to Achieved
-        The measured spread over the bound, by free parameter; empty where it was not measured.
-    """
+    """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}

@@ -17,13 +17,7 @@ Notify = Callable[[str], None]
 
 
 def unheard(text: str) -> None:
-    """Tell nobody.
-
-    Parameters
-    ----------
-    text : str
-        What would have been told.
-    """
+    """Tell nobody."""
 
 
 class Clock:
@@ -42,29 +36,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Run:
-    """One run.
-
-    Attributes
-    ----------
-    notify : callable
-        Told what the user should know of the run, one line at a time.
-    progress : Progress
-        Told how far each stage is.
-    compilation : Compilation
-        Of the kernels.
-    partial : Path or None
-        Folder that keeps finished parts of a movie; None keeps nothing.
-    place : Place
-        Where the chunks of a landing movie are analysed.
-    inject : int
-        Known particles to add to a landing movie in a second run.
-    begin_report : callable
-        Given what was found before its species are known.
-    clock : Clock
-        Seconds per stage.
-    warnings : list of str
-        What the user should know of the movie and its result, as it was told.
-    """
+    """One run."""
 
     notify: Notify
     progress: Progress

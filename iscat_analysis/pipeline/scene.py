@@ -30,27 +30,7 @@ _VARIANCE_OF_BACKGROUND = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What a configuration fixes for every field of a movie: model, templates, scale.
-
-    Attributes
-    ----------
-    config : Config
-        Resolved.
-    model : ForwardModel
-        For fitted regions.
-    wide : ForwardModel
-        For signals up to `SPREAD_NM` away.
-    templates : Templates
-        Matched filter.
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    searches : int
-        Images, or boundaries between windows, that are searched in all of the movie.
-    lines : Lines or None
-        Rows and columns whose flicker is divided out of the frames.
-    moving : (MovingFocus, MovingFocus) or None
-        `model` and `wide` by frame, where the focus moves.
-    """
+    """What a configuration fixes for every field of a movie: model, templates, scale."""
 
     config: Config
     model: ForwardModel
@@ -82,31 +62,12 @@ class Scene:
     def left(self, signal: FloatArray) -> FloatArray:
         """Give what the frames, as they are corrected, show of a signal over the field.
 
-        Parameters
-        ----------
-        signal : ndarray, shape (y, x)
-            Contrast.
-
-        Returns
-        -------
-        ndarray, shape (y, x)
-            The signal itself where no line flickers.
+        Shapes: `signal` (y, x), result (y, x).
         """
         return signal if self.lines is None else self.lines.left(signal)
 
     def contrasts(self, amplitude: FloatArray) -> FloatArray:
-        """Give the peak contrast of particles at the nominal height.
-
-        Parameters
-        ----------
-        amplitude : ndarray
-            As the matched filter measures it.
-
-        Returns
-        -------
-        ndarray
-            In proportion to that of the nominal particle.
-        """
+        """Give the peak contrast of particles at the nominal height."""
         nominal = self.model.material.mass_kda
         peak = self.model.peak_contrast(self.model.height_nm, nominal)
         return amplitude * peak / self.model.scale.amplitude(nominal)
@@ -131,37 +92,7 @@ def make_scene(
     lines: Lines | None = None,
     sliding: bool = False,
 ) -> Scene:
-    """Build the models and the matched filter for a field.
-
-    Parameters
-    ----------
-    config : Config
-        With a pixel size.
-    field_px : (int, int)
-        Rows and columns.
-    searches : int
-        Images, or boundaries between windows, that will be searched; they share the expected false
-        alarms.
-    noise : NoiseSpectrum, optional
-        Of the movie; without it the noise is white and of the expected size.
-    lines : Lines, optional
-        What was divided out of the frames.
-    sliding : bool
-        Whether windows slide over the movie: particles are then sought at their nominal height,
-        neighbouring boundaries have frames in common, and the rings reach as far as those of a
-        strong particle matter.
-
-    Returns
-    -------
-    Scene
-        Ready for `fit_field`, or for chunks of a landing movie.
-
-    Raises
-    ------
-    ConfigError
-        The region is too small or too large, the likelihood does not suit the scheme, or the
-        calibration has the wrong sign.
-    """
+    """Build the models and the matched filter for a field."""
     pixel, roi_px = square_of(config, field_px)
     darkfield = config.optics.scheme == "darkfield"
     if config.fit.likelihood == "conditional" and (darkfield or not is_counted(config)):
@@ -206,27 +137,7 @@ def make_scene(
 
 
 def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:
-    """Give the side of a pixel and of the square that is fitted.
-
-    Parameters
-    ----------
-    config : Config
-        With a pixel size.
-    field_px : (int, int)
-        Rows and columns of the field.
-
-    Returns
-    -------
-    pixel_nm : float
-        Side of a pixel [nm].
-    roi_px : int
-        Side of the square [pixels].
-
-    Raises
-    ------
-    ConfigError
-        The pixel size is missing, or the square is larger than the field.
-    """
+    """Give the side of a pixel and of the square that is fitted."""
     pixel = _pixel_nm(config)
     roi_px = config.fit.roi_px(pixel)
     if roi_px > min(field_px):
@@ -238,22 +149,7 @@ def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:
 
 
 def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
-    """Build the forward model of the square that is fitted.
-
-    Parameters
-    ----------
-    config : Config
-        Optics, particle and calibration.
-    pixel_nm : float
-        Side of a pixel [nm].
-    roi_px : int
-        Side of the square [pixels].
-
-    Returns
-    -------
-    ForwardModel
-        It reaches over the square from wherever a fit may put the particle.
-    """
+    """Build the forward model of the square that is fitted."""
     margin = pixel_nm + margin_nm(config.optics, pixel_nm)
     return forward_model(
         config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + margin)
@@ -261,70 +157,24 @@ def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
 
 
 def search_both(detection: Detection, *, searches: int = 1) -> Detection:
-    """Search both polarities, for one that is not wanted has side lobes that are.
-
-    Parameters
-    ----------
-    detection : Detection
-        As configured.
-    searches : int
-        Images that share the expected false alarms.
-
-    Returns
-    -------
-    Detection
-        Where one polarity is wanted, twice the false alarms: half of them have the other.
-    """
+    """Search both polarities, for one that is not wanted has side lobes that are."""
     sides = 1 if detection.polarity == "both" else 2
     alarms = sides * detection.false_alarms_per_movie / searches
     return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
 
 
 def reported_steps(scene: Scene) -> int:
-    """Give which steps of a landing movie have the polarity that is reported.
-
-    Parameters
-    ----------
-    scene : Scene
-        Its template tells what landing does to the light.
-
-    Returns
-    -------
-    int
-        1 landings, −1 leavings, 0 both.
-    """
+    """Give which steps of a landing movie have the polarity that is reported."""
     return scene.config.detection.sign * int(scene.templates.signs[0])
 
 
 def variance_of_background(config: Config) -> float:
-    """Give the variance of the background over that of the mean of its frames.
-
-    Parameters
-    ----------
-    config : Config
-        Method of its background.
-
-    Returns
-    -------
-    float
-        0 where it is known.
-    """
+    """Give the variance of the background over that of the mean of its frames."""
     return _VARIANCE_OF_BACKGROUND[str(config.background.method)]
 
 
 def is_counted(config: Config) -> bool:
-    """Tell whether the background is a sum of counts, which is what the conditional law is about.
-
-    Parameters
-    ----------
-    config : Config
-        Method of its background.
-
-    Returns
-    -------
-    bool
-        True for the methods ``"fixed"`` and ``"sliding"``.
-    """
+    """Tell whether the background is a sum of counts, as the conditional likelihood assumes."""
     return config.background.method in ("fixed", "sliding")
 
 

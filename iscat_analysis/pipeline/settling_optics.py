@@ -30,15 +30,7 @@ _FARTHEST = 0.7  # times the last change that is added to it: some directions ch
 
 @dataclass(frozen=True)
 class Round:
-    """Optics with which tracks were followed, and those that were learned from these tracks.
-
-    Attributes
-    ----------
-    before, after : Config
-        With the optics.
-    found : OpticsCalibration
-        What was learned.
-    """
+    """Optics with which tracks were followed, and those that were learned from these tracks."""
 
     before: Config
     after: Config
@@ -57,29 +49,12 @@ class Round:
 
 @dataclass(frozen=True)
 class Rounds:
-    """One round after the other.
-
-    Attributes
-    ----------
-    all : tuple of Round
-        The latest last.
-    """
+    """One round after the other."""
 
     all: tuple[Round, ...] = ()
 
     def with_one(self, last: Round) -> Rounds:
-        """Add a round.
-
-        Parameters
-        ----------
-        last : Round
-            The latest.
-
-        Returns
-        -------
-        Rounds
-            With it.
-        """
+        """Add a round."""
         return Rounds((*self.all, last))
 
     @property
@@ -130,18 +105,7 @@ class Rounds:
         return with_settings(last.after, values)
 
     def error_of(self, taken: Round) -> FloatArray:
-        """Give what later rounds changed of a round, and others would, shape (n,).
-
-        Parameters
-        ----------
-        taken : Round
-            One of them.
-
-        Returns
-        -------
-        ndarray
-            In the order of its measured parameters.
-        """
+        """Give what later rounds changed of a round, and others would, shape (n,)."""
         last = self.all[-1]
         names = taken.found.names
         rest = dict(zip(last.found.names, self.to_come.tolist(), strict=True))

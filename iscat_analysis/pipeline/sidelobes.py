@@ -24,19 +24,7 @@ _RINGS = 0.04  # the same for the rest of its region
 
 @dataclass(frozen=True)
 class Sieve:
-    """Tells steps from side lobes.
-
-    Attributes
-    ----------
-    first : int
-        Frame at which the chunk begins.
-    stride : int
-        Frames between two boundaries.
-    window : int
-        Frames before and after a step.
-    roi_px : int
-        Side of the square that is fitted [pixels].
-    """
+    """Tells steps from side lobes."""
 
     first: int
     stride: int
@@ -48,19 +36,7 @@ class Sieve:
     ) -> tuple[list[Peak], list[Peak]]:
         """Sort peaks.
 
-        Parameters
-        ----------
-        peaks : sequence of Peak
-            Highest first.
-        steps : sequence of Step
-            Those that are known.
-        snr : ndarray, shape (n, y, x)
-            From `iscat_analysis.search.sliding.sliding_maps`, with these taken off.
-
-        Returns
-        -------
-        fresh, doubtful : list of Peak
-            Particles, and what may be the side lobe of a known one.
+        Shapes: `snr` (n, y, x).
         """
         fresh: list[Peak] = []
         doubtful: list[Peak] = []

@@ -80,31 +80,6 @@ def bright_sights(
 
     Particles with heights of their own are known only from fits of the whole field: there are none
     then, where frames before and after are compared.
-
-    Parameters
-    ----------
-    movie : Stack
-        A landing movie, or one with background frames or a known level.
-    config : Config
-        Resolved.
-    camera : Camera
-        Counts → photoelectrons.
-    pool : ThreadPoolExecutor
-        Runs the search.
-    opening : Opening, optional
-        Of a landing movie, where it was judged; its reader keeps what is read here.
-    rings : bool
-        Whether to look for those of a landing movie whose rings may lie in the pictures of others,
-        as where optics are learned; without, for as many particles as they are tested on.
-    whole : bool
-        Whether to look in all of a landing movie, and not only until there are enough.
-
-    Returns
-    -------
-    sights : list of Sight
-        At most `MOST_SIGHTS`, or `TESTED` without `rings`, the brightest first.
-    others : list of Sight
-        Every bright particle, on small regions; of a landing movie with `rings` only.
     """
     if way_of(config) == "sliding":
         if opening is not None:
@@ -119,18 +94,7 @@ def bright_sights(
 
 
 def kind_of(config: Config) -> str:
-    """Say what such a movie shows, for the record of a calibration.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved.
-
-    Returns
-    -------
-    str
-        A few words.
-    """
+    """Say what such a movie shows, for the record of a calibration."""
     return "landing movie" if way_of(config) == "sliding" else "frames before and after"
 
 
@@ -142,28 +106,7 @@ def landing_sights(
     rings: bool,
     whole: bool,
 ) -> tuple[list[Sight], list[Sight]]:
-    """Find bright steps of a landing movie, chunk by chunk until there are enough.
-
-    Parameters
-    ----------
-    reader : Reader
-        The frames.
-    window : int
-        Frames before, and as many after, each step.
-    config : Config
-        Resolved.
-    pool : ThreadPoolExecutor
-        Runs the search.
-    rings, whole : bool
-        As in `bright_sights`.
-
-    Returns
-    -------
-    sights : list of Sight
-        At most `MOST_SIGHTS`, or `TESTED` without `rings`, the brightest first.
-    others : list of Sight
-        Every bright step, on small regions; empty without `rings`.
-    """
+    """Find bright steps of a landing movie, chunk by chunk until there are enough."""
     stride = stride_of(window)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
@@ -241,24 +184,7 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
 def bright_places(
     windows: Windows, config: Config, alone_nm: float = APART_NM
 ) -> tuple[list[Sight], list[Sight]]:
-    """Find bright particles that bound between two ranges of frames.
-
-    Parameters
-    ----------
-    windows : Windows
-        The sums before and after.
-    config : Config
-        Resolved.
-    alone_nm : float
-        Distance from a particle within which there is no other [nm].
-
-    Returns
-    -------
-    sights : list of Sight
-        At most `MOST_SIGHTS`, the brightest first.
-    others : list of Sight
-        Every bright particle, on small regions.
-    """
+    """Find bright particles that bound between two ranges of frames."""
     ratio = windows.power_ratio
     # the noise of a known background is none
     noise_before = windows.before_e + windows.read_variance_before_e2 if windows.n_before else 0.0
@@ -286,23 +212,7 @@ def known_places(
 ) -> tuple[list[Sight], list[Sight]]:
     """Cut out particles that are known, those that are farthest from others.
 
-    Parameters
-    ----------
-    windows : Windows
-        The sums before and after.
-    config : Config
-        Resolved.
-    known : sequence of ndarray, shape (5,)
-        All particles, as they were fitted, in the order of `Likelihood`.
-    least : int
-        Pictures wanted: the distance from others is the largest that leaves so many.
-
-    Returns
-    -------
-    sights : list of Sight
-        At most `MOST_SIGHTS`, the brightest first.
-    others : list of Sight
-        Every particle, on small regions.
+    Shapes: `known` (5,).
     """
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
     heights = config.fit.z_range_nm if heights_free(config) else None
@@ -367,20 +277,6 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     The particles stay where they are, so that no frame shows the background alone.  It comes from
     ``background.frames`` where the movie has some; otherwise it is taken for even around each
     particle, at a level that is fitted in every picture.
-
-    Parameters
-    ----------
-    movie : Stack
-        The scan.
-    config : Config
-        Resolved; ``optics.focus_nm`` is that of the first frame that is fitted.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    list of Sight
-        At most `MOST_SIGHTS`, spread evenly over the frames.
     """
     known = config.background.recorded
     start = known[1] if known else 0
@@ -489,16 +385,5 @@ def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[in
 
 
 def reach_nm(sight: Sight) -> float:
-    """Distance from a particle, which may move in its picture, to the farthest pixel.
-
-    Parameters
-    ----------
-    sight : Sight
-        The picture.
-
-    Returns
-    -------
-    float
-        Distance [nm].
-    """
+    """Distance from a particle, which may move in its picture, to the farthest pixel."""
     return sight.grid.diagonal_nm / 2 + _SHIFT_NM

@@ -11,39 +11,13 @@ _MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone
 
 
 def followed(config: Config, *, moves: bool) -> Config:
-    """Settle whether the motion of the fixed pattern is divided out.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved, with ``background.drift_correction = "auto"``.
-    moves : bool
-        Whether it moves.
-
-    Returns
-    -------
-    Config
-        With a setting that repeats the analysis.
-    """
+    """Settle whether the motion of the fixed pattern is divided out."""
     background = config.background.model_copy(update={"drift_correction": moves})
     return config.model_copy(update={"background": background})
 
 
 def motion_said(movie: FrameSource, opening: Opening) -> str:
-    """Say that the fixed pattern of a landing movie moves.
-
-    Parameters
-    ----------
-    movie : FrameSource
-        In steady light.
-    opening : Opening
-        Of the same movie; its first frames are looked at, and the last that are analysed.
-
-    Returns
-    -------
-    str
-        Some words; empty where its motion makes no noise that matters, or there is no pattern.
-    """
+    """Say that the fixed pattern of a landing movie moves."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"
     reader, length = opening.reader, opening.curve.frames[-1]

@@ -22,26 +22,7 @@ from iscat_analysis.search.sliding import STRIDES, Chunk, Filter, MapArray, slid
 
 
 class StepMaps:
-    """The maps of one chunk, from one search to the next.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    chunk : Chunk
-        The frames.
-    matched : Filter
-        Of the chunk.
-    neighbours : Neighbours
-        Of the same chunk.
-    pattern : MovingPattern, optional
-        Of the same chunk, where its motion is divided out.
-
-    Attributes
-    ----------
-    matched : Filter
-        As given.
-    """
+    """The maps of one chunk, from one search to the next."""
 
     def __init__(
         self,
@@ -59,20 +40,7 @@ class StepMaps:
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
 
     def without(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
-        """Take known steps off.
-
-        Parameters
-        ----------
-        steps : sequence of Step
-            All that are known.
-        mapper : callable
-            `map`, or the one of a pool.
-
-        Returns
-        -------
-        snr, frames : ndarray
-            As from `iscat_analysis.search.sliding.sliding_maps`; the next call overwrites them.
-        """
+        """Take known steps off."""
         if self._is_local:
             maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
             for step in _missing(self._known, steps):

@@ -55,19 +55,7 @@ _SAME_PX = 1.5
 
 @dataclass(frozen=True)
 class StepEvent:
-    """A step that was fitted for good, and what its frames say beside it.
-
-    Attributes
-    ----------
-    event : Event
-        The particle that lands or leaves.
-    step : Step
-        When and where, as its neighbours see it.
-    others : tuple of Step
-        Those that the fit knew of.
-    repeats : ndarray
-        From `iscat_analysis.pipeline.repeats.step_repeats`.
-    """
+    """A step that was fitted for good, and what its frames say beside it."""
 
     event: Event
     step: Step
@@ -85,31 +73,7 @@ class _Finished:
 
 
 class ChunkFitter:
-    """Finds and fits the steps of one chunk.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and template; `wide` reaches over a step's image.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-    pool : ThreadPoolExecutor
-        Runs the fits; the result does not depend on its size.
-    pattern : MovingPattern, optional
-        Of the same chunk, where its motion is divided out.
-    excess_noise : ExcessNoise, optional
-        With it a search is given up that such noise passes; see `refuse_flood`.
-
-    Attributes
-    ----------
-    strongest : ndarray, shape (2, y, x)
-        Of all boundaries, the one with the largest signal-to-noise ratio at each pixel: that
-        ratio, and the amplitude.
-    rounds : int
-        Searches made.
-    """
+    """Finds and fits the steps of one chunk."""
 
     def __init__(
         self,
@@ -138,18 +102,7 @@ class ChunkFitter:
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
     def run(self, keep: tuple[int, int]) -> list[StepEvent]:
-        """Find and fit every step.
-
-        Parameters
-        ----------
-        keep : (int, int)
-            Frames whose steps are wanted; those outside are only seen as neighbours.
-
-        Returns
-        -------
-        list of StepEvent
-            In order of frame.
-        """
+        """Find and fit every step."""
         templates = self._scene.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
         maps = StepMaps(self._scene, self._chunk, matched, self._neighbours, self._pattern)
@@ -210,20 +163,7 @@ class ChunkFitter:
     def shown(
         self, fitted: Sequence[StepEvent], clips: int
     ) -> list[tuple[Trace | None, Clip | None]]:
-        """Give what the report shows of steps beside their images.
-
-        Parameters
-        ----------
-        fitted : sequence of StepEvent
-            From `run`.
-        clips : int
-            How many, the first, have a clip.
-
-        Returns
-        -------
-        list of (Trace or None, Clip or None)
-            Where the frames allow.
-        """
+        """Give what the report shows of steps beside their images."""
         chunk, window = self._chunk, self._window
 
         def one(number: int) -> tuple[Trace | None, Clip | None]:

@@ -30,26 +30,7 @@ def summary_of(
     timings: Mapping[str, float],
     achieved: Mapping[str, Achieved] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    table : pandas.DataFrame
-        The events.
-    compared : Compared
-        Frames and their light.
-    timings : mapping of str to float
-        Seconds per stage.
-    achieved : mapping of str to Achieved
-        Measured spread of each free parameter over its bound, where it was measured.
-
-    Returns
-    -------
-    dict
-        Nested plain values; nothing where species will be.
-    """
+    """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
     good = table[table["status"] == Status.OK]
     free = free_parameters(scene.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
@@ -97,20 +78,7 @@ def summary_of(
 
 
 def species_of(scene: Scene, table: pd.DataFrame) -> dict[str, Any]:
-    """Describe the species of all events, which takes as long as drawing what does not need them.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    table : pandas.DataFrame
-        The events.
-
-    Returns
-    -------
-    dict
-        What ``summary.json`` says of them.
-    """
+    """Describe the species of all events."""
     distribution = _distribution(scene, table[table["status"] == Status.OK])
     across = _across(scene, table, distribution)
     return {"distribution": distribution, "across_particles": across}

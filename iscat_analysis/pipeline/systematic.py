@@ -46,25 +46,7 @@ def systematic(
     mass_share: float = 0.0,
     scale: MassScale | None = None,
 ) -> dict[str, FloatArray]:
-    """Add up the errors that all events of a movie share.
-
-    Parameters
-    ----------
-    config : Config
-        Says what was calibrated, and how well.
-    table : pandas.DataFrame
-        Events, with the columns of ``fits.csv``.
-    mass_share : float
-        Share of its mass by which every event may be wrong, for what the model leaves over.
-    scale : MassScale, optional
-        Of the fits, whose line of faint standards may not hold for heavy particles.
-
-    Returns
-    -------
-    dict of str to ndarray
-        Parameter (`PARAMETERS`), or ``"contrast"`` where no calibration makes masses of contrasts →
-        standard deviation of every event [nm or kDa]; only of those for which an error is known.
-    """
+    """Add up the errors that all events of a movie share."""
     squares: dict[str, FloatArray] = {}
     sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
     if scale is not None:
@@ -97,17 +79,7 @@ def _of_heavy_particles(
 def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     """Tell which masses a line of faint standards is clearly wrong about.
 
-    Parameters
-    ----------
-    scale : MassScale
-        Of the fits.
-    table : pandas.DataFrame
-        Rows of ``fits.csv``.
-
-    Returns
-    -------
-    ndarray of bool, shape (rows,)
-        Of the rows that are ok: by five of their errors, or by more than lines are wrong anyway.
+    Shapes: result (rows,).
     """
     off, sigma = _off_the_line(scale, table)
     share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)

@@ -27,27 +27,7 @@ FEWEST_FRAMES = 10
 
 @dataclass(frozen=True)
 class Task:
-    """A step's likelihood and what it is made of.
-
-    Attributes
-    ----------
-    likelihood : Likelihood
-        Of the counts before and after.
-    region : Region
-        Its pixels, in the full frame.
-    patch : Patch
-        Of these pixels, the frames that are used and some around them.
-    windows : Windows
-        The sums, those with the particle as "after".
-    at : StepFrame
-        When.
-    n_before, n_after : int
-        Frames before and after the step that are used.
-    crowded : bool
-        Whether a close neighbour could not be kept out of them.
-    offset_px : ndarray, shape (2,)
-        Mean place (y, x) of the particle in the frames used, from where it is at its step.
-    """
+    """A step's likelihood and what it is made of."""
 
     likelihood: Likelihood
     region: Region
@@ -61,21 +41,7 @@ class Task:
 
 
 class TaskBuilder:
-    """Builds the likelihoods of the steps of one chunk.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-    neighbours : Neighbours
-        Of the same chunk.
-    pattern : MovingPattern, optional
-        Of the same chunk, where its motion is corrected.
-    """
+    """Builds the likelihoods of the steps of one chunk."""
 
     def __init__(
         self,
@@ -229,23 +195,7 @@ class TaskBuilder:
     ) -> FloatArray:
         """Height that neighbours, and the motion of the pattern, add to each frame.
 
-        Parameters
-        ----------
-        step : Step
-            The step.
-        neighbours : sequence of Step
-            Others.
-        region : Region
-            Which pixels, in the full frame.
-        patch : Patch
-            Frames of these pixels.
-        image : ndarray, shape (ny, nx)
-            Contrast of the step there, which is the unit.
-
-        Returns
-        -------
-        ndarray, shape (t,)
-            To be taken off what `frame_heights` measures.
+        Shapes: `image` (ny, nx), result (t,).
         """
         local = self._pattern.local(region, step.at.frame) if self._pattern else None
         return self._added(step, neighbours, region, patch, local, image)

@@ -40,24 +40,6 @@ def median_p(
     """Give the median p-value of the brightest particles in the configured microscope.
 
     The rings of neighbours, where any are known, are put into the pictures that fail without.
-
-    Parameters
-    ----------
-    sights : list of Sight
-        The particles, the brightest first.
-    config : Config
-        With the optics that are tested.
-    others : sequence of Sight
-        Every particle that `Sight.neighbours` counts.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    p_value : float
-        Of the best fits of all that were tested.
-    fitted : sequence of Sight
-        Those, where the fits put them.
     """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
@@ -89,24 +71,6 @@ def not_alone(
     A microscope that is wrong is so for all particles, and is seen the better the brighter they
     are.  Where some as bright are described, the places that are not show two that landed at once.
     From a place that others drew aside a fit ends in another optimum: each begins anew here.
-
-    Parameters
-    ----------
-    sights : list of Sight
-        As for `median_p`.
-    config : Config
-        As for `median_p`.
-    others : sequence of Sight
-        As for `median_p`.
-    mapper : callable
-        As for `median_p`.
-
-    Returns
-    -------
-    numbers : list of int
-        Those of the places that are described badly; empty where no others tell that.
-    p_value : float
-        Median of the other places.
     """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])

@@ -60,20 +60,7 @@ class _Steps:
 
 
 def warnings_of(fits: pd.DataFrame, frame_rate_hz: float | None) -> Iterator[str]:
-    """Say what all particles do at once.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        One row per particle and frame, with its track.
-    frame_rate_hz : float or None
-        Frames per second [Hz].
-
-    Yields
-    ------
-    str
-        One line each.
-    """
+    """Say what all particles do at once."""
     steps = _steps_of(fits)
     if steps is None:
         return

@@ -34,22 +34,7 @@ CLIP_STEPS = 6
 
 
 def patch_of(fitted: StepEvent, chunk: Chunk, window: int) -> Patch:
-    """Copy the frames around a step, for `trace_of` and `clip_of`.
-
-    Parameters
-    ----------
-    fitted : StepEvent
-        The step.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-
-    Returns
-    -------
-    Patch
-        `TRACE_WINDOWS` on either side, of the pixels that were fitted.
-    """
+    """Copy the frames around a step, for `trace_of` and `clip_of`."""
     region = fitted.event.region
     turn, reach = fitted.step.at.frame, TRACE_WINDOWS * window
     return chunk.patch(turn - reach, turn + reach, region.rows, region.columns)
@@ -58,26 +43,7 @@ def patch_of(fitted: StepEvent, chunk: Chunk, window: int) -> Patch:
 def trace_of(
     fitted: StepEvent, patch: Patch, chunk: Chunk, neighbours: Neighbours, tasks: TaskBuilder
 ) -> Trace | None:
-    """Measure the contrast of a step's particle in every frame around the step.
-
-    Parameters
-    ----------
-    fitted : StepEvent
-        The step; what its neighbours make is taken off.
-    patch : Patch
-        From `patch_of`.
-    chunk : Chunk
-        The frames.
-    neighbours : Neighbours
-        Of the chunk.
-    tasks : TaskBuilder
-        Of the chunk.
-
-    Returns
-    -------
-    Trace or None
-        None where the region holds too little of the picture.
-    """
+    """Measure the contrast of a step's particle in every frame around the step."""
     event = fitted.event
     fit, windows, region = event.fit, event.windows, event.region
     step, turn = fitted.step, fitted.step.at.frame
@@ -116,28 +82,7 @@ def clip_of(
     window: int,
     pattern: MovingPattern | None = None,
 ) -> Clip | None:
-    """Set windows that slide over a step against those before them.
-
-    Parameters
-    ----------
-    fitted : StepEvent
-        The step.
-    patch : Patch
-        From `patch_of`.
-    scene : Scene
-        Its pixel size.
-    chunk : Chunk
-        The frames.
-    window : int
-        Frames before and after a step.
-    pattern : MovingPattern, optional
-        Of the chunk, where its motion is corrected.
-
-    Returns
-    -------
-    Clip or None
-        None where the frames around the step are too few for a second image.
-    """
+    """Set windows that slide over a step against those before them."""
     turn, start = fitted.step.at.frame, fitted.event.candidate
     side = min(scene.roi_px, 2 * math.ceil(CLIP_NM / scene.pixel_nm / 2) - 1)
     fold = math.ceil(side / CLIP_PIXELS)

@@ -64,17 +64,7 @@ _LOOKED_AT = 24  # pictures in which the cause is looked for
 
 @dataclass(frozen=True)
 class LeftOver:
-    """What the model leaves over of all pictures of tracks together.
-
-    Attributes
-    ----------
-    share : float
-        Beyond the noise, of the particle's picture.
-    clear : bool
-        Whether that is clearly more than noise.
-    tracks : int
-        That were looked at.
-    """
+    """What the model leaves over of all pictures of tracks together."""
 
     share: float
     clear: bool
@@ -98,17 +88,7 @@ class LeftOver:
 
 @dataclass(frozen=True)
 class Begun:
-    """The first frames of a movie, followed with some optics.
-
-    Attributes
-    ----------
-    config : Config
-        With these.
-    scene : Scene
-        Its models.
-    block : Block
-        What was found.
-    """
+    """The first frames of a movie, followed with some optics."""
 
     config: Config
     scene: Scene
@@ -146,33 +126,6 @@ def learn_from_tracks(
 
     Through optics that are very wrong a particle leaves rings which are taken for others, until
     nothing can be linked or learned.  Then only what stands alone is followed, and learned from.
-
-    Parameters
-    ----------
-    config : Config
-        Resolved; ``optics.calibrate`` says what is wanted.
-    begin : callable
-        Follows the first frames with the optics of a configuration.
-    name : str
-        Of the movie.
-    pool : ThreadPoolExecutor
-        Runs the fits.
-    tell : callable
-        Told in one line what is wrong, or what was learned.
-    notify : callable
-        Told that optics are being learned, which may take minutes.
-
-    Returns
-    -------
-    begun : Begun
-        With the optics to go on with.
-    summary : dict
-        What ``summary.json`` says of it; empty where nothing could be tested.
-
-    Raises
-    ------
-    DataError
-        Nothing can be followed with the configured optics, and no others were learned.
     """
     optics = config.optics
     suited = optics.convention == "exact" and optics.psf == "model"
@@ -285,18 +238,7 @@ def _described(
 
 
 def mass_error(summary: Mapping[str, Any]) -> float:
-    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks.
-
-    Parameters
-    ----------
-    summary : mapping
-        From `learn_from_tracks`.
-
-    Returns
-    -------
-    float
-        0 where the optics were not rejected, or others learned whose own errors are known.
-    """
+    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks."""
     if "left_over_then" in summary:
         return MASS_SHARE * float(summary["left_over_then"])
     share = float(summary.get("left_over", 0.0))

@@ -64,28 +64,7 @@ _NEARLY_ALL = 0.8  # where so many of them are no particles
 
 
 def find_moving(ready: Prepared, run: Run) -> Found:
-    """Track particles over backgrounds that are learnt with them.
-
-    Parameters
-    ----------
-    ready : Prepared
-        The movie.
-    run : Run
-        Is told what the user should know.
-
-    Returns
-    -------
-    Found
-        One row per particle and frame; one view per track, of its clearest frame.  An interrupt
-        keeps the blocks that are finished.
-
-    Raises
-    ------
-    DataError
-        There are too few frames.
-    KeyboardInterrupt
-        The user stopped it before the first block was finished.
-    """
+    """Track particles over backgrounds that are learnt with them."""
     config, camera = ready.config, ready.camera
     additive = config.optics.scheme == "darkfield"
     span = fitted_frames(ready.steady, config)
@@ -203,43 +182,7 @@ def track_movie(
     progress: Progress,
     first: Block | None = None,
 ) -> tuple[list[Block], bool]:
-    """Track particles that are there in all frames, over backgrounds learnt with them.
-
-    Parameters
-    ----------
-    scene : Scene
-        From `iscat_analysis.pipeline.moving_field.track_scene`.
-    movie : CountSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    plan : Plan
-        Its blocks of frames.
-    store : BlockStore
-        Keeps the finished ones, and has those of a run that was interrupted.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs parts of blocks.
-    progress : Progress
-        Told the stages.
-    first : Block, optional
-        The first of them, where it is finished.
-
-    Returns
-    -------
-    blocks : list of Block
-        Those that are finished.
-    interrupted : bool
-        Whether there should have been more.
-
-    Raises
-    ------
-    DataError
-        There are too few frames.
-    KeyboardInterrupt
-        The user stopped it before the first block was finished.
-    """
+    """Track particles that are there in all frames, over backgrounds learnt with them."""
     blocks: list[Block] = [] if first is None else [first]
     interrupted = False
     try:
@@ -310,42 +253,7 @@ def track_frames(
     doubt: str = "",
     tell: Callable[[str], None],
 ) -> Found:
-    """Fit each frame after the background, starting from the frame before, and link.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and matched filter.
-    movie : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : Windows
-        The background, and all frames after it summed.
-    summary : mapping
-        What was learnt of the background.
-    check : callable
-        Refuses impossible counts.
-    pool : ThreadPoolExecutor
-        Runs the fits of a frame.
-    progress : Progress
-        Told the frames.
-    doubt : str
-        Why the background may not be that of the frames, and what to do; empty where it is.
-    tell : callable
-        Told what is probably wrong with the model.
-
-    Returns
-    -------
-    Found
-        One row per particle and frame, numbered by track; one view per track.  An interrupt keeps
-        the frames that are done.
-
-    Raises
-    ------
-    DataError
-        The background is not that of the frames, and what differs looks like particles.
-    """
+    """Fit each frame after the background, starting from the frame before, and link."""
     first, last = windows.frames_after
     lines: list[dict[str, Any]] = []
     views: list[EventView] = []

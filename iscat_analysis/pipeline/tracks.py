@@ -56,28 +56,7 @@ _ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no mo
 
 
 def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
-    """Say what frame rate, exposure and length of a movie leave unknown of its tracks.
-
-    Parameters
-    ----------
-    config : Config
-        In mode ``track``, metadata filled in.
-    frames : int
-        Frames to be tracked.
-    name : str
-        What messages call the movie.
-
-    Yields
-    ------
-    str
-        One line each.
-
-    Raises
-    ------
-    ConfigError
-        The exposure is longer than the time from frame to frame, or the shortest track that is
-        kept longer than the movie.
-    """
+    """Say what frame rate, exposure and length of a movie leave unknown of its tracks."""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
         yield (
@@ -123,30 +102,7 @@ def tracks_of(
     tell: Callable[[str], None],
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
-    """Describe the tracks of a movie.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    fits : pandas.DataFrame
-        One row per particle and frame, with its track.
-    windows : Windows
-        Frame ranges.
-    masses : pandas.DataFrame or None
-        Masses of the exact likelihood, as in `Found`.
-    tell : callable
-        Told what the user should know.
-    progress : Progress
-        Told the tracks.
-
-    Returns
-    -------
-    tracks : pandas.DataFrame
-        Columns `TRACK_COLUMNS`.
-    summary : dict
-        ``tracks`` and ``motion`` of ``summary.json``.
-    """
+    """Describe the tracks of a movie."""
     setup = track_setup(scene, windows)
     setup = replace(setup, change=changes_together(fits, setup.frames))
     with one_thread_algebra():
@@ -175,20 +131,7 @@ def tracks_of(
 
 
 def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
-    """Gather what all tracks of a movie have in common.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    windows : Windows
-        Frame ranges and the shape of the field.
-
-    Returns
-    -------
-    TrackSetup
-        For `describe_tracks`.
-    """
+    """Gather what all tracks of a movie have in common."""
     config = scene.config
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
@@ -218,18 +161,6 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     K = Σ h(u) h(u − r)/Σ h² in common.  With n frames before, the noise of their mean (f = 1) or
     median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
     well, h is what of the picture its derivative along z does not explain.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models and configuration.
-    fits : pandas.DataFrame
-        One row per particle and frame.
-
-    Returns
-    -------
-    callable or None
-        None where the background is known, or learnt with the tracks, whose masses are exact then.
     """
     config = scene.config
     before = fits["n_before"].median() if len(fits) else 0
@@ -273,20 +204,6 @@ def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> str:
 
     Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²), and without
     these their mean square is less by R²/2s² p/(1 − p) of itself.
-
-    Parameters
-    ----------
-    tracks : pandas.DataFrame
-        From `describe_tracks`.
-    setup : TrackSetup
-        Knows the frame rate.
-    reach_nm : float
-        ``track.max_step_nm`` [nm].
-
-    Returns
-    -------
-    str
-        One line.
     """
     d = tracks.loc[tracks["status"] == TrackStatus.OK, "d_um2_s"].max()
     if setup.frame_rate_hz is None or not d > 0:
@@ -335,28 +252,7 @@ def make_films(
     fits: pd.DataFrame,
     tracks: pd.DataFrame,
 ) -> tuple[Film, ...]:
-    """Draw the best and the worst tracks frame by frame.
-
-    Parameters
-    ----------
-    scene : Scene
-        Models.
-    movie : FrameSource
-        The movie.
-    camera : Camera
-        Counts → photoelectrons.
-    windows : sequence of Windows
-        The background, or those of blocks of frames.
-    fits : pandas.DataFrame
-        One row per particle and frame, with its track.
-    tracks : pandas.DataFrame
-        From `tracks_of`.
-
-    Returns
-    -------
-    tuple of Film
-        The best first.
-    """
+    """Draw the best and the worst tracks frame by frame."""
     numbers = track_numbers(fits)
     of_film = fits[list(_OF_FILM)].assign(track=numbers)
     chosen = [

@@ -51,31 +51,7 @@ def learn_with_heights(
     around: bool,
     mapper: Mapper = map,
 ) -> OpticsCalibration:
-    """Learn the optics from particles whose heights are between limits.
-
-    Parameters
-    ----------
-    sights, others : sequence of Sight
-        As for `calibrate_sights`, placed as the known optics have them.
-    config : Config
-        Resolved.
-    groups : sequence of str
-        As for `calibrate_sights`.
-    source : mapping of str to str
-        As for `calibrate_sights`.
-    known : mapping
-        Optics where the search begins.
-    around : bool
-        Whether to look around them too, where what is found from there does not describe the
-        pictures.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    OpticsCalibration
-        What describes the pictures best.
-    """
+    """Learn the optics from particles whose heights are between limits."""
     found = calibrate_sights(sights, others, config, groups, source, known=known, mapper=mapper)
     if not around or (found.accepted and misfit_of(found) < _DESCRIBED_CHI2):
         return found
@@ -87,34 +63,13 @@ def learn_with_heights(
 
 
 def misfit_of(found: OpticsCalibration) -> float:
-    """Give the mean reduced χ² of pictures that were not fitted.
-
-    Parameters
-    ----------
-    found : OpticsCalibration
-        What was learned.
-
-    Returns
-    -------
-    float
-        1 where they are described.
-    """
+    """Give the mean reduced χ² of pictures that were not fitted."""
     return float(found.measured.judgement.chi2_reduced.mean())
 
 
 @dataclass(frozen=True)
 class _Begun:
-    """A microscope, and all particles at the heights that suit it best.
-
-    Attributes
-    ----------
-    settings : mapping
-        Of the microscope.
-    sights, others : list of Sight
-        As from `seen_in_field`, the first among the rings of the others.
-    misfit : float
-        Median of the reduced χ² of the sights.
-    """
+    """A microscope, and all particles at the heights that suit it best."""
 
     settings: Settings
     sights: list[Sight]

@@ -23,24 +23,7 @@ Way = Literal["fixed", "sliding", "tracks"]
 
 
 def way_of(config: Config) -> Way:
-    """Tell in which way a movie is analysed.
-
-    Parameters
-    ----------
-    config : Config
-        Its ``background.method`` decides; a median, or a mean, is that of ``background.frames``,
-        which may be ``"all"``.
-
-    Returns
-    -------
-    {"fixed", "sliding", "tracks"}
-        The way.
-
-    Raises
-    ------
-    ConfigError
-        The windows slide, which measures the background, but the likelihood takes it for known.
-    """
+    """Tell in which way a movie is analysed."""
     method = config.background.method
     if method == "sliding":
         if config.fit.likelihood == "poisson":
@@ -55,18 +38,7 @@ def way_of(config: Config) -> Way:
 
 
 def way_said(config: Config) -> str:
-    """Say which frames stand against which.
-
-    Parameters
-    ----------
-    config : Config
-        Its ``background.method`` decides.
-
-    Returns
-    -------
-    str
-        One line that names the method, which need not be written in the configuration.
-    """
+    """Say which frames stand against which."""
     background = config.background
     those = "all of them" if background.frames == ALL else "background.frames"
     if background.recorded:

@@ -22,12 +22,4 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Ignore progress.
-
-    Parameters
-    ----------
-    stage : str
-        Name of the stage.
-    done, total : int
-        Steps finished, and steps there are.
-    """
+    """Ignore progress."""

@@ -19,20 +19,7 @@ FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
 
 
 def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
-    """Tell what was fitted: in mode ``track`` the height only where ``track.free`` asks for it.
-
-    Parameters
-    ----------
-    mode : str
-        Key of `FREE_PARAMETERS`.
-    fits : pandas.DataFrame
-        With a column ``sigma_…`` of each, empty where it was held fixed.
-
-    Returns
-    -------
-    tuple of str
-        A subset of `PARAMETERS`, in that order.
-    """
+    """Tell what was fitted: in mode ``track`` the height only where ``track.free`` asks for it."""
     names = FREE_PARAMETERS[mode]
     fitted = tuple(name for name in names if fits[f"sigma_{name}"].notna().any())
     return fitted if mode == "track" and fitted else names
@@ -67,16 +54,5 @@ TRACK_COLUMNS = (
 
 
 def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:
-    """Give the track of every row.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        With ``track``, or from mode ``track`` alone, where ``event`` is the number of the track.
-
-    Returns
-    -------
-    pandas.Series
-        Whole numbers, missing where a row belongs to no track.
-    """
+    """Give the track of every row."""
     return fits["track"] if "track" in fits else fits["event"]

@@ -128,18 +128,7 @@ class FitResult:
     alternatives: tuple[Alternative, ...] = ()
 
     def shifted(self, x_nm: float, y_nm: float) -> FitResult:
-        """Give the same fit in coordinates with another origin.
-
-        Parameters
-        ----------
-        x_nm, y_nm : float
-            Added to the place [nm]; `theta` and `estimate` stay those of the likelihood.
-
-        Returns
-        -------
-        FitResult
-            In the other coordinates.
-        """
+        """Give the same fit in coordinates with another origin."""
         return replace(self, x_nm=self.x_nm + x_nm, y_nm=self.y_nm + y_nm)
 
 

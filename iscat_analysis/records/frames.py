@@ -133,18 +133,7 @@ class Windows:
         return int(defects.sum()), int(self.saturated.sum())
 
     def cut(self, region: tuple[slice, slice]) -> Windows:
-        """Give the sums of some pixels.
-
-        Parameters
-        ----------
-        region : (slice, slice)
-            Rows and columns.
-
-        Returns
-        -------
-        Windows
-            Views of these pixels, nothing is copied.
-        """
+        """Give the sums of some pixels."""
         return replace(
             self,
             before_e=self.before_e[region],

@@ -57,20 +57,7 @@ pixels left out."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
-    """Put the remarks on a fit in order.
-
-    Parameters
-    ----------
-    flags : iterable of Status
-        Every condition that was noticed, in any order.
-
-    Returns
-    -------
-    status : Status
-        The worst of them, or ok.
-    flags : tuple of Status
-        All of them, worst first, each once.
-    """
+    """Put the remarks on a fit in order."""
     ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
     return (ordered[0] if ordered else Status.OK), ordered
 

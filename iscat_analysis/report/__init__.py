@@ -59,29 +59,6 @@ def write_report(
     ``summary.json``, ``config.toml``, ``posterior.nc`` (where a posterior converged),
     ``report.html`` and ``figures/``.  The folder appears complete or not at
     all; an earlier result is replaced only once the new one is complete.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found; no events is a result too.
-    folder : Path
-        Where to write.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-    event_figures : int
-        Events whose images are drawn into the folder, at most; each takes a fifth of a second.
-    draughtsman : Draughtsman, optional
-        The process that draws; default this one.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    DataError
-        The folder exists and may not be replaced, or cannot be written.
     """
     with atomic_folder(folder, overwrite) as building:
         fill_report(analysis, building, event_figures=event_figures, draughtsman=draughtsman)
@@ -91,17 +68,7 @@ def write_report(
 def fill_report(
     analysis: Analysis, folder: Path, *, event_figures: int, draughtsman: Draughtsman | None
 ) -> None:
-    """Write a report into a folder of its own.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    folder : Path
-        Empty but for figures that `draughtsman` has begun to draw into ``figures``.
-    event_figures, draughtsman
-        As for `write_report`.
-    """
+    """Write a report into a folder of its own."""
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
     if draughtsman is not None:

@@ -79,36 +79,7 @@ def batch_page(
     mass_label: str,
     folder: Path | None = None,
 ) -> str:
-    """Make the page of a batch, and write its figures.
-
-    Parameters
-    ----------
-    title, subtitle : str
-        Of the page.
-    curves : sequence of Curve
-        Masses of every movie.
-    movies : pandas.DataFrame
-        ``movies.csv``, with the columns group, rate, rate_from, rate_to and rate_unit.
-    species : pandas.DataFrame
-        ``species.csv``, with the column group.
-    shifts : pandas.DataFrame
-        ``shifts.csv``.
-    equilibria : sequence of (str, mapping, sequence of str)
-        A condition, its document ``kd`` and remarks.
-    calibrations : sequence of (str, str, str)
-        What was calibrated, by what, and the page of it, relative to this one; empty without.
-    failed : sequence of (str, str)
-        What could not be analysed, and why.
-    mass_label : str
-        Of axes and columns.
-    folder : Path, optional
-        An existing folder for the figures; without it they are in the page only.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the page of a batch, and write its figures."""
     figures = chain(
         batch_figures(curves, movies, species, mass_label=mass_label), _binding(equilibria)
     )
@@ -443,16 +414,5 @@ def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
 
 
 def summary_line(movies: pd.DataFrame) -> str:
-    """Say in one line what there is.
-
-    Parameters
-    ----------
-    movies : pandas.DataFrame
-        ``movies.csv``.
-
-    Returns
-    -------
-    str
-        As in ``"24 movies of 8 samples"``.
-    """
+    """Say in one line what there is."""
     return f"{count(len(movies), 'movie')} of {count(movies['sample'].nunique(), 'sample')}"

@@ -34,17 +34,7 @@ _QUANTILE = 0.995  # of all masses that an axis shows
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """Masses of one movie.
-
-    Attributes
-    ----------
-    movie, sample, group : str
-        Its name, its sample, and the panel that it belongs to.
-    masses_kda : ndarray, shape (n,)
-        |mass| of its events [kDa].
-    grid_kda, density : ndarray, shape (m,)
-        Kernel density of its events [per kDa]; empty where there is none.
-    """
+    """Masses of one movie."""
 
     movie: str
     sample: str
@@ -61,26 +51,7 @@ def batch_figures(
     *,
     mass_label: str,
 ) -> Iterator[tuple[str, Figure]]:
-    """Draw the figures of a batch.
-
-    Parameters
-    ----------
-    curves : sequence of Curve
-        In the order of the table; movies without events too.
-    movies : pandas.DataFrame
-        ``movies.csv`` with the column group.
-    species : pandas.DataFrame
-        ``species.csv`` with the column group.
-    mass_label : str
-        Of the axis.
-
-    Yields
-    ------
-    name : str
-        Of the files.
-    figure : Figure
-        In the size of print.
-    """
+    """Draw the figures of a batch."""
     shown = [curve for curve in curves if curve.masses_kda.size]
     if shown:
         limit = _limit(shown, species)
@@ -112,18 +83,7 @@ def _limit(curves: Sequence[Curve], species: pd.DataFrame) -> float:
 
 
 def shades(count: int) -> list[str]:
-    """Give colours that can be told apart: named ones, or steps of a scale where there are many.
-
-    Parameters
-    ----------
-    count : int
-        How many.
-
-    Returns
-    -------
-    list of str
-        Of Matplotlib.
-    """
+    """Give colours that can be told apart: named ones, or steps of a scale where there are many."""
     if count <= len(_COLORS):
         return list(_COLORS[:count])
     scale = mpl.colormaps["viridis"]

@@ -50,20 +50,7 @@ _AXES = {
 
 
 def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) -> str:
-    """Make the page of a study, and write its figures.
-
-    Parameters
-    ----------
-    study : mapping
-        What ``benchmark.json`` holds.
-    folder : Path, optional
-        Where each figure goes as PNG and SVG.
-
-    Returns
-    -------
-    str
-        HTML that needs no other file.
-    """
+    """Make the page of a study, and write its figures."""
     drawn = publish(benchmark_figures(study), folder)
     sections = [_summary(study)]
     sections += [_mode_section(study, mode, drawn) for mode in MODES if mode in study]
@@ -241,20 +228,7 @@ def _coverage_row(entry: Mapping[str, Any], name: str) -> list[Any]:
 
 
 def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw the figures.
-
-    Parameters
-    ----------
-    study : mapping
-        What ``benchmark.json`` holds.
-
-    Yields
-    ------
-    name : str
-        ``photons_MODE``, ``heights_MODE`` (spread, CRB and QCRB), ``pulls_MODE``, ``ranks_MODE``.
-    figure : Figure
-        One panel for each free parameter.
-    """
+    """Draw the figures."""
     for mode in MODES:
         if mode not in study:
             continue

@@ -18,20 +18,7 @@ _DEVIANCE = 3.84  # of the ends of a 95 % interval
 
 
 def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw fractions of complexes with their intervals, the equilibrium and the profile.
-
-    Parameters
-    ----------
-    found : mapping
-        The document ``kd``.
-
-    Yields
-    ------
-    name : str
-        ``kd``.
-    figure : Figure
-        Two panels.
-    """
+    """Draw fractions of complexes with their intervals, the equilibrium and the profile."""
     figure = new_figure(9.6, 3.6)
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     rows = found["samples"]

@@ -38,37 +38,7 @@ def write_bounds(
     design: PupilOptimum | None = None,
     overwrite: bool = False,
 ) -> Path:
-    """Write the bounds of one experiment, and of a scan through it.
-
-    Parameters
-    ----------
-    report : mapping
-        What ``bounds.json`` holds.  Where height and mass are both free, the figure ``tradeoff``
-        shows what one measurement can reach for the two.
-    folder : Path
-        Where to write.
-    table : pandas.DataFrame, optional
-        The scan: its axis first, then ``crb_single_*``, ``crb_joint_*``, ``qcrb_*`` and
-        ``information_*`` for each parameter.
-    label : str
-        Name of the axis.
-    here : float
-        Where the experiment stands on it.
-    design : PupilOptimum, optional
-        The best pupil, for ``optics.toml`` and the figure ``pupil``.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    DataError
-        The folder may not or cannot be written.
-    """
+    """Write the bounds of one experiment, and of a scan through it."""
     with atomic_folder(folder, overwrite, known=BOUNDS_FILES) as building:
         (building / "bounds.json").write_text(to_json("bounds", report) + "\n", encoding="utf-8")
         if table is not None:
@@ -85,18 +55,7 @@ def write_bounds(
 
 
 def design_toml(design: PupilOptimum) -> str:
-    """Write the experiment with the best pupil.
-
-    Parameters
-    ----------
-    design : PupilOptimum
-        From `optimize_pupil`.
-
-    Returns
-    -------
-    str
-        TOML that ``--config`` takes, with the same bounds; ``optics.file`` takes its ``[optics]``.
-    """
+    """Write the experiment with the best pupil."""
     config = design.config
     maps = ("gain_e_per_adu", "offset_adu")
     camera = {
@@ -117,18 +76,7 @@ def design_toml(design: PupilOptimum) -> str:
 
 
 def pupil_figure(design: PupilOptimum) -> Figure:
-    """Draw what the best pupil gives, and how a particle looks through it.
-
-    Parameters
-    ----------
-    design : PupilOptimum
-        From `optimize_pupil`.
-
-    Returns
-    -------
-    Figure
-        σ over each parameter's own quantum bound, and the contrast with the best pupil.
-    """
+    """Draw what the best pupil gives, and how a particle looks through it."""
     figure = new_figure(8.4, 3.6)
     left, right = figure.subplots(1, 2, width_ratios=[1.3, 1])
     at = np.arange(len(design.chosen))
@@ -163,18 +111,7 @@ def pupil_figure(design: PupilOptimum) -> Figure:
 
 
 def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
-    """Draw how well one measurement can tell height and mass, and how well this microscope does.
-
-    Parameters
-    ----------
-    report : mapping
-        From `iscat_analysis.bounds.bounds_report`.
-
-    Returns
-    -------
-    Figure
-        The quantum bounds of each, the edge of what can be reached for both, and this microscope.
-    """
+    """Draw how well one measurement can tell height and mass, and how well this microscope does."""
     information = np.asarray(report["qfi"]) + 1j * np.asarray(report["qfi_imaginary"])
     edge = tradeoff(information[2:, 2:])
     actual, both = report["actual"], report["holevo"]
@@ -203,27 +140,7 @@ def tradeoff_figure(report: Mapping[str, Any]) -> Figure:
 def write_optics_bounds(
     report: Mapping[str, Any], folder: Path, *, overwrite: bool = False
 ) -> Path:
-    """Write how well particles would tell the microscope.
-
-    Parameters
-    ----------
-    report : mapping
-        What ``optics_bounds.json`` holds.
-    folder : Path
-        Where to write.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    DataError
-        The folder may not or cannot be written.
-    """
+    """Write how well particles would tell the microscope."""
     with atomic_folder(folder, overwrite, known=OPTICS_BOUNDS_FILES) as building:
         (building / "optics_bounds.json").write_text(
             to_json("optics_bounds", report) + "\n", encoding="utf-8"
@@ -235,20 +152,7 @@ def write_optics_bounds(
 
 
 def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
-    """Draw how many particles of which mass the precisions take.
-
-    Parameters
-    ----------
-    report : mapping
-        As in `write_optics_bounds`.
-
-    Yields
-    ------
-    name : str
-        ``needed``.
-    figure : Figure
-        Events against mass, both logarithmic.
-    """
+    """Draw how many particles of which mass the precisions take."""
     figure = new_figure(6.4, 4.2)
     axes = figure.subplots()
     needed, goals = pd.DataFrame(report["needed"]), report["goals"]
@@ -274,24 +178,7 @@ def needed_figures(report: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
 
 
 def scan_figures(table: pd.DataFrame, label: str, here: float) -> Iterator[tuple[str, Figure]]:
-    """Draw bounds and used information along a scan.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        As in `write_bounds`.
-    label : str
-        Name of the axis.
-    here : float
-        Operating point; drawn where it lies inside the scan.
-
-    Yields
-    ------
-    name : str
-        ``scan``.
-    figure : Figure
-        Two rows: bounds, and the share of the light's information.
-    """
+    """Draw bounds and used information along a scan."""
     figure = new_figure(11, 5.4)
     grid = figure.subplots(2, 4, sharex=True, height_ratios=[1.7, 1])
     x = table.iloc[:, 0].to_numpy(float)

@@ -27,22 +27,7 @@ _SOURCES = {
 
 
 def camera_page(title: str, found: Mapping[str, Any], toml: str) -> str:
-    """Make the page of a camera calibration.
-
-    Parameters
-    ----------
-    title : str
-        The recordings.
-    found : mapping
-        What ``camera.json`` holds.
-    toml : str
-        The section to paste.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the page of a camera calibration."""
     sections: list[dict[str, Any]] = [
         {
             "id": "camera",
@@ -64,22 +49,7 @@ def camera_page(title: str, found: Mapping[str, Any], toml: str) -> str:
 
 
 def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
-    """Make the page of a mass calibration.
-
-    Parameters
-    ----------
-    title : str
-        The events.
-    found : mapping
-        What ``calibration.json`` holds.
-    toml : str
-        The section to paste.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the page of a mass calibration."""
     standards = found["standards"]
     sections: list[dict[str, Any]] = [
         {

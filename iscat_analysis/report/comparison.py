@@ -23,22 +23,7 @@ _LONGEST = 24  # letters of a name
 def comparison_figure(
     found: Mapping[str, Any], histograms: Sequence[Mapping[str, Any]]
 ) -> Iterator[tuple[str, Figure]]:
-    """Draw mass distributions over each other, shifts and differences of fractions.
-
-    Parameters
-    ----------
-    found : mapping
-        The document ``species_comparison``.
-    histograms : sequence of mapping
-        Of some samples, the first one first: source, edges [kDa] and share of events.
-
-    Yields
-    ------
-    name : str
-        ``comparison``.
-    figure : Figure
-        Three panels.
-    """
+    """Draw mass distributions over each other, shifts and differences of fractions."""
     pairs = found["comparisons"]
     figure = new_figure(11.5, max(3.4, 1.6 + 0.3 * min(len(pairs), _NAMED)))
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.8, 1, 1))

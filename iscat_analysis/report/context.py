@@ -49,20 +49,7 @@ _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
 
 def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
-    """Gather everything that ``report.html`` shows beside figures.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    dict
-        The template's context.
-    """
+    """Gather everything that ``report.html`` shows beside figures."""
     source = analysis.provenance.input_path
     tracked = analysis.tracks is not None  # then `tracks_context` says what is said of events
     images = {} if tracked else event_details(analysis, table)
@@ -180,20 +167,7 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
 
 
 def event_rows(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
-    """Write the table of events, one column of one kind with the same decimals throughout.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    dict
-        ``columns``: the headings; ``body``: the rows as HTML.
-    """
+    """Write the table of events, one column of one kind with the same decimals throughout."""
     free = FREE_PARAMETERS[analysis.mode]
     columns = [("x_px", "x [px]"), ("y_px", "y [px]"), ("contrast", "contrast [10⁻³]")]
     for name in ("z_nm", "mass_kda"):
@@ -268,18 +242,7 @@ def _statuses(table: pd.DataFrame) -> list[list[str]]:
 
 
 def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say what windows, drift and added particles came to.
-
-    Parameters
-    ----------
-    summary : mapping
-        What ``summary.json`` holds.
-
-    Yields
-    ------
-    str
-        One sentence or two.
-    """
+    """Say what windows, drift and added particles came to."""
     landing, injection = summary.get("landing"), summary.get("injection")
     for name, lines in (("row", "rows"), ("column", "columns")):
         share = summary.get("lines", {}).get(f"{name}_share")

@@ -31,19 +31,7 @@ _COLUMNS = (
 
 
 def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Lay out a distribution as one section of a page.
-
-    Parameters
-    ----------
-    found : mapping
-        What ``summary.json`` holds under ``distribution``.
-
-    Returns
-    -------
-    dict or None
-        What ``report.html`` shows: id, title, lead, caption, tables, notes; None where there are no
-        species to show.
-    """
+    """Lay out a distribution as one section of a page."""
     species = found["species"]
     if not species:
         return None
@@ -123,18 +111,7 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
 
 
 def species_figure(found: Mapping[str, Any]) -> Figure | None:
-    """Draw masses, species and the efficiency of their detection.
-
-    Parameters
-    ----------
-    found : mapping
-        What ``summary.json`` holds under ``distribution``.
-
-    Returns
-    -------
-    Figure or None
-        One panel, or two where particles were missed; None where there are no species.
-    """
+    """Draw masses, species and the efficiency of their detection."""
     if not found["species"]:
         return None
     bars, curves = found["histogram"], found["curves"]

@@ -33,20 +33,7 @@ _MOST_SHARED = 256  # figures that two processes take from each other: a number 
 
 
 class Drawing:
-    """The figures and the page of an analysis, begun before its species are known.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found, perhaps without species.
-    folder : Path
-        An existing folder.
-    most : int
-        Events whose images are drawn, at most.
-    together : bool
-        On Linux a copy of this process draws as well, and begins at once.  Only for a process whose
-        threads do nothing that a copy would lack.
-    """
+    """The figures and the page of an analysis, begun before its species are known."""
 
     def __init__(self, analysis: Analysis, folder: Path, most: int, *, together: bool) -> None:
         self._folder = folder
@@ -62,23 +49,7 @@ class Drawing:
             self._others = aside(lambda: publish(drawn(left), folder))
 
     def page(self, analysis: Analysis) -> str:
-        """Draw what is left, and make the page.
-
-        Parameters
-        ----------
-        analysis : Analysis
-            The same, with all that was found.
-
-        Returns
-        -------
-        str
-            The page.
-
-        Raises
-        ------
-        Exception
-            As the copy raises it where it cannot draw what it has taken.
-        """
+        """Draw what is left, and make the page."""
         folder = self._folder
         shown = list(page_sketches(analysis, self._table))
         late = [sketch for sketch in shown if sketch[0] not in self._names]
@@ -117,28 +88,11 @@ class Desk:
         self._begun: tuple[Drawing, Analysis] | None = None
 
     def begin(self, analysis: Analysis, folder: Path, most: int) -> None:
-        """Begin to draw.
-
-        Parameters
-        ----------
-        analysis, folder, most
-            As for `Drawing`.
-        """
+        """Begin to draw."""
         self._begun = Drawing(analysis, folder, most, together=processors() > 1), analysis
 
     def page(self, summary: Mapping[str, Any]) -> str:
-        """Draw what is left.
-
-        Parameters
-        ----------
-        summary : mapping
-            Of the whole analysis.
-
-        Returns
-        -------
-        str
-            The page.
-        """
+        """Draw what is left."""
         if self._begun is None:
             raise RuntimeError("nothing was begun")
         drawing, analysis = self._begun

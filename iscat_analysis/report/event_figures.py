@@ -51,17 +51,7 @@ HALO = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
 
 
 class EventDetail(NamedTuple):
-    """What the page shows of one event when its row is opened; empty where there is none.
-
-    Attributes
-    ----------
-    images, scales : str
-        Data, model and residual side by side as a PNG in base64, and the ranges of their scales.
-    trace, words : str
-        Contrast against frame as an SVG element, and what it shows.
-    clip, sliding : str
-        Ratiometric images one after the other as an element, and what it shows.
-    """
+    """What the page shows of one event when its row is opened; empty where there is none."""
 
     images: str
     scales: str
@@ -72,21 +62,7 @@ class EventDetail(NamedTuple):
 
 
 def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
-    """Name the images of the first events, and what draws them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    most : int
-        How many, at most.
-
-    Yields
-    ------
-    Sketch
-        ``event_NNNN``; for a track, which has one view of each of its frames, with a number: data,
-        model and residual.
-    """
+    """Name the images of the first events, and what draws them."""
     seen: dict[int, int] = {}
     for view in analysis.views[:most]:
         seen[view.event] = nth = seen.get(view.event, 0) + 1
@@ -95,18 +71,7 @@ def event_figures(analysis: Analysis, most: int) -> Iterator[Sketch]:
 
 
 def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
-    """Name the first converged posteriors, and what draws them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Yields
-    ------
-    Sketch
-        ``corner_NNNN``, a corner plot.
-    """
+    """Name the first converged posteriors, and what draws them."""
     sampled = [
         (view.event, view.posterior)
         for view in analysis.views
@@ -117,20 +82,7 @@ def corner_figures(analysis: Analysis) -> Iterator[Sketch]:
 
 
 def event_details(analysis: Analysis, table: pd.DataFrame) -> dict[int, EventDetail]:
-    """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    dict of int to EventDetail
-        By row of the table.
-    """
+    """Pack what the page shows of the first events, as many as `DETAIL_BYTES` hold."""
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     packed: dict[int, EventDetail] = {}
     spent = 0
@@ -169,20 +121,7 @@ def _strip(view: EventView, low: float, high: float, limit: float) -> str:
 
 
 def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple[int, EventView]]:
-    """Pair each view with its row: by position where the numbers agree, else by number.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    views : sequence of EventView
-        In any order; one whose event is not in the table is left out.
-
-    Returns
-    -------
-    list of (int, EventView)
-        Row and view.
-    """
+    """Pair each view with its row: by position where the numbers agree, else by number."""
     numbers = table["event"].tolist()
     if [view.event for view in views] == numbers:
         return list(enumerate(views))
@@ -193,18 +132,7 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
 
 
 def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
-    """Say of each cell of a histogram which of the `CREDIBLE_LEVELS` contain it.
-
-    Parameters
-    ----------
-    counts : ndarray, any shape
-        Samples in each cell.
-
-    Returns
-    -------
-    ndarray of int, same shape
-        0 outside all regions of highest density, `len(CREDIBLE_LEVELS)` in the innermost.
-    """
+    """Say of each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
     flat = counts.ravel()
     order = np.argsort(-flat, kind="stable")
     before = np.cumsum(flat[order]) - flat[order]
@@ -216,17 +144,7 @@ def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
 
 
 def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None:
-    """Draw a scale bar into the lower left corner of an image.
-
-    Parameters
-    ----------
-    axes : Axes
-        Where the image is shown, in pixels.
-    columns, rows : int
-        Its shape.
-    pixel_size_nm : float
-        In the sample plane [nm].
-    """
+    """Draw a scale bar into the lower left corner of an image."""
     bars = [50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000]
     length_nm = max([b for b in bars if b <= 0.4 * columns * pixel_size_nm], default=bars[0])
     x, y = 0.04 * columns - 0.5, 0.955 * rows - 0.5
@@ -246,22 +164,7 @@ def scale_bar(axes: Axes, columns: int, rows: int, pixel_size_nm: float) -> None
 
 
 def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw data, model and residual of one event, and its contrast against frame.
-
-    Parameters
-    ----------
-    view : EventView
-        Its images.
-    scheme : str
-        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
-    pixel_size_nm : float
-        Side of a pixel [nm].
-
-    Returns
-    -------
-    Figure
-        Three panels, and below them a fourth of an event with a trace.
-    """
+    """Draw data, model and residual of one event, and its contrast against frame."""
     rows, columns = view.contrast.shape
     aspect = float(np.clip(rows / columns, 0.3, 3.0))
     below = 0.0 if view.trace is None else _TRACE_INCHES
@@ -297,20 +200,7 @@ def triptych(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
 
 
 def corner(posterior: PosteriorResult, event: int) -> Figure:
-    """Draw a posterior: each parameter, and each pair.
-
-    Parameters
-    ----------
-    posterior : PosteriorResult
-        A chain that converged.
-    event : int
-        Number of the event.
-
-    Returns
-    -------
-    Figure
-        Its shades hold 25, 50, 75 and 95 % of the samples.
-    """
+    """Draw a posterior: each parameter, and each pair."""
     flat = posterior.samples.reshape(-1, len(posterior.names))
     n = len(posterior.names)
     figure = new_figure(1.9 * n + 0.6, 1.9 * n + 0.6, constrained=False)

@@ -26,17 +26,7 @@ SUFFIXES = {"trackpy": ".csv", "napari": ".npy", "photomol": ".csv", "picasso": 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written for another program.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    text : str
-        What is in it, as "3 tracks".
-    notes : tuple of str
-        What is not in it, one sentence each.
-    """
+    """What was written for another program."""
 
     path: Path
     text: str
@@ -172,36 +162,7 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
 def export_result(
     folder: Path, layout: Layout, *, out: Path | None = None, overwrite: bool = False
 ) -> Exported:
-    """Write the events or tracks of an output folder as another program reads them.
-
-    Parameters
-    ----------
-    folder : Path
-        Output of ``iscat fit``.
-    layout : str
-        ``"trackpy"``: a CSV table, of events without ``particle``; ``"napari"``: an array in
-        NumPy's format, (track, t, y, x) for a layer of tracks or (t, y, x) for one of points;
-        ``"photomol"``: a CSV table like Refeyn's, of events; ``"picasso"``: HDF5 with ``locs``, and
-        its metadata in a file ``.yaml`` beside it.
-    out : Path, optional
-        The file; default the folder's name with ``.trackpy.csv``, ``.napari.npy``,
-        ``.photomol.csv`` or ``.picasso.hdf5``.
-    overwrite : bool
-        Replace an existing file.
-
-    Returns
-    -------
-    Exported
-        Where, and what.
-
-    Raises
-    ------
-    ConfigError
-        There is no such layout.
-    DataError
-        The folder holds nothing that the layout could show, or the file exists or cannot be
-        written.
-    """
+    """Write the events or tracks of an output folder as another program reads them."""
     if layout not in get_args(Layout):
         raise ConfigError(f"layout = {layout!r}: choose one of {', '.join(get_args(Layout))}")
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out

@@ -18,22 +18,7 @@ _TITLE_IN = 0.25
 
 
 def field_axes(shape: tuple[int, int]) -> tuple[Figure, Axes, tuple[float, float]]:
-    """Make a figure for a field of view.
-
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-
-    Returns
-    -------
-    Figure
-        As tall as the field asks for.
-    Axes
-        With a title where pixels are stretched.
-    (float, float)
-        Pixels to an inch along x and y, whose ratio `Axes.imshow` takes as ``aspect``.
-    """
+    """Make a figure for a field of view."""
     true = shape[0] / shape[1]
     drawn = float(np.clip(true, 1 / MOST_ELONGATED, MOST_ELONGATED))
     stretched = drawn / true

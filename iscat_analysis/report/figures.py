@@ -42,23 +42,7 @@ _NAMES = {"mass_kda": "mass", "z_nm": "height", "n_scattered": "photon"}
 
 
 def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
-    """Name the figures of the report page, and what draws them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Yields
-    ------
-    Sketch
-        Those of `track_figures` where there are tracks, else ``overview`` (the field with its
-        events), a histogram, ``timeline``, ``precision`` (σ
-        against the bounds), ``spread`` (what was measured of it), ``diagnostics`` and ``power``;
-        what has no data is left out.
-    """
+    """Name the figures of the report page, and what draws them."""
     main = main_quantity(analysis).column
     fitted = np.isfinite(counted(table)[main].to_numpy(float)).any()
     if analysis.tracks is not None:
@@ -97,20 +81,7 @@ def _points(
 
 
 def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw the field of view with its events numbered.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    Figure
-        One panel.
-    """
+    """Draw the field of view with its events numbered."""
     image = np.asarray(analysis.ratio_image, float)
     rows, columns = image.shape
     figure, axes, per_inch = field_axes((rows, columns))
@@ -166,18 +137,7 @@ def _number(
 
 
 def power(analysis: Analysis) -> Figure:
-    """Draw the laser power of each frame used.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Returns
-    -------
-    Figure
-        One panel.
-    """
+    """Draw the laser power of each frame used."""
     figure = new_figure(7.0, 2.3)
     axes = figure.add_subplot()
     axes.axhline(1.0, color=GREY, lw=0.8, ls="--")
@@ -197,20 +157,7 @@ def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, F
 
 
 def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw the histogram of what the analysis is about: mass, contrast or height.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    Figure
-        Rows that are ok and those that are flagged, stacked.
-    """
+    """Draw the histogram of what the analysis is about: mass, contrast or height."""
     table = counted(table)
     values, sigma, label = _main_values(analysis, table)
     finite, good = np.isfinite(values), _is_ok(table)
@@ -229,20 +176,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw what the analysis is about against the frame.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    Figure
-        One point for each row.
-    """
+    """Draw what the analysis is about against the frame."""
     values, _, label = _main_values(analysis, table)
     figure = new_figure(6.2, 2.8)
     axes = figure.add_subplot()
@@ -261,20 +195,7 @@ def _is_ok(table: pd.DataFrame) -> BoolArray:
 
 
 def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw each event's σ and QCRB against its CRB, for every free parameter.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    Figure
-        One panel for each free parameter.
-    """
+    """Draw each event's σ and QCRB against its CRB, for every free parameter."""
     free = free_parameters(analysis.mode, table)
     figure = new_figure(3.0 * len(free), 3.4)
     good = _is_ok(table)
@@ -313,20 +234,7 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
-    """Draw what tells whether model and noise describe the movie.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Returns
-    -------
-    Figure or None
-        Reduced χ², p-values, and the noise against averaging; None where all are missing.
-    """
+    """Draw what tells whether model and noise describe the movie."""
     columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
     chi2, p_value = (values[np.isfinite(values)] for values in columns)
     noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}

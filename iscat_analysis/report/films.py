@@ -41,21 +41,7 @@ _CLIP_SHADES = 24  # of a clip, of which a page holds hundreds
 
 @dataclass(frozen=True)
 class FilmShown:
-    """One film as the page shows it.
-
-    Attributes
-    ----------
-    track : int
-        Its number.
-    why : str
-        Why it is shown.
-    scales : str
-        Ranges of the scales, in words.
-    film, still : str
-        Animated WebP, and its first picture as PNG, in base64.
-    width, height : int
-        Size of a frame [px].
-    """
+    """One film as the page shows it."""
 
     track: int
     why: str
@@ -67,20 +53,7 @@ class FilmShown:
 
 
 def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[FilmShown]:
-    """Make the films of the page, as many as `FILM_BYTES` hold.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With films.
-    folder : Path, optional
-        Where each goes as a file, ``track_NNNN.webp``; nothing is written without it.
-
-    Yields
-    ------
-    FilmShown
-        The best first.
-    """
+    """Make the films of the page, as many as `FILM_BYTES` hold."""
     spent = 0
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
     for film in analysis.films:
@@ -107,24 +80,7 @@ def films_shown(analysis: Analysis, folder: Path | None = None) -> Iterator[Film
 
 
 def clip_shown(clip: Clip, low: float, high: float, still: int) -> tuple[Markup, str]:
-    """Make the film of a clip: its images below each other, of which a page shows one at a time.
-
-    Parameters
-    ----------
-    clip : Clip
-        Of one event.
-    low, high : float
-        Ends of the grey scale.
-    still : int
-        Frame whose image is shown to those who want no motion.
-
-    Returns
-    -------
-    film : Markup
-        An element; ``style.css`` moves its image.
-    words : str
-        What it shows.
-    """
+    """Make the film of a clip: its images below each other, of which a page shows one at a time."""
     number, rows, columns = clip.contrast.shape
     grey = shaded((clip.contrast - low) / (high - low), _CLIP_SHADES).reshape(-1, columns)
     image = png_of(grey, GREYS(np.linspace(0, 1, _CLIP_SHADES)))

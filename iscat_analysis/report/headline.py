@@ -33,15 +33,7 @@ NOT_A_MASS = (
 
 @dataclass(frozen=True)
 class Quantity:
-    """The column that an analysis is about.
-
-    Attributes
-    ----------
-    column : str
-        Of the table.
-    label, unit : str
-        What it is called in print; the unit may be empty.
-    """
+    """The column that an analysis is about."""
 
     column: str
     label: str
@@ -50,32 +42,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Precision:
-    """What the likelihood promises for one parameter beside its bounds, over the rows that are ok.
-
-    Attributes
-    ----------
-    name : str
-        As in `PARAMETERS`.
-    events : int
-        Rows with a usable σ and CRB.
-    sigma, crb, qcrb : float
-        Medians [nm or kDa]; NaN where there is none.
-    holevo : float
-        The same of the Holevo bound, where height and mass are both free; NaN elsewhere.
-    over_crb : float
-        Median of σ/CRB.
-    information : float
-        Median of (QCRB/CRB)², or of (Holevo/CRB)² where there is that: the share that the
-        measurement uses of what can be had of the light's information.
-    systematic : float
-        Median of the error that all events share [nm or kDa]; NaN where it is not known.
-    measured : float
-        Measured spread over the CRB; NaN where it was not measured.
-    measured_ci95 : (float, float)
-        Its 95 % interval.
-    whole : bool
-        Whether it holds at the full length of the windows.
-    """
+    """The likelihood's σ of one parameter beside its bounds, over the rows that are ok."""
 
     name: str
     events: int
@@ -109,36 +76,13 @@ class Precision:
 
 
 def is_uncalibrated(analysis: Analysis) -> bool:
-    """Tell whether masses were fitted on the model's own scale.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Returns
-    -------
-    bool
-        False also where the mass was not fitted.
-    """
+    """Tell whether masses were fitted on the model's own scale."""
     fitted = "mass_kda" in FREE_PARAMETERS[analysis.mode]
     return fitted and analysis.summary.get("mass_scale") != "calibration"
 
 
 def main_quantity(analysis: Analysis) -> Quantity:
-    """Choose what the headline is about.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Returns
-    -------
-    Quantity
-        The mass where it is calibrated; otherwise the contrast, or in dark field, which has none,
-        the number of scattered photons; the height where the mass was not fitted.
-    """
+    """Choose what the headline is about."""
     if "mass_kda" not in FREE_PARAMETERS[analysis.mode]:
         return Quantity("z_nm", "height", "nm")
     if not is_uncalibrated(analysis):
@@ -149,19 +93,7 @@ def main_quantity(analysis: Analysis) -> Quantity:
 
 
 def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
-    """Put contrasts where the masses are: right for a scale that is proportional to the mass.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`; without calibration the model's contrast is proportional to the
-        mass.
-
-    Returns
-    -------
-    pandas.DataFrame
-        A copy in which ``mass_kda``, its σ, its bounds and its common error are contrasts.
-    """
+    """Put contrasts where the masses are: right for a scale that is proportional to the mass."""
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
     columns = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
@@ -171,37 +103,12 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def label_of(analysis: Analysis, name: str) -> str:
-    """Say what a parameter is called in tables and figures.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    name : str
-        As in `PARAMETERS`.
-
-    Returns
-    -------
-    str
-        ``"mass, model scale"`` where the mass is not calibrated.
-    """
+    """Say what a parameter is called in tables and figures."""
     return "mass, model scale" if name == "mass_kda" and is_uncalibrated(analysis) else LABELS[name]
 
 
 def caution(table: pd.DataFrame) -> str | None:
-    """Say that too many rows are flagged for a headline.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        With a column ``status``.
-
-    Returns
-    -------
-    str or None
-        One sentence with the commonest reason and its remedy; None where `MOST_FLAGGED` or fewer
-        are flagged.
-    """
+    """Say that too many rows are flagged for a headline."""
     table = counted(table)
     flagged = table["status"][table["status"] != Status.OK.value]
     if len(flagged) <= MOST_FLAGGED * len(table):
@@ -216,22 +123,7 @@ def caution(table: pd.DataFrame) -> str | None:
 
 
 def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precision:
-    """Set σ of one parameter beside its bounds.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Its summary knows the Holevo bound.
-    table : pandas.DataFrame
-        Columns `EVENT_COLUMNS`.
-    name : str
-        As in `PARAMETERS`.
-
-    Returns
-    -------
-    Precision
-        Over the rows whose status is ok; NaN where nothing is known.
-    """
+    """Set σ of one parameter beside its bounds."""
     good = table[table["status"] == Status.OK.value]
     sigma, crb, qcrb = (good[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb"))
     usable = np.isfinite(sigma) & np.isfinite(crb) & (crb > 0)
@@ -268,18 +160,7 @@ def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
 
 
 def quantiles(values: FloatArray) -> tuple[float, float, float]:
-    """Give the quartiles of what is finite.
-
-    Parameters
-    ----------
-    values : ndarray
-        Any shape.
-
-    Returns
-    -------
-    tuple of three floats
-        25, 50 and 75 %; NaN where nothing is finite.
-    """
+    """Give the quartiles of what is finite."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return math.nan, math.nan, math.nan
@@ -290,17 +171,7 @@ def quantiles(values: FloatArray) -> tuple[float, float, float]:
 def sizes(analysis: Analysis, table: pd.DataFrame) -> FloatArray:
     """Give the magnitudes of the main quantity over the rows that are ok.
 
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        Its table.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        Finite; particles that leave count by their magnitude.
+    Shapes: result (n,).
     """
     good = table["status"] == Status.OK.value
     values = np.abs(table[main_quantity(analysis).column][good].to_numpy(float))
@@ -308,20 +179,7 @@ def sizes(analysis: Analysis, table: pd.DataFrame) -> FloatArray:
 
 
 def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Say in two or three sentences what was found.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        Its table.
-
-    Returns
-    -------
-    list of str
-        A warning first where one is due.
-    """
+    """Say in two or three sentences what was found."""
     table = counted(table)
     if table.empty:
         return [
@@ -379,20 +237,7 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
 
 
 def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Say what spread was measured, and where the model is rejected.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        Its table.
-
-    Returns
-    -------
-    list of str
-        One or two sentences; empty where nothing was measured.
-    """
+    """Say what spread was measured, and where the model is rejected."""
     free = FREE_PARAMETERS[analysis.mode]
     rejected = rejection(table)
     said = analysis.summary.get("repeats", {}).get("message", "")
@@ -422,22 +267,7 @@ def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
 
 
 def precision_rows(analysis: Analysis, precision: Sequence[Precision]) -> list[list[str]]:
-    """Write the table of precisions.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    precision : sequence of Precision
-        One of each free parameter.
-
-    Returns
-    -------
-    list of list of str
-        Parameter, σ, the error common to all events, CRB, Holevo, QCRB, σ over CRB, measured spread
-        over CRB, light used, rows; without the common error, Holevo and the measured spread where
-        no parameter has them.
-    """
+    """Write the table of precisions."""
     common = any(math.isfinite(p.systematic) for p in precision)
     holevo = any(math.isfinite(p.holevo) for p in precision)
     measured = any(p.is_measured for p in precision)

@@ -13,20 +13,7 @@ UNITS = {"x_nm": "nm", "y_nm": "nm", "z_nm": "nm", "mass_kda": "kDa"}
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """Write a number for people.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-    digits : int
-        Significant digits.
-
-    Returns
-    -------
-    str
-        Plain notation with a true minus sign; a dash for NaN and None.
-    """
+    """Write a number for people."""
     if value is None or not math.isfinite(value):
         return "—"
     if value != 0 and not 1e-3 <= abs(value) < 1e6:
@@ -38,55 +25,18 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def decimals_for(errors: Iterable[float | None], digits: int = 2) -> int:
-    """Give the decimals with which a column of numbers lines up.
-
-    Parameters
-    ----------
-    errors : iterable of float or None
-        Errors of the numbers, or the numbers; what is zero or missing does not count.
-    digits : int
-        Digits of the smallest that are shown.
-
-    Returns
-    -------
-    int
-        0 to 8; 2 where there is nothing to go by.
-    """
+    """Give the decimals with which a column of numbers lines up."""
     known = [abs(e) for e in errors if e is not None and math.isfinite(e) and e != 0]
     return min(8, max(0, digits - 1 - math.floor(math.log10(min(known))))) if known else 2
 
 
 def fixed(value: float | None, decimals: int) -> str:
-    """Write a number with so many decimals.
-
-    Parameters
-    ----------
-    value : float or None
-        The number.
-    decimals : int
-        From `decimals_for`.
-
-    Returns
-    -------
-    str
-        With a true minus sign; a dash for NaN and None.
-    """
+    """Write a number with so many decimals."""
     if value is None or not math.isfinite(value):
         return "—"
     return f"{value:z.{decimals}f}".replace("-", "−")
 
 
 def percent(value: float) -> str:
-    """Write a share as a percentage with two digits; a dash for NaN.
-
-    Parameters
-    ----------
-    value : float
-        The share.
-
-    Returns
-    -------
-    str
-        With its sign.
-    """
+    """Write a share as a percentage with two digits; a dash for NaN."""
     return "—" if not math.isfinite(value) else f"{number(100 * value, 2)} %"

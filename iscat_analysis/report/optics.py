@@ -43,22 +43,7 @@ _STATES = {
 
 
 def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
-    """Make the page of a calibration of the optics.
-
-    Parameters
-    ----------
-    title : str
-        The movie.
-    found : mapping
-        What ``optics.json`` holds.
-    toml : str
-        ``optics.toml``.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the page of a calibration of the optics."""
     drawn = publish(_figures(found))
     judged, before = found["held_out"], found["held_out_as_configured"]
     verdict = (
@@ -217,18 +202,7 @@ def _pupil(pictures: Mapping[str, Any]) -> Figure:
 
 
 def draw_p_values(p_values: list[float]) -> Figure:
-    """Draw the histogram of p-values.
-
-    Parameters
-    ----------
-    p_values : list of float
-        Of pictures that were not fitted.
-
-    Returns
-    -------
-    Figure
-        The histogram.
-    """
+    """Draw the histogram of p-values."""
     figure = new_figure(4.6, 3.0)
     ax = figure.subplots()
     ax.hist(p_values, bins=10, range=(0.0, 1.0), color=VERMILLION)

@@ -46,24 +46,7 @@ _LOCK_ATTEMPTS = 100
 def check_output(
     folder: Path, overwrite: bool = False, *, known: Collection[str] = OUTPUT_NAMES
 ) -> None:
-    """Refuse an output folder that must not be written, before any work is done.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the results shall go.
-    overwrite : bool
-        Whether an earlier result there may be replaced.
-    known : collection of str
-        Names that an earlier result consists of.  A folder that holds anything else is never
-        replaced, so that ``--out ~ --overwrite`` does not delete a home folder.
-
-    Raises
-    ------
-    DataError
-        The folder is a file, holds an earlier result and `overwrite` is false, or holds something
-        else.
-    """
+    """Refuse an output folder that must not be written, before any work is done."""
     target = _resolved(folder)
     try:
         if not target.exists():
@@ -90,26 +73,7 @@ def check_output(
 def claim_output(
     folder: Path, overwrite: bool = False, *, known: Collection[str] = OUTPUT_NAMES
 ) -> Iterator[None]:
-    """Hold an output folder for this process, before any work is done.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the results shall go; its parents are made.
-    overwrite : bool
-        Whether an earlier result there may be replaced.
-    known : collection of str
-        As in `check_output`.
-
-    Yields
-    ------
-    None
-
-    Raises
-    ------
-    DataError
-        As in `check_output`, or another run is about to write there, or the disk refuses.
-    """
+    """Hold an output folder for this process, before any work is done."""
     check_output(folder, overwrite, known=known)
     target = _resolved(folder)
     try:
@@ -139,27 +103,7 @@ def claim_output(
 def atomic_folder(
     folder: Path, overwrite: bool = False, *, known: Collection[str] = OUTPUT_NAMES
 ) -> Iterator[Path]:
-    """Fill a temporary sibling, and put it in place only once the block has ended well.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the results shall go; its parents are made.
-    overwrite : bool
-        Whether an earlier result there may be replaced; it stays until the new one is complete.
-    known : collection of str
-        As in `check_output`.
-
-    Yields
-    ------
-    Path
-        The temporary folder to write into.
-
-    Raises
-    ------
-    DataError
-        As in `check_output`, or the disk refuses.
-    """
+    """Fill a temporary sibling, and put it in place only once the block has ended well."""
     with claim_output(folder, overwrite, known=known):
         target = _resolved(folder)
         building = _hidden(_BUILDING, target)

@@ -28,25 +28,6 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
     """Fill one of the templates in ``iscat_analysis/report/templates``.
 
     Everything is escaped; the result needs no network and no other file.
-
-    Parameters
-    ----------
-    template : str
-        ``"document.html"`` for a page of sections (facts, figures, tables, notes, code), whose
-        first lines say what each may hold; ``"report.html"`` for the report of an analysis.
-    context : mapping
-        ``title`` and, for a document, ``sections``.  Optional: ``kicker`` (the name at the left of
-        the bar), ``subtitle``, ``footer``, ``nav`` ((id, label) pairs; by default the sections).
-
-    Returns
-    -------
-    str
-        HTML.
-
-    Raises
-    ------
-    jinja2.UndefinedError
-        The context lacks something that the template needs.
     """
     defaults = {
         "kicker": "iscat-analysis",
@@ -59,13 +40,7 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
 
 @cache
 def templates() -> jinja2.Environment:
-    """Give the templates, each of which is compiled once in a process.
-
-    Returns
-    -------
-    jinja2.Environment
-        That loads them.
-    """
+    """Give the templates, each of which is compiled once in a process."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("iscat_analysis.report"),
         autoescape=True,
@@ -78,40 +53,14 @@ def templates() -> jinja2.Environment:
 
 
 def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
-    """Make the report page of one analysis, and write its figures.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    folder : Path, optional
-        Where each figure goes as PNG and SVG; without it they are in the page only.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the report page of one analysis, and write its figures."""
     table = event_table(analysis)
     about = page_context(analysis, table, folder)
     return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
 
 
 def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
-    """Name the figures of the page, and what draws them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-
-    Yields
-    ------
-    Sketch
-        Those of `page_figures`, ``species`` and those of `corner_figures`.
-    """
+    """Name the figures of the page, and what draws them."""
     yield from page_figures(analysis, table)
     if (found := _species(analysis, table)) is not None:
         yield "species", partial(species_figure, found)
@@ -127,22 +76,7 @@ def _species(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any] | None:
 def page_context(
     analysis: Analysis, table: pd.DataFrame, folder: Path | None = None
 ) -> dict[str, Any]:
-    """Gather what the page says.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    table : pandas.DataFrame
-        From `event_table`.
-    folder : Path, optional
-        Where films of tracks go.
-
-    Returns
-    -------
-    dict
-        The template's context, without figures.
-    """
+    """Gather what the page says."""
     found = _species(analysis, table)
     species = distribution_section(found) if found else None
     if species is not None and is_uncalibrated(analysis):
@@ -171,20 +105,7 @@ def page_context(
 
 
 def page_of(about: Mapping[str, Any], figures: Mapping[str, Markup]) -> str:
-    """Put words and figures together.
-
-    Parameters
-    ----------
-    about : mapping
-        From `page_context`.
-    figures : mapping of str to Markup
-        From `publish`.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Put words and figures together."""
     shown = {
         "figures": figures,
         "histogram": next((name for name in figures if name.endswith("_histogram")), None),

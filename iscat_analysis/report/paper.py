@@ -45,36 +45,7 @@ def write_paper(
     field_nm: float,
     overwrite: bool = False,
 ) -> Path:
-    """Write every panel of D21, Table 1 and the page that compares them.
-
-    Parameters
-    ----------
-    curves : pandas.DataFrame
-        Long form: ``panel``, ``scheme``, ``convention``, ``attenuation``, ``quantity``, ``x``,
-        ``value``.
-    images : mapping
-        (scheme, height [nm]) → intensity over the incident.
-    table : pandas.DataFrame
-        Table 1, one row per ``quantity``.
-    quantum : mapping
-        (measure, scheme) → quantum bounds of one photon.
-    folder : Path
-        Where to write.
-    field_nm : float
-        Side of the images [nm].
-    overwrite : bool
-        Whether an earlier result may be replaced.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    DataError
-        The folder may not or cannot be written.
-    """
+    """Write every panel of D21, Table 1 and the page that compares them."""
     with atomic_folder(folder, overwrite, known=PAPER_FILES) as building:
         _images_table(images, field_nm).to_csv(
             building / "fig_2a.csv", index=False, float_format="%.5g", lineterminator="\n"

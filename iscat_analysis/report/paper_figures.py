@@ -26,21 +26,7 @@ SHADES = ("#1B1D21", "#0072B2", "#009E73", "#D55E00", "#B5578C")
 
 @dataclass(frozen=True)
 class Panel:
-    """How one of D21's panels is drawn.
-
-    Attributes
-    ----------
-    title, x_label, y_label : str
-        Words.
-    log : bool
-        Logarithmic y axis.
-    quantities : tuple of str
-        The quantities shown; the CSV has all.
-    bound : int or None
-        Index of the quantum bound drawn dashed.
-    by_attenuation : bool
-        Curves are attenuations of one scheme instead of schemes.
-    """
+    """How one of D21's panels is drawn."""
 
     title: str
     x_label: str
@@ -87,19 +73,7 @@ WAYS = {
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve of a panel.
-
-    Attributes
-    ----------
-    name : str
-        Its legend.
-    x, y : ndarray, shape (n,)
-        Its points.
-    color : str
-        Its colour.
-    joint : bool
-        Whether another parameter is unknown as well.
-    """
+    """One curve of a panel."""
 
     name: str
     x: FloatArray
@@ -110,17 +84,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Limit:
-    """A quantum bound, drawn across a panel.
-
-    Attributes
-    ----------
-    name : str
-        Its legend.
-    value : float
-        Where it lies.
-    color : str
-        Its colour.
-    """
+    """A quantum bound, drawn across a panel."""
 
     name: str
     value: float
@@ -128,22 +92,7 @@ class Limit:
 
 
 def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
-    """Gather the curves of a panel.
-
-    Parameters
-    ----------
-    panel : str
-        A key of `PANELS`.
-    rows : pandas.DataFrame
-        Its curves, as in `write_paper`.
-    convention : str
-        ``"dong2021"`` or ``"exact"``.
-
-    Returns
-    -------
-    list of Curve
-        In the order of the legend.
-    """
+    """Gather the curves of a panel."""
     spec, found = PANELS[panel], []
     rows = rows[(rows["convention"] == convention) & rows["quantity"].isin(spec.quantities)]
     keys = ["attenuation", "quantity"] if spec.by_attenuation else ["scheme", "quantity"]
@@ -172,22 +121,7 @@ def curves_of(panel: str, rows: pd.DataFrame, convention: str) -> list[Curve]:
 def limits_of(
     panel: str, quantum: Mapping[tuple[str, str], FloatArray], convention: str
 ) -> list[Limit]:
-    """Gather the quantum bounds of a panel.
-
-    Parameters
-    ----------
-    panel : str
-        A key of `PANELS`.
-    quantum : mapping
-        As in `write_paper`.
-    convention : str
-        ``"dong2021"`` or ``"exact"``.
-
-    Returns
-    -------
-    list of Limit
-        None where the panel shows none.
-    """
+    """Gather the quantum bounds of a panel."""
     spec = PANELS[panel]
     if spec.bound is None:
         return []
@@ -207,23 +141,7 @@ def limits_of(
 def panel_figure(
     panel: str, rows: pd.DataFrame, quantum: Mapping[tuple[str, str], FloatArray]
 ) -> Figure:
-    """Draw a panel, both conventions over each other, and below it how far they are apart.
-
-    Parameters
-    ----------
-    panel : str
-        A key of `PANELS`.
-    rows : pandas.DataFrame
-        Its curves, as in `write_paper`.
-    quantum : mapping
-        As in `write_paper`.
-
-    Returns
-    -------
-    Figure
-        Solid: exact; dashed: the authors' convention.  The lower panel shows exact over authors'
-        where the axis is logarithmic, and the difference elsewhere.
-    """
+    """Draw a panel, both conventions over each other, and below it how far they are apart."""
     spec = PANELS[panel]
     figure = new_figure(8.2, 4.8)
     top, low = figure.subplots(2, 1, sharex=True, height_ratios=[2.4, 1])
@@ -254,20 +172,7 @@ def panel_figure(
 
 
 def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: float) -> Figure:
-    """Draw figure 2a: one row per scheme, each with its own grey scale.
-
-    Parameters
-    ----------
-    images : mapping
-        As in `write_paper`.
-    field_nm : float
-        Side of the images [nm].
-
-    Returns
-    -------
-    Figure
-        One column per height.
-    """
+    """Draw figure 2a: one row per scheme, each with its own grey scale."""
     schemes = list(dict.fromkeys(scheme for scheme, _ in images))
     heights = list(dict.fromkeys(z for _, z in images))
     figure = new_figure(1.75 * len(heights) + 1.3, 1.75 * len(schemes) + 0.4)
@@ -301,18 +206,7 @@ def images_figure(images: Mapping[tuple[str, float], FloatArray], field_nm: floa
 
 
 def table_figure(table: pd.DataFrame) -> Figure:
-    """Draw Table 1.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        As in `write_paper`.
-
-    Returns
-    -------
-    Figure
-        One line per length, a mark for each way to compute it.
-    """
+    """Draw Table 1."""
     figure = new_figure(7.4, 3.0)
     axes = figure.subplots()
     rows = table[table["unit"] == "nm"]

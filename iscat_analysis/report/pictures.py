@@ -19,27 +19,7 @@ from iscat_analysis.report.tables import event_table
 
 
 def draw(analysis: Analysis, kind: str) -> Figure:
-    """Draw one figure of the whole analysis.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    kind : str
-        ``"overview"``, ``"histogram"``, ``"precision"`` or ``"power"``.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Shows itself in a notebook; `Figure.savefig` writes it.
-
-    Raises
-    ------
-    DataError
-        There is nothing to draw.
-    ValueError
-        No such kind of figure.
-    """
+    """Draw one figure of the whole analysis."""
     table = event_table(analysis)
     main = main_quantity(analysis).column
     kinds: dict[str, Callable[[], Figure]] = {
@@ -59,94 +39,23 @@ def draw(analysis: Analysis, kind: str) -> Figure:
 
 
 def draw_event(analysis: Analysis, event: int) -> Figure:
-    """Draw data, model and residual of one event.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    event : int
-        Its number in the table.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Three panels, and below them a trace where the event has one.
-
-    Raises
-    ------
-    DataError
-        There is no such event.
-    """
+    """Draw data, model and residual of one event."""
     return draw_view(view_of(analysis, event), analysis.scheme, analysis.pixel_size_nm)
 
 
 def draw_view(view: EventView, scheme: str, pixel_size_nm: float) -> Figure:
-    """Draw the images of one event.
-
-    Parameters
-    ----------
-    view : EventView
-        Its images.
-    scheme : str
-        ``"iscat"``, ``"cobri"`` or ``"darkfield"``.
-    pixel_size_nm : float
-        Side of a pixel [nm].
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Data, model and residual.
-    """
+    """Draw the images of one event."""
     return _shown(lambda: event_figures.triptych(view, scheme, pixel_size_nm))
 
 
 def draw_corner(analysis: Analysis, event: int) -> Figure:
-    """Draw the posterior of one event: each parameter, and each pair.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    event : int
-        Its number in the table.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        A corner plot; the shades hold 25, 50, 75 and 95 % of the samples.
-
-    Raises
-    ------
-    DataError
-        There is no such event, it was not sampled, or its chain did not converge.
-    """
+    """Draw the posterior of one event: each parameter, and each pair."""
     posterior = posterior_of(analysis, event)
     return _shown(lambda: event_figures.corner(posterior, event))
 
 
 def view_of(analysis: Analysis, event: int) -> EventView:
-    """Find the images of one event.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    event : int
-        Its number in the table; of a track, its first frame.
-
-    Returns
-    -------
-    EventView
-        Images of shape (y, x), and the chain where sampled.
-
-    Raises
-    ------
-    DataError
-        There is no such event.
-    ConfigError
-        `event` is not a whole number.
-    """
+    """Find the images of one event."""
     if isinstance(event, bool) or not isinstance(event, (int, np.integer)):
         raise ConfigError(f"event = {event!r}: events have whole numbers, as in view(0)")
     for view in analysis.views:
@@ -158,25 +67,7 @@ def view_of(analysis: Analysis, event: int) -> EventView:
 
 
 def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
-    """Find the converged chain of one event.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    event : int
-        Its number in the table.
-
-    Returns
-    -------
-    PosteriorResult
-        Samples of shape (chain, draw, parameter).
-
-    Raises
-    ------
-    DataError
-        There is no such event, it was not sampled, or its chain did not converge.
-    """
+    """Find the converged chain of one event."""
     posterior = view_of(analysis, event).posterior
     if posterior is None:
         status = analysis.table.loc[analysis.table["event"] == event, "status"].iloc[0]

@@ -19,22 +19,7 @@ if TYPE_CHECKING:
 
 
 def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str, xarray.Dataset]:
-    """Arrange posteriors as ArviZ does, with the events as one more dimension.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    views : sequence of EventView
-        With posteriors of the same parameters.  Chains of different length are cut to the last
-        draws that all have.
-
-    Returns
-    -------
-    dict of str to xarray.Dataset
-        ``posterior``, with a variable (chain, draw, event) for each parameter [nm, kDa], and
-        ``sample_stats``: log-likelihood, acceptance, and diagnostics by event and parameter.
-    """
+    """Arrange posteriors as ArviZ does, with the events as one more dimension."""
     import xarray  # takes half a second, and only chains need it
 
     chains = [view.posterior for view in views if view.posterior is not None]
@@ -88,18 +73,6 @@ def write_posterior(analysis: Analysis, path: Path) -> bool:
 
     ``arviz.from_netcdf(path).posterior["mass_kda"].sel(event=7)`` is one event's chain.  Events
     whose chains did not converge are left out and named in the attributes.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Its views may carry posteriors.
-    path : Path
-        The file to write.
-
-    Returns
-    -------
-    bool
-        Whether there was a converged posterior to write.
     """
     usable = [v for v in analysis.views if v.posterior is not None and v.posterior.converged]
     if not usable:

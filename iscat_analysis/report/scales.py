@@ -27,21 +27,7 @@ _NOTHING = 255  # of a palette: transparent
 
 
 def display_range(images: Sequence[NDArray[np.floating[Any]]], scheme: str) -> tuple[float, float]:
-    """Choose the grey scale that images share.
-
-    Parameters
-    ----------
-    images : sequence of ndarray
-        Contrast (dark field: photoelectrons).
-    scheme : str
-        As in `Analysis`.
-
-    Returns
-    -------
-    float, float
-        Symmetric about zero for contrast, from the lowest to the highest in dark field; always a
-        proper interval.
-    """
+    """Choose the grey scale that images share."""
     values = np.concatenate([np.ravel(image) for image in images])
     values = values[np.isfinite(values)]
     if not values.size:
@@ -56,37 +42,14 @@ def display_range(images: Sequence[NDArray[np.floating[Any]]], scheme: str) -> t
 def residual_limit(residual: NDArray[np.float64]) -> float:
     """Choose the range of a residual image: a few standard deviations, more where it needs more.
 
-    Parameters
-    ----------
-    residual : ndarray, shape (y, x)
-        Residual [standard deviations].
-
-    Returns
-    -------
-    float
-        Half the range, at least `RESIDUAL_LIMIT`.
+    Shapes: `residual` (y, x).
     """
     values = np.abs(residual[np.isfinite(residual)])
     return max(RESIDUAL_LIMIT, math.ceil(np.quantile(values, 0.995))) if values.size else 4.0
 
 
 def shaded(values: NDArray[np.floating[Any]], shades: int, first: int = 0) -> NDArray[np.uint8]:
-    """Give every pixel of an image the number of its shade, for `png_of`.
-
-    Parameters
-    ----------
-    values : ndarray, any shape
-        0 to 1 within the scale.
-    shades : int
-        How many there are.
-    first : int
-        Number of the first.
-
-    Returns
-    -------
-    ndarray of uint8, same shape
-        What is no number is transparent.
-    """
+    """Give every pixel of an image the number of its shade, for `png_of`."""
     inside = np.rint(np.clip(np.nan_to_num(values), 0, 1) * (shades - 1)) + first
     return np.where(np.isfinite(values), inside, _NOTHING).astype(np.uint8)
 
@@ -94,17 +57,7 @@ def shaded(values: NDArray[np.floating[Any]], shades: int, first: int = 0) -> ND
 def png_of(shades: NDArray[np.uint8], colours: NDArray[np.float64]) -> str:
     """Write a small PNG file.
 
-    Parameters
-    ----------
-    shades : ndarray of uint8, shape (y, x)
-        From `shaded`; 255 is transparent.
-    colours : ndarray, shape (n, 4)
-        Of each shade, 0 to 1; n is at most 255.
-
-    Returns
-    -------
-    str
-        In base64.
+    Shapes: `shades` (y, x), `colours` (n, 4).
     """
     picture = Image.fromarray(np.minimum(shades, len(colours)).astype(np.uint8))
     palette = np.rint(255 * colours[:, :3]).astype(int).ravel().tolist()

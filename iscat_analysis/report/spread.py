@@ -17,34 +17,12 @@ _CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
 
 
 def counted(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out the rows that stay in the table but are no events: side lobes of others.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        With a column ``status``.
-
-    Returns
-    -------
-    pandas.DataFrame
-        The rows that count as events.
-    """
+    """Leave out the rows that stay in the table but are no events: side lobes of others."""
     return table[table["status"] != "sidelobe"]
 
 
 def rejection(table: pd.DataFrame) -> str:
     """Say that the model of the image is rejected, where it is.
-
-    Parameters
-    ----------
-    table : pandas.DataFrame
-        With the columns ``p_value`` and ``status``, and ``track`` where particles move.
-
-    Returns
-    -------
-    str
-        One sentence; empty where no more fits are poor than chance makes so, or only those of some
-        tracks are.
 
     Notes
     -----
@@ -72,18 +50,7 @@ def rejection(table: pd.DataFrame) -> str:
 
 
 def species_widths(summary: Mapping[str, Any]) -> list[str]:
-    """Say how much wider than σ the species are.
-
-    Parameters
-    ----------
-    summary : mapping
-        What ``summary.json`` holds.
-
-    Returns
-    -------
-    list of str
-        One sentence per species; relative to its size where masses are not calibrated.
-    """
+    """Say how much wider than σ the species are."""
     lines = []
     calibrated = summary.get("mass_scale") == "calibration"
     for one in summary.get("across_particles") or ():

@@ -18,18 +18,6 @@ def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) 
     """Draw the measured spread over the bound against the frames averaged.
 
     In mode ``track``, where none are, against the frames since the background.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-    label_of : callable
-        Says what a parameter is called.
-
-    Returns
-    -------
-    Figure or None
-        One panel for each free parameter; None where nothing was measured.
     """
     found = {
         name: part

@@ -63,20 +63,7 @@ _NO_PDF_METADATA = dict.fromkeys(("Creator", "CreationDate", "Producer"))
 
 
 def new_figure(width: float, height: float, *, constrained: bool = True) -> Figure:
-    """Make a figure that no window shows.
-
-    Parameters
-    ----------
-    width, height : float
-        Size [inches].
-    constrained : bool
-        Whether Matplotlib finds the places of what is drawn.
-
-    Returns
-    -------
-    Figure
-        Empty.
-    """
+    """Make a figure that no window shows."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained" if constrained else None)
     FigureCanvasAgg(figure)
     return figure
@@ -87,20 +74,7 @@ Sketch = tuple[str, Callable[[], Figure | None]]
 
 
 def drawn(sketches: Iterable[Sketch]) -> Iterator[tuple[str, Figure]]:
-    """Draw figures one after the other.
-
-    Parameters
-    ----------
-    sketches : iterable of Sketch
-        What to draw.
-
-    Yields
-    ------
-    name : str
-        Of a figure.
-    figure : Figure
-        The figure.
-    """
+    """Draw figures one after the other."""
     for name, draw in sketches:
         if (figure := draw()) is not None:
             yield name, figure
@@ -112,20 +86,6 @@ def publish(
     """Write figures as PNG and SVG files, and as SVG for a page.
 
     Equal figures give equal files at any time.
-
-    Parameters
-    ----------
-    figures : iterable of (str, Figure)
-        Each with the name of its files; a generator draws under the style of this package.
-    folder : Path, optional
-        An existing folder; nothing is written without it.
-    printed : bool
-        The figures have the size that they are printed in: PNG at `PRINT_DPI`, and PDF as well.
-
-    Returns
-    -------
-    dict of str to Markup
-        Each figure as an SVG element whose colours follow the theme of the page.
     """
     inline = {}
     with mpl.rc_context(STYLE):
@@ -169,20 +129,7 @@ def _hold_labels(figure: Figure) -> None:
 
 
 def inline_svg(svg: str, name: str) -> Markup:
-    """Fit an SVG file of Matplotlib's into a page that holds others.
-
-    Parameters
-    ----------
-    svg : str
-        What the file holds.
-    name : str
-        Of the figure.
-
-    Returns
-    -------
-    Markup
-        An element.
-    """
+    """Fit an SVG file of Matplotlib's into a page that holds others."""
     svg = svg[svg.index("<svg") :]
     svg = re.sub(r"<defs>\s*<style.*?</style>\s*</defs>", "", svg, count=1, flags=re.DOTALL)
     svg = re.sub(r' (xmlns|xmlns:xlink|width|height|version)="[^"]*"', "", svg, count=5)
@@ -194,13 +141,7 @@ def inline_svg(svg: str, name: str) -> Markup:
 
 
 def log_y(axes: Axes) -> None:
-    """Set a logarithmic y axis with plain numbers.
-
-    Parameters
-    ----------
-    axes : Axes
-        With what it shows already drawn.
-    """
+    """Set a logarithmic y axis with plain numbers."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     steps = {200.0: (1.0,), 20.0: (1.0, 2.0, 5.0), 4.0: (1.0, 2.0, 3.0, 5.0, 7.0)}

@@ -16,24 +16,7 @@ CSV_DIGITS = 9
 
 
 def event_table(analysis: Analysis) -> pd.DataFrame:
-    """Put the table of an analysis into the shape it is published in.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        Its `table` may be empty and may hold flags as tuples.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `EVENT_COLUMNS` in that order, then those that only some analyses have; flags
-        joined by ``;``, status as text.
-
-    Raises
-    ------
-    ValueError
-        The table lacks one of the columns.
-    """
+    """Put the table of an analysis into the shape it is published in."""
     missing = [name for name in EVENT_COLUMNS if name not in analysis.table.columns]
     if missing and len(analysis.table):
         raise ValueError(f"analysis.table lacks the columns {', '.join(missing)}")
@@ -62,13 +45,6 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
     """Write ``fits.csv``, ``tracks.csv`` where there are tracks, both as Parquet, and the rest.
 
     The rest is ``summary.json`` and ``config.toml``.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What to write.
-    folder : Path
-        An existing folder.
     """
     tables = {"fits": event_table(analysis)}
     if analysis.tracks is not None:

@@ -16,24 +16,7 @@ from iscat_analysis.report.style import new_figure, publish
 
 
 def template_page(title: str, found: Mapping[str, Any], template: Template, toml: str) -> str:
-    """Make the page of a measured picture.
-
-    Parameters
-    ----------
-    title : str
-        The movie.
-    found : mapping
-        What ``template.json`` holds.
-    template : Template
-        The picture.
-    toml : str
-        ``optics.toml``.
-
-    Returns
-    -------
-    str
-        HTML.
-    """
+    """Make the page of a measured picture."""
     drawn, judged = publish(_figures(found, template)), found["held_out"]
     verdict = (
         "The template describes pictures that were held out."

@@ -23,18 +23,7 @@ _OUTSIDE = 0.005  # share of frames on either side that the scale may leave out
 
 
 def trace_svg(trace: Trace) -> Markup:
-    """Draw a trace for the page; its colours follow the theme.
-
-    Parameters
-    ----------
-    trace : Trace
-        Of one event.
-
-    Returns
-    -------
-    Markup
-        An SVG element of two or three kilobytes.
-    """
+    """Draw a trace for the page; its colours follow the theme."""
     low, high = _range(trace)
     frames = len(trace.contrast)
     across, down = _WIDTH - _LEFT - _RIGHT, _HEIGHT - _TOP - _BOTTOM
@@ -83,18 +72,7 @@ def trace_svg(trace: Trace) -> Markup:
 
 
 def trace_words(trace: Trace) -> str:
-    """Say what a drawn trace shows.
-
-    Parameters
-    ----------
-    trace : Trace
-        Of one event.
-
-    Returns
-    -------
-    str
-        A sentence or two.
-    """
+    """Say what a drawn trace shows."""
     when = f"frame {trace.frame}" + (f" ± {trace.half_width}" if trace.half_width else "")
     return (
         f"Contrast of each frame by the matched filter; dots: means of "
@@ -104,15 +82,7 @@ def trace_words(trace: Trace) -> str:
 
 
 def draw_trace(axes: Axes, trace: Trace) -> None:
-    """Draw a trace.
-
-    Parameters
-    ----------
-    axes : Axes
-        Empty.
-    trace : Trace
-        Of one event.
-    """
+    """Draw a trace."""
     low, high = _range(trace)
     frames = trace.first + np.arange(len(trace.contrast))
     centres, means = _means(trace)

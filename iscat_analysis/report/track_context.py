@@ -50,22 +50,7 @@ _TWO = ("exponent", "p_confinement", "p_anomalous", "p_steady", "mass_scatter")
 def tracks_context(
     analysis: Analysis, fits: pd.DataFrame, folder: Path | None = None
 ) -> dict[str, Any]:
-    """Gather what the page says of tracks, in place of what it says of events.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-    fits : pandas.DataFrame
-        From `event_table`.
-    folder : Path, optional
-        Where films go as files.
-
-    Returns
-    -------
-    dict
-        Further keys of the template's context.
-    """
+    """Gather what the page says of tracks, in place of what it says of events."""
     tracks = tracks_of(analysis)
     numbered = tracks.rename(columns={"track": "event"})
     images = event_details(analysis, numbered)
@@ -102,18 +87,7 @@ def _tiles(analysis: Analysis, fits: pd.DataFrame) -> list[dict[str, str]]:
 
 
 def track_rows(analysis: Analysis) -> dict[str, Any]:
-    """Write the table of tracks.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-
-    Returns
-    -------
-    dict
-        ``columns``: the headings; ``body``: the rows as HTML.
-    """
+    """Write the table of tracks."""
     tracks = tracks_of(analysis)
     names = dict(_COLUMNS)
     if main_quantity(analysis).column == "contrast":

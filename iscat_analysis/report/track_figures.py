@@ -42,21 +42,7 @@ _NO_MASS = (0.6, 0.6, 0.6, 1.0)
 
 
 def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
-    """Name the figures of the tracks, and what draws them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-    fits : pandas.DataFrame
-        One row per particle and frame.
-
-    Yields
-    ------
-    Sketch
-        ``overview`` (the field with its tracks), ``mass_d`` (density of mass and D),
-        ``distributions`` and ``msd``; what has no data is left out.
-    """
+    """Name the figures of the tracks, and what draws them."""
     tracks = tracks_of(analysis)
     if np.asarray(analysis.ratio_image).size:
         yield "overview", partial(trajectories, analysis, fits)
@@ -72,15 +58,7 @@ def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
 def masses(analysis: Analysis) -> tuple[FloatArray, FloatArray]:
     """Give the main quantity of every track, mass or contrast, and its σ.
 
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-
-    Returns
-    -------
-    values, sigma : ndarray, shape (tracks,)
-        Magnitudes.
+    Shapes: `values, sigma` (tracks,).
     """
     tracks, column = tracks_of(analysis), main_quantity(analysis).column
     mass = tracks["mass_kda"].abs().to_numpy(float)
@@ -93,18 +71,7 @@ def masses(analysis: Analysis) -> tuple[FloatArray, FloatArray]:
 
 
 def mass_label(analysis: Analysis) -> str:
-    """Name the axis of masses or contrasts.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Returns
-    -------
-    str
-        With its unit.
-    """
+    """Name the axis of masses or contrasts."""
     main = main_quantity(analysis)
     if main.column == "contrast":
         return "|contrast|"
@@ -143,20 +110,7 @@ def _scale_beside(figure: Figure, axes: Axes, analysis: Analysis) -> None:
 
 
 def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
-    """Draw the field with the paths of its particles, coloured by mass.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-    fits : pandas.DataFrame
-        One row per particle and frame.
-
-    Returns
-    -------
-    Figure
-        One panel.
-    """
+    """Draw the field with the paths of its particles, coloured by mass."""
     tracks = tracks_of(analysis)
     image = np.asarray(analysis.ratio_image, float)
     tall, columns = image.shape
@@ -199,19 +153,7 @@ def _points(axes: Axes, x: FloatArray, y: FloatArray, rows: NDArray[np.intp], **
 
 
 def mass_d(analysis: Analysis) -> Figure:
-    """Draw the density of tracks over mass and diffusion coefficient.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-
-    Returns
-    -------
-    Figure
-        Shades: the sum of what the tracks' errors make of each that is ok, or of all where none is;
-        points: the tracks.
-    """
+    """Draw the density of tracks over mass and diffusion coefficient."""
     tracks = tracks_of(analysis)
     mass, sigma = masses(analysis)
     d, d_sigma = (tracks[name].to_numpy(float) for name in ("d_um2_s", "sigma_d_um2_s"))
@@ -249,18 +191,7 @@ def mass_d(analysis: Analysis) -> Figure:
 
 
 def distributions(analysis: Analysis) -> Figure:
-    """Draw the distributions of mass and D, every track with its error.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-
-    Returns
-    -------
-    Figure
-        Two panels: above the sum of the tracks' errors, below the tracks in order of size.
-    """
+    """Draw the distributions of mass and D, every track with its error."""
     tracks = tracks_of(analysis)
     figure = new_figure(7.4, 4.2)
     panels = figure.subplots(2, 2, sharex="col", height_ratios=[2, 3], squeeze=False)
@@ -309,20 +240,7 @@ def distributions(analysis: Analysis) -> Figure:
 
 
 def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
-    """Draw mean-squared displacements beside what each track's D says of them.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-    fits : pandas.DataFrame
-        One row per particle and frame.
-
-    Returns
-    -------
-    Figure or None
-        None where no track has a D.
-    """
+    """Draw mean-squared displacements beside what each track's D says of them."""
     tracks, motion = tracks_of(analysis), analysis.summary.get("motion", {})
     rate, exposure = motion.get("frame_rate_hz"), motion.get("exposure_ms")
     usable = tracks[tracks["d_um2_s"].notna() & (tracks["n_d_frames"] >= 2 * MSD_PART)]

@@ -23,38 +23,13 @@ from iscat_analysis.units import count
 
 
 def tracks_of(analysis: Analysis) -> pd.DataFrame:
-    """Give the tracks of an analysis.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        What was found.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `TRACK_COLUMNS`; empty but in mode ``track``.
-    """
+    """Give the tracks of an analysis."""
     found = analysis.tracks
     return pd.DataFrame(columns=list(TRACK_COLUMNS)) if found is None else found
 
 
 def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
-    """Say in two or three sentences what the tracks come to.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-    fits : pandas.DataFrame
-        One row per particle and frame.
-
-    Returns
-    -------
-    list of str
-        The first sentence counts; medians are over the tracks that are ok, and there are none
-        where more than a fifth of the tracks is flagged.
-    """
+    """Say in two or three sentences what the tracks come to."""
     tracks = tracks_of(analysis)
     warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
     if fits.empty:
@@ -79,18 +54,7 @@ def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
 
 
 def tracks_caution(tracks: pd.DataFrame) -> str | None:
-    """Say that too many tracks are flagged for a median.
-
-    Parameters
-    ----------
-    tracks : pandas.DataFrame
-        Columns `TRACK_COLUMNS`.
-
-    Returns
-    -------
-    str or None
-        One or two sentences with the commonest reason; None where few are flagged.
-    """
+    """Say that too many tracks are flagged for a median."""
     judged = tracks["status"][tracks["status"] != TrackStatus.FEW_FRAMES]  # these have no D
     flagged = judged[judged != TrackStatus.OK]
     if len(flagged) <= MOST_FLAGGED * len(judged):
@@ -104,18 +68,7 @@ def tracks_caution(tracks: pd.DataFrame) -> str | None:
 
 
 def medians(analysis: Analysis) -> list[tuple[str, str]]:
-    """Give the medians over the tracks that are ok, as text with units.
-
-    Parameters
-    ----------
-    analysis : Analysis
-        With tracks.
-
-    Returns
-    -------
-    list of (str, str)
-        What it is, and how much; what is not known is left out.
-    """
+    """Give the medians over the tracks that are ok, as text with units."""
     tracks = tracks_of(analysis)
     good = tracks[tracks["status"] == TrackStatus.OK]
     main = main_quantity(analysis)
@@ -134,18 +87,7 @@ def medians(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say where tracks begin, end and meet.
-
-    Parameters
-    ----------
-    summary : mapping
-        What ``summary.json`` holds.
-
-    Yields
-    ------
-    str
-        One sentence each.
-    """
+    """Say where tracks begin, end and meet."""
     motion = summary.get("motion")
     if not motion or not summary.get("tracks"):
         return
@@ -172,18 +114,7 @@ TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
 
 
 def advice(tracks: pd.DataFrame) -> Iterator[str]:
-    """Explain the remarks on tracks.
-
-    Parameters
-    ----------
-    tracks : pandas.DataFrame
-        Columns `TRACK_COLUMNS`.
-
-    Yields
-    ------
-    str
-        One line for each status that was given.
-    """
+    """Explain the remarks on tracks."""
     remarks = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
     for status in TrackStatus:
         if remarks[status.value]:

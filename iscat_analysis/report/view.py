@@ -14,23 +14,7 @@ PAGES = (
 
 
 def page_of(result: Path) -> Path:
-    """Find the page of a result.
-
-    Parameters
-    ----------
-    result : Path
-        A folder that a command wrote; a movie, whose result is beside it; or the page itself.
-
-    Returns
-    -------
-    Path
-        Of an existing file.
-
-    Raises
-    ------
-    DataError
-        There is no such result, or it has no page.
-    """
+    """Find the page of a result."""
     if result.suffix.lower() in (".html", ".htm") and result.is_file():
         return result
     folder = result.with_suffix(".iscat") if result.is_file() else result

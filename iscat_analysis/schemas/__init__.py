@@ -50,13 +50,7 @@ def _model(name: str) -> type[BaseModel]:
 
 
 def schema_names() -> tuple[str, ...]:
-    """List the documents that have a schema.
-
-    Returns
-    -------
-    tuple of str
-        Sorted.
-    """
+    """List the documents that have a schema."""
     return tuple(_DOCUMENTS)
 
 
@@ -89,44 +83,14 @@ def schema(name: str) -> dict[str, Any]:
 
 
 def to_json(name: str, values: Mapping[str, Any]) -> str:
-    """Write a document as JSON, through its model.
-
-    Parameters
-    ----------
-    name : str
-        As for `schema`.
-    values : mapping
-        Its content; NumPy scalars and arrays are allowed at any depth.
-
-    Returns
-    -------
-    str
-        Strict JSON, indented, without a newline at the end.
-
-    Raises
-    ------
-    pydantic.ValidationError
-        The content is not what the schema promises.
-    """
+    """Write a document as JSON, through its model."""
     document = _model(name).model_validate(jsonable(values))
     plain = document.model_dump(mode="json", exclude_unset=True, by_alias=True)
     return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
 
 
 def jsonable(value: Any) -> Any:
-    """Turn a value into what strict JSON can hold.
-
-    Parameters
-    ----------
-    value : Any
-        Numbers, arrays, mappings, sequences, paths, enumerations, at any depth.
-
-    Returns
-    -------
-    Any
-        The same with NaN, ±∞ and pandas' missing values as None, arrays as lists, and everything
-        unknown as text.
-    """
+    """Turn a value into what strict JSON can hold."""
     if value is None or isinstance(value, (str, bool, int)):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, float):

@@ -23,34 +23,12 @@ Parameter = Literal["x_nm", "y_nm", "z_nm", "mass_kda"]
 
 
 def key(description: str) -> Any:
-    """Describe a key that is always there.
-
-    Parameters
-    ----------
-    description : str
-        What the key holds, with its unit.
-
-    Returns
-    -------
-    Any
-        The field.
-    """
+    """Describe a key that is always there."""
     return Field(description=description)
 
 
 def maybe(description: str) -> Any:
-    """Describe a key that is left out where there is nothing to say.
-
-    Parameters
-    ----------
-    description : str
-        What the key holds, with its unit.
-
-    Returns
-    -------
-    Any
-        The field.
-    """
+    """Describe a key that is left out where there is nothing to say."""
     return Field(default=None, description=description)
 
 

@@ -43,33 +43,7 @@ _CORE_NM = 900.0  # radius that dates a step
 
 @dataclass(frozen=True)
 class BrightStep:
-    """One bright step, summed before and after.
-
-    Attributes
-    ----------
-    frame : int
-        First frame of the new state.
-    x_px, y_px : float
-        Centre of its energy, to about a pixel.
-    snr : float
-        Root of the χ² that its picture has in excess of noise.
-    rows, columns : (int, int)
-        Its region of the field, half-open.
-    before_e, after_e : ndarray, shape (ny, nx)
-        Summed photoelectrons [e].
-    frames_before, frames_after : (int, int)
-        Frames in each sum, half-open.
-    n_before, n_after : int
-        The good ones among them.
-    power_ratio : float
-        Power after over power before.
-    usable : ndarray of bool, shape (ny, nx)
-        Pixels that are neither defective nor saturated.
-    read_variance_e2 : ndarray, shape (ny, nx)
-        Of one frame [e²].
-    motion : ndarray, shape (ny, nx), or float
-        Light after over light before that the motion of the fixed pattern makes.
-    """
+    """One bright step, summed before and after."""
 
     frame: int
     x_px: float
@@ -122,37 +96,7 @@ def find_bright_steps(
     motion: Motion | None = None,
     mapper: Mapper = map,
 ) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
-    """Bright steps that stand alone, and all of them, brightest first.
-
-    Parameters
-    ----------
-    chunk : Chunk
-        The frames, with `STRIDES` blocks to a window.
-    window : int
-        Frames before a step, and after it, at most.
-    pixel_nm : float
-        Pixel side [nm].
-    resolution_nm : float
-        λ/NA, roughly [nm].
-    roi_px : int
-        Side of the region that is cut out.
-    most : int
-        Steps that are returned at most.
-    rings : bool
-        Whether to cut out the others, too, which takes as long again.
-    motion : Motion, optional
-        Of the fixed pattern, where it is divided out.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    alone : tuple of BrightStep
-        Each with nothing else within `ALONE_NM` in the frames summed.
-    others : tuple of BrightStep
-        Every step with nothing else at its own place, in the middle of its region: what the rings
-        in the pictures of the first come from.  Empty without `rings`.
-    """
+    """Bright steps that stand alone, and all of them, brightest first."""
     moved = None if motion is None else motion.contrast
     spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
     # one after the other: between small kernels threads wait for each other at the interpreter
@@ -212,19 +156,7 @@ def energy_of(
 ) -> NDArray[np.float32]:
     """Smoothed energy of a change of the image, in standard deviations of its noise.
 
-    Parameters
-    ----------
-    change, variance : ndarray, shape (y, x)
-        The change and the variance of its noise, in any unit and its square.
-    used : ndarray of bool, shape (y, x)
-        Pixels to use.
-    spot_px : float
-        Standard deviation of the smoothing [pixels].
-
-    Returns
-    -------
-    ndarray of float32, shape (y, x)
-        About 0 where there is only noise.
+    Shapes: `change, variance` (y, x), `used` (y, x), result (y, x).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = (np.square(change) / variance - 1).astype(np.float32)
@@ -242,21 +174,7 @@ def find_bright_places(
 ) -> list[tuple[int, int]]:
     """Places where a single map of the energy has a maximum with no other near.
 
-    Parameters
-    ----------
-    energy : ndarray, shape (y, x)
-        From `energy_of`.
-    pixel_nm : float
-        Pixel side [nm].
-    alone_nm : float
-        Distance within which there is no other [nm].
-    roi_px : int
-        Side of the region that must lie inside the field.
-
-    Returns
-    -------
-    list of (int, int)
-        Row and column, brightest first.
+    Shapes: `energy` (y, x).
     """
     found = [(i, j) for _, i, j in _maxima(energy[None], _SHADOW_NM / pixel_nm)]
     room = roi_px // 2 + 1
@@ -352,15 +270,7 @@ def _region(centre: int, side: int) -> tuple[int, int]:
 def measured_contrast(step: BrightStep) -> tuple[FloatArray, FloatArray]:
     """Contrast of a step, its common level taken off, and the variance of shot noise.
 
-    Parameters
-    ----------
-    step : BrightStep
-        The step.
-
-    Returns
-    -------
-    contrast, variance : ndarray, shape (ny, nx)
-        Where a pixel is not usable, 0 and a variance of 10⁶.
+    Shapes: `contrast, variance` (ny, nx).
     """
     used = step.usable & (step.before_e > 0) & (step.after_e > 0)
     before, after = np.where(used, step.before_e, 1.0), np.where(used, step.after_e, 1.0)
@@ -383,19 +293,7 @@ def centre_of_energy(
 ) -> tuple[float, float, float]:
     """Centre of a picture's energy, found in a shrinking neighbourhood.
 
-    Parameters
-    ----------
-    contrast, variance : ndarray, shape (ny, nx)
-        The picture, its level taken off, and the variance of its noise.
-    pixel_nm : float
-        Pixel side [nm].
-
-    Returns
-    -------
-    row, column : float
-        Where it lies, counted from the first pixel.
-    snr : float
-        Root of the χ² in excess of noise.
+    Shapes: `contrast, variance` (ny, nx).
     """
     energy = np.maximum(gaussian_filter(contrast**2 / variance - 1, 0.7), 0.0)
     y, x = np.arange(contrast.shape[0]), np.arange(contrast.shape[1])

@@ -47,18 +47,7 @@ _ASKED = 500_000  # values, whose median has an error of a few thousandths
 
 @dataclass(frozen=True)
 class Changes:
-    """Clear changes in a movie.
-
-    Attributes
-    ----------
-    number : int
-        How many there are, no two in each other's surroundings.
-    staying : float
-        Share after which everything stays as it is, as before, with one picture; NaN where there is
-        none.
-    moving : float
-        Share around which there are three pictures or more.
-    """
+    """Clear changes in a movie."""
 
     number: int
     staying: float
@@ -72,17 +61,7 @@ NO_CHANGES = Changes(0, float("nan"), float("nan"))
 def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     """Look for changes from block to block, and at what becomes of them.
 
-    Parameters
-    ----------
-    blocks : ndarray, shape (k, y, x)
-        Mean images of successive blocks of frames, over that of all: 1 where nothing changes.
-    spot_px : float
-        Standard deviation of a particle's picture [px], from `spot_of`.
-
-    Returns
-    -------
-    Changes
-        None in fewer than 5 blocks.
+    Shapes: `blocks` (k, y, x).
     """
     if len(blocks) < _LEAST_BLOCKS:
         return NO_CHANGES
@@ -151,36 +130,10 @@ def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) ->
 
 
 def least_beside(spot_px: float) -> float:
-    """Give the part of a particle's change that the pixels beside its centre have at least.
-
-    Parameters
-    ----------
-    spot_px : float
-        Standard deviation of a particle's picture [px], from `spot_of`.
-
-    Returns
-    -------
-    float
-        Below it, a pixel changes by itself.
-    """
+    """Give the part of a particle's change that the pixels beside its centre have at least."""
     return _SHARED * math.exp(-0.5 / spot_px**2)
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
-    """Give the standard deviation of a particle's picture.
-
-    Parameters
-    ----------
-    wavelength_nm : float
-        Of the light [nm].
-    na : float
-        Numerical aperture.
-    pixel_nm : float
-        Side of a pixel [nm].
-
-    Returns
-    -------
-    float
-        In pixels, at least half a one.
-    """
+    """Give the standard deviation of a particle's picture."""
     return max(_SPOT * wavelength_nm / na / pixel_nm, 0.5)

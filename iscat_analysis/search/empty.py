@@ -35,21 +35,7 @@ _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where 
 
 @dataclass(frozen=True)
 class EmptySpread:
-    """Squared errors at empty places over the variance that the model expects, summed.
-
-    Attributes
-    ----------
-    squares : ndarray, shape (contrasts, n, tiles)
-        For each contrast, parameter and tile of the field: `CONTRASTS` where windows are compared;
-        where single frames are, all with the background, successive ones with each other, and with
-        the background those at each of `distances`.
-    counts : ndarray, shape (contrasts, tiles)
-        What they come to under the model.
-    shared : ndarray, shape (n,)
-        Variance of a mean over all tiles, over what it were if no two had noise in common.
-    distances : tuple of float, optional
-        Of single frames from the middle of the background [frames].
-    """
+    """Squared errors at empty places over the variance that the model expects, summed."""
 
     squares: FloatArray
     counts: FloatArray
@@ -63,25 +49,7 @@ class EmptySpread:
 
 
 class EmptyField:
-    """The linear estimator at every place of a field.
-
-    Parameters
-    ----------
-    mean_e : ndarray, shape (y, x)
-        Photoelectrons per unit of power without the particles that are sought [e].
-    read_e2 : ndarray, shape (y, x)
-        Variance of the read noise of one frame [e²].
-    used : ndarray of bool, shape (y, x)
-        Pixels in use.
-    slopes : ndarray, shape (n, k, k)
-        Derivatives of the signal by the free parameters, k odd.
-    n_free : int
-        How many of them belong to the particle; the others are nuisances.
-    additive : bool
-        Whether particles add to the light instead of multiplying it.
-    spacing_px, tile_px : int
-        From one place to the next, and side of the tiles whose errors are taken together [pixels].
-    """
+    """The linear estimator at every place of a field."""
 
     def __init__(
         self,
@@ -139,19 +107,7 @@ class EmptyField:
     def errors(self, sum_e: FloatArray, power: float, known: FloatArray | None) -> FloatArray:
         """Give the errors that a sum of frames contributes everywhere.
 
-        Parameters
-        ----------
-        sum_e : ndarray, shape (y, x)
-            Photoelectrons of the frames [e].
-        power : float
-            Their light.
-        known : ndarray, shape (y, x), optional
-            What particles that were found add to the light, per unit of power [e].
-
-        Returns
-        -------
-        ndarray, shape (n, rows, columns)
-            At every place, in units of the parameters but for a factor.
+        Shapes: `sum_e` (y, x), `known` (y, x), result (n, rows, columns).
         """
         rest = sum_e / power - self._mean
         if known is not None:
@@ -165,21 +121,13 @@ class EmptyField:
 
         A fit follows the noise, also of pixels that matter to its neighbourhood.
 
-        Parameters
-        ----------
-        particles : sequence of (float, float)
-            x and y [pixels] of all that were fitted.
-
-        Returns
-        -------
-        ndarray, shape (n, rows, columns)
-            Share at every place, 1 far from all of them.
-
         Notes
         -----
         With the information M(Δ) that places Δ apart have in common, F = M(0), and C = F⁻¹ M F⁻¹
         the covariance of what is estimated at both, the residuals of a fit hold F⁻¹ − C F Cᵀ of the
         variance F⁻¹, on a background that is even.
+
+        Shapes: result (n, rows, columns).
         """
         inverse, middle, covariance = self._related
         followed = np.einsum("ilyx,lm,imyx->iyx", covariance, middle, covariance)
@@ -205,21 +153,7 @@ class EmptyField:
     ) -> EmptySpread:
         """Compare the parts of two windows.
 
-        Parameters
-        ----------
-        before, after : list of ndarray, shape (n, rows, columns)
-            From `errors`, of contiguous parts.
-        powers : (ndarray, ndarray)
-            Light of each part.
-        taken : ndarray of bool, shape (y, x)
-            Pixels near a particle that lands or leaves in these frames.
-        left : ndarray, shape (n, rows, columns), optional
-            What the fits of particles leave of the variance between the windows; from `left`.
-
-        Returns
-        -------
-        EmptySpread
-            Zero throughout where too few places are empty.
+        Shapes: `before, after` (n, rows, columns), `taken` (y, x), `left` (n, rows, columns).
         """
         kept = self._known & ~taken[self._places]
         squares = np.zeros((len(CONTRASTS), self._n_free, self.tiles))

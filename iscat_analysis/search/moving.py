@@ -40,21 +40,7 @@ _FIELDS = 32  # of frames and templates that are filtered at a time
 
 @dataclass(frozen=True)
 class Sightings:
-    """Candidates in frames, in the order of the frames.
-
-    Attributes
-    ----------
-    frame : ndarray of int, shape (n,)
-        Frame.
-    x_px, y_px : ndarray, shape (n,)
-        Place [pixels].
-    z_nm : ndarray, shape (n,)
-        Height of the template [nm].
-    strength : ndarray, shape (n,)
-        Linear estimate of the amplitude.
-    snr : ndarray, shape (n,)
-        Signal-to-noise ratio.
-    """
+    """Candidates in frames, in the order of the frames."""
 
     frame: IntArray
     x_px: FloatArray
@@ -65,26 +51,7 @@ class Sightings:
 
 
 class FrameFilter:
-    """A matched filter for the frames of one movie.
-
-    Parameters
-    ----------
-    templates : Templates
-        The pictures and the threshold.
-    level_e : ndarray, shape (y, x)
-        Background at power 1 [e].
-    read_e2 : ndarray, shape (y, x)
-        Variance of the read noise [e²].
-    used : ndarray of bool, shape (y, x)
-        Pixels that may be used.
-    polarity : int
-        Sign of the contrasts that are wanted; 0 for both.
-    roi_px : int
-        Side of the fitted square [pixels].
-    cautious : bool
-        Nothing is found within a square's side of what is brighter or known, as through optics that
-        leave over bright rings.
-    """
+    """A matched filter for the frames of one movie."""
 
     def __init__(
         self,
@@ -126,21 +93,7 @@ class FrameFilter:
     ) -> Sightings:
         """Find candidates in a block of frames.
 
-        Parameters
-        ----------
-        residual_e : ndarray of float32, shape (n, y, x)
-            Counts minus what is expected [e].
-        power : ndarray, shape (n,)
-            Of these frames.
-        first : int
-            Number of the first of them.
-        known : list of ndarray, shape (k, 3)
-            What is known in each: x, y [pixels] and signal-to-noise ratio.
-
-        Returns
-        -------
-        Sightings
-            Above the threshold, strongest first in each frame, side lobes left out.
+        Shapes: `residual_e` (n, y, x), `power` (n,), `known` (k, 3).
         """
         parts: list[FloatArray] = []
         threshold = self._templates.threshold
@@ -247,33 +200,13 @@ def _ring(image: FloatArray, beyond_px: float) -> float:
 def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int) -> IntArray:
     """Say which positions are one particle.
 
-    Parameters
-    ----------
-    frame : ndarray of int, shape (n,)
-        Not decreasing.
-    places_nm : ndarray, shape (n, axes)
-        x and y [nm], and whatever else is its own, as a length: a particle keeps its mass where it
-        crosses another.
-    reach_nm : float
-        Farthest that a particle goes from one frame to the next [nm].
-    memory : int
-        Frames in which it may be missed.
-
-    Returns
-    -------
-    ndarray of int, shape (n,)
-        Number of the track, from 0.
-
-    Raises
-    ------
-    DataError
-        More particles than can be told apart are in reach of each other.
-
     Notes
     -----
     What has no choice is linked at once, and the rest of each frame by
     trackpy (D. B. Allan et al., doi:10.5281/zenodo.4682814), after J. C. Crocker and D. G. Grier,
     J. Colloid Interface Sci. 179, 298 (1996).
+
+    Shapes: `frame` (n,), `places_nm` (n, axes), result (n,).
     """
     n = len(frame)
     track = np.zeros(n, dtype=np.int64)
@@ -323,11 +256,6 @@ def load_linker() -> Any:
     """Import trackpy, silenced, which reports every frame, and let it keep what it compiles.
 
     That takes a third of a second, which is better taken beside something else.
-
-    Returns
-    -------
-    module
-        trackpy.
     """
     import trackpy
     from trackpy.linking import subnetlinker
@@ -354,19 +282,7 @@ def _uncollected() -> Iterator[None]:
 def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
     """Give the frames inside tracks in which the particle was missed.
 
-    Parameters
-    ----------
-    frame, track : ndarray of int, shape (n,)
-        Of each position.
-
-    Returns
-    -------
-    missed : ndarray of int, shape (m,)
-        Frame.
-    before, after : ndarray of int, shape (m,)
-        Indices of the positions between which it lies.
-    share : ndarray, shape (m,)
-        How far on the way from the one to the other.
+    Shapes: `frame, track` (n,), `missed` (m,), `before, after` (m,), `share` (m,).
     """
     order = np.lexsort((frame, track))
     before, after = order[:-1], order[1:]

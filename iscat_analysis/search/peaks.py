@@ -24,19 +24,7 @@ _FINE = np.linspace(-0.625, 0.625, 11)
 def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> NDArray[np.int64]:
     """Find what stands out of a stack of fields and has nothing higher beside it.
 
-    Parameters
-    ----------
-    fields : ndarray, shape (k, y, x)
-        The fields.
-    least : float
-        What a maximum exceeds.
-    reach : (int, int, int)
-        Fields, rows and columns on either side in which nothing is higher.
-
-    Returns
-    -------
-    ndarray of int, shape (n, 3)
-        Field, row and column of each, in this order; of equal neighbours all.
+    Shapes: `fields` (k, y, x), result (n, 3).
     """
     values = np.ascontiguousarray(fields).ravel()
     at = np.flatnonzero(values > least)
@@ -58,19 +46,7 @@ def summits(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Find the tops of smooth fields, or their bottoms, between the pixels.
 
-    Parameters
-    ----------
-    fields : ndarray, shape (k, y, x)
-        The fields.
-    at : ndarray of int, shape (n, 3)
-        Field, row and column of pixels that no neighbour of their sign exceeds in magnitude.
-
-    Returns
-    -------
-    dy, dx : ndarray, shape (n,)
-        From each pixel to there; never out of the field.
-    above : ndarray, shape (n,)
-        Magnitude there above that at the pixel, ≥ 0.
+    Shapes: `fields` (k, y, x), `at` (n, 3), `dy, dx` (n,), `above` (n,).
     """
     layer, *place = at.T
     value = fields[layer, place[0], place[1]].astype(np.float64)
@@ -114,19 +90,7 @@ def _spline() -> FloatArray:
 def vertices(lines: NDArray[Any], index: NDArray[np.int64]) -> tuple[FloatArray, FloatArray]:
     """Vertices of the parabolas through maxima and their two neighbours.
 
-    Parameters
-    ----------
-    lines : ndarray, shape (n, m)
-        Fields along one axis; −inf where there is none.
-    index : ndarray of int, shape (n,)
-        Where each has a maximum.
-
-    Returns
-    -------
-    shift : ndarray, shape (n,)
-        From the maximum to the vertex, at most half a step; 0 at an end of the line.
-    above : ndarray, shape (n,)
-        Height of the vertex above the maximum.
+    Shapes: `lines` (n, m), `index` (n,), `shift` (n,), `above` (n,).
     """
     each, last = np.arange(len(lines)), lines.shape[1] - 1
     before, after = np.maximum(index - 1, 0), np.minimum(index + 1, last)

@@ -42,37 +42,14 @@ _PATCH_PX = 5.0  # around the candidate, which is its own
 
 @dataclass(frozen=True)
 class Described:
-    """How well a fit describes its region.
-
-    Attributes
-    ----------
-    snr : float
-        Of the particle.
-    excess : float
-        χ² above its expectation; 0 where that may be noise.
-    """
+    """How well a fit describes its region."""
 
     snr: float
     excess: float
 
     @classmethod
     def of(cls, snr: float, chi2_reduced: float, n_pixels: int) -> Described:
-        """Take it from a fit.
-
-        Parameters
-        ----------
-        snr : float
-            Of the particle.
-        chi2_reduced : float
-            Of its fit.
-        n_pixels : int
-            In its region.
-
-        Returns
-        -------
-        Described
-            The fit.
-        """
+        """Take it from a fit."""
         return cls(snr, _significant((chi2_reduced - 1) * n_pixels, n_pixels))
 
     def is_dwarfed(self, others: Iterable[Described]) -> bool:
@@ -80,16 +57,6 @@ class Described:
 
         A model that is wrong leaves the same share of every particle, which the brighter one shows:
         so much of the excess is the particle's own.
-
-        Parameters
-        ----------
-        others : iterable of Described
-            Those that reach there.
-
-        Returns
-        -------
-        bool
-            Whether it is no more than a side lobe, as far as the model can tell.
         """
         brightest = max(others, key=lambda other: other.snr, default=self)
         own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
@@ -97,36 +64,12 @@ class Described:
 
 
 def is_hidden(snr: float, size: float) -> bool:
-    """Whether a candidate is too low to be listed, even as a side lobe.
-
-    Parameters
-    ----------
-    snr : float
-        Its signal-to-noise ratio.
-    size : float
-        What it must exceed to be a particle.
-
-    Returns
-    -------
-    bool
-        Whether it is below `LISTED` of that.
-    """
+    """Whether a candidate is too low to be listed, even as a side lobe."""
     return abs(snr) <= LISTED * size
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:
-    """Measure what a fit left over.
-
-    Parameters
-    ----------
-    residuals : ndarray
-        Data minus model in standard deviations; NaN where masked.
-
-    Returns
-    -------
-    float
-        χ² above its expectation; 0 where that may be noise.
-    """
+    """Measure what a fit left over."""
     n = int(np.count_nonzero(np.isfinite(residuals)))
     return _significant(float(np.nansum(residuals**2)) - n, n)
 
@@ -147,19 +90,7 @@ def size_on_ring(
     The highest peak there may be another particle that is not known yet, and a fifth of what is
     then left of the ring may be higher, for more: a misfit rises all around.
 
-    Parameters
-    ----------
-    snr : ndarray, shape (y, x)
-        Signal-to-noise ratio after all that is known has been taken off.
-    centre, place : (float, float)
-        The particle and the candidate, (x, y) [pixels].
-    others : iterable of (float, float)
-        Further known particles: what lies nearer to one of them is what is left of that one.
-
-    Returns
-    -------
-    float
-        The signal-to-noise ratio that four fifths of what is left do not exceed.
+    Shapes: `snr` (y, x).
     """
     (x0, y0), (xc, yc) = centre, place
     distance = max(math.hypot(xc - x0, yc - y0), _RING_PX)

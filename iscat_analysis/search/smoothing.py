@@ -23,17 +23,7 @@ T = TypeVar("T", np.float32, np.float64)
 def spot_response(shape: tuple[int, ...], sigma_px: float) -> NDArray[np.float64]:
     """Give what a Gaussian spot leaves of each cosine of an image.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    sigma_px : float
-        Standard deviation of the spot [px].
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        1 for the mean; differences are responses as well.
+    Shapes: result (y, x).
     """
     rows, columns = (_along(n, sigma_px) for n in shape)
     return np.multiply.outer(rows, columns)
@@ -51,17 +41,7 @@ def _along(length: int, sigma_px: float) -> NDArray[np.float64]:
 def smoothed(image: NDArray[T], response: NDArray[np.floating]) -> NDArray[T]:
     """Filter an image that is mirrored at its border.
 
-    Parameters
-    ----------
-    image : ndarray, shape (y, x)
-        Finite values.
-    response : ndarray, shape (y, x)
-        From `spot_response`.
-
-    Returns
-    -------
-    ndarray, shape (y, x)
-        Of the image's type, with its rounding errors: those of the largest value are everywhere.
+    Shapes: `image` (y, x), `response` (y, x), result (y, x).
     """
     waves = scipy.fft.dctn(image)
     waves *= response

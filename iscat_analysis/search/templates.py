@@ -54,15 +54,7 @@ _NOISE_SHARE = 0.1  # of these that noise must account for; particles have a tho
 
 @dataclass(frozen=True)
 class ExcessNoise:
-    """Noise beyond the expected.
-
-    Attributes
-    ----------
-    ratio : float
-        Its variance over that which is expected.
-    message : str
-        Where it was seen and what to do about it, in one line.
-    """
+    """Noise beyond the expected."""
 
     ratio: float
     message: str
@@ -70,27 +62,7 @@ class ExcessNoise:
 
 @dataclass(frozen=True)
 class Templates:
-    """The model's images, normalised, at the heights searched.
-
-    Attributes
-    ----------
-    z_nm : ndarray, shape (n,)
-        Heights [nm].
-    images : ndarray, shape (n, k, k)
-        Signal per unit amplitude (dark field: per unit amplitude squared), k odd.
-    signs : ndarray, shape (n,)
-        Sign of the signal's peak.
-    quadratic : bool
-        Whether the signal grows with the square of the mass (dark field).
-    threshold : float
-        Signal-to-noise ratio that noise reaches as often as configured.
-    two_sided : bool
-        Whether negative amplitudes count.
-    excursions : Excursions
-        How often noise exceeds a level, with the sign that it has.
-    noise : NoiseSpectrum or None
-        What the noise is where it is not white and of the expected size.
-    """
+    """The model's images, normalised, at the heights searched."""
 
     z_nm: FloatArray
     images: FloatArray
@@ -102,18 +74,7 @@ class Templates:
     noise: NoiseSpectrum | None = None
 
     def reached_by(self, ratio: float) -> float:
-        """Count the places of an image that noise lifts above the threshold.
-
-        Parameters
-        ----------
-        ratio : float
-            Variance of the noise over that which is expected.
-
-        Returns
-        -------
-        float
-            Expected number.
-        """
+        """Count the places of an image that noise lifts above the threshold."""
         level = max(self.threshold / math.sqrt(ratio), LOWEST)
         return self.excursions.above(level) * (2 if self.two_sided else 1)
 
@@ -130,34 +91,7 @@ def make_templates(
     correlation: float = 0.0,
     in_turn: bool = False,
 ) -> Templates:
-    """Prepare the matched filter for a field.
-
-    Parameters
-    ----------
-    model : ForwardModel
-        Its reach must cover the region's diagonal.
-    detection : Detection
-        Polarity and expected false alarms.
-    pixel_nm : float
-        Pixel side [nm].
-    roi_nm : float
-        Side of the template [nm].
-    z_range_nm : (float, float) or None
-        Heights to search; None for the nominal height alone.
-    field_px : (int, int)
-        Rows and columns of the field.
-    noise : NoiseSpectrum, optional
-        Of the movie; without it the noise is white and of the expected size.
-    correlation : float
-        Of the noise with that of the next image that is searched; what both see is one false alarm.
-    in_turn : bool
-        Whether what is found is fitted and taken off before what is near is looked at.
-
-    Returns
-    -------
-    Templates
-        Images and threshold.
-    """
+    """Prepare the matched filter for a field."""
     half = max(2, int(roi_nm / 2 / pixel_nm))
     grid = PixelGrid.centred(2 * half + 1, pixel_nm)
     if z_range_nm is None:
@@ -211,21 +145,7 @@ def signal_to_noise(
 ) -> tuple[FloatArray, FloatArray]:
     """Matched-filter maps.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of the whole field.
-    templates : Templates
-        From `make_templates`.
-    explained : ndarray, shape (y, x), optional
-        Signal of particles already known, to be taken off.
-
-    Returns
-    -------
-    snr : ndarray, shape (n, y, x)
-        Signal-to-noise ratio at every height and pixel.
-    strength : ndarray, shape (n, y, x)
-        Linear estimate of the amplitude, in dark field of its square.
+    Shapes: `explained` (y, x), `snr` (n, y, x), `strength` (n, y, x).
     """
     weight = likelihood.signal_information(explained)
     signal = np.nan_to_num(likelihood.measured_signal())
@@ -257,35 +177,7 @@ def find_particles(
     A peak much weaker than another may be its side lobe and is held back, a little weaker inside
     its region, far weaker anywhere; call again with the strong one explained.
 
-    Parameters
-    ----------
-    likelihood : Likelihood
-        Of the whole field.
-    templates : Templates
-        From `make_templates`.
-    detection : Detection
-        Polarity.
-    roi_px : float
-        Side of the fitted region [pixels].
-    explained : ndarray, shape (y, x), optional
-        Signal of particles already known.
-    known : sequence of (float, float)
-        Where those are, (x, y) [pixels].
-    excess_noise : ExcessNoise, optional
-        As for `refuse_flood`.
-    cumulants : (ndarray, ndarray), optional
-        Third and fourth cumulants of each pixel's counts [e³, e⁴]; without them the noise is
-        normal.
-
-    Returns
-    -------
-    tuple of Candidate
-        With sub-pixel positions.
-
-    Raises
-    ------
-    FloodError
-        As from `refuse_flood`.
+    Shapes: `explained` (y, x).
     """
     snr, strength = signal_to_noise(likelihood, templates, explained)
     ranked = np.abs(snr) if templates.two_sided else snr
@@ -391,24 +283,6 @@ def refuse_flood(
 
     The rings of many particles look like noise as well, but normal noise of that variance would
     hardly pass the threshold.
-
-    Parameters
-    ----------
-    candidates : int
-        Places above the threshold.
-    templates : Templates
-        Which know the threshold, and how often noise passes it.
-    excess_noise : ExcessNoise or None
-        None where the noise is as expected.
-    images : int
-        Images in which they are.
-    frames : str
-        Of which these are, for the message.
-
-    Raises
-    ------
-    FloodError
-        There are more than `FLOOD` places, and it is such noise that makes them.
     """
     if excess_noise is None or candidates <= FLOOD:
         return

@@ -21,15 +21,7 @@ _TOLERANCE = 1e-6  # of the log-likelihood per event: a tenth of a standard erro
 
 @dataclass(frozen=True, eq=False)
 class Repeat:
-    """One repetition.
-
-    Attributes
-    ----------
-    mixture : Mixture
-        Fitted to it.
-    count, corrected : ndarray, shape (k,)
-        Events of each species that were seen, and that came.
-    """
+    """One repetition."""
 
     mixture: Mixture
     count: FloatArray
@@ -46,32 +38,7 @@ def bootstrap(
     structure: tuple[Structure, Limits] | None = None,
     searched: bool = True,
 ) -> tuple[list[Repeat], float]:
-    """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    best : Mixture
-        By rising mass.
-    draws : int
-        Repetitions.
-    least : int
-        Events in a repetition, at least.
-    seed : int
-        Chooses the random numbers.
-    structure : (Structure, Limits), optional
-        Which mixtures to fit; default all of as many species.
-    searched : bool
-        Whether BIC chose the number, and shall choose again.
-
-    Returns
-    -------
-    repeats : list of Repeat
-        Their species in the order of `best`.
-    support : float
-        Share of those asked in which BIC chose the same number; NaN where none was.
-    """
+    """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers."""
     rng = np.random.default_rng(seed)
     repeats, agreed = [], []
     for number in range(draws):
@@ -92,22 +59,6 @@ def bootstrap(
 
 def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generator) -> Events:
     """Draw events as the mixture would give them, each detected and with a real event's noise.
-
-    Parameters
-    ----------
-    events : Events
-        Whose noise and detector to take.
-    mixture : Mixture
-        The species.
-    n : int
-        Events to draw.
-    rng : numpy.random.Generator
-        Random numbers.
-
-    Returns
-    -------
-    Events
-        Exactly n.
 
     Notes
     -----

@@ -46,23 +46,7 @@ _SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
 
 @dataclass(frozen=True)
 class LadderFit:
-    """The monomer of a ladder.
-
-    Attributes
-    ----------
-    steps : tuple of int
-        n of each rung.
-    monomer_kda, monomer_se, monomer_low, monomer_high : float
-        m₁, its statistical standard error and its 95 % interval, which holds the error of the mass
-        scale [kDa].
-    offset_kda, offset_se, offset_low, offset_high : float
-        b, likewise [kDa].
-    held : bool
-        Whether m₁ was given and not fitted.
-    p_value : float
-        Chance of masses that are at least as far from a ladder if it is one; NaN where there are
-        no more rungs than parameters.
-    """
+    """The monomer of a ladder."""
 
     steps: tuple[int, ...]
     monomer_kda: float
@@ -79,25 +63,7 @@ class LadderFit:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """Species that were chosen.
-
-    Attributes
-    ----------
-    tried : tuple of Mixture
-        What else was fitted, and the chosen one.
-    best : Mixture
-        By rising mass, a background last.
-    structure, limits : Structure and Limits, or None
-        Of the chosen one; None where every parameter is free.
-    background : bool
-        Whether the last species is a background.
-    steps : tuple of int
-        n of each rung of a ladder, without the background.
-    searched : bool
-        Whether BIC chose the number of free species.
-    p_value : float
-        That the masses are those of the ladder; NaN without.
-    """
+    """Species that were chosen."""
 
     tried: tuple[Mixture, ...]
     best: Mixture
@@ -111,29 +77,12 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Searched:
-    """As many species as BIC likes.
-
-    Attributes
-    ----------
-    most : int
-        Largest number to try.
-    """
+    """As many species as BIC likes."""
 
     most: int = 6
 
     def choose(self, events: Events) -> Chosen:
-        """Fit one number after another.
-
-        Parameters
-        ----------
-        events : Events
-            What was seen.
-
-        Returns
-        -------
-        Chosen
-            The number with the least BIC.
-        """
+        """Fit one number after another."""
         fits = fit_species(events, self.most)
         bic = [fit.bic(events.x.size) for fit in fits]
         return Chosen(tuple(fits), fits[int(np.argmin(bic))].by_mass(), searched=True)
@@ -141,64 +90,26 @@ class Searched:
 
 @dataclass(frozen=True)
 class Number:
-    """So many species, all free.
-
-    Attributes
-    ----------
-    k : int
-        How many.
-    """
+    """So many species, all free."""
 
     k: int
 
     def choose(self, events: Events) -> Chosen:
-        """Fit so many species.
-
-        Parameters
-        ----------
-        events : Events
-            What was seen.
-
-        Returns
-        -------
-        Chosen
-            Fewer where there are fewer than five events for each.
-        """
+        """Fit so many species."""
         fits = fit_species(events, self.k, least=self.k)
         return Chosen(tuple(fits), fits[-1].by_mass())
 
 
 @dataclass(frozen=True)
 class Given:
-    """Species whose masses are known; shares and widths are fitted.
-
-    Attributes
-    ----------
-    masses_kda : tuple of float
-        Their masses [kDa].
-    widths : {"common", "free"}
-        One τ for all, or one for each.
-    background : bool
-        Whether something else may be there.
-    """
+    """Species whose masses are known; shares and widths are fitted."""
 
     masses_kda: tuple[float, ...]
     widths: Widths = "common"
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
-        """Fit shares and widths.
-
-        Parameters
-        ----------
-        events : Events
-            What was seen.
-
-        Returns
-        -------
-        Chosen
-            By rising mass.
-        """
+        """Fit shares and widths."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         structure, limits = rungs(
             events, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
@@ -211,23 +122,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Ladder:
-    """Oligomers of one monomer.
-
-    Attributes
-    ----------
-    monomer_kda : float or None
-        m₁, to begin with or to hold; None where it is to be found [kDa].
-    steps : tuple of int
-        Which n there are; none given, they are found.
-    offset : bool
-        Whether b is fitted; 0 otherwise.
-    held : bool
-        Whether m₁ is held where it was given.
-    widths : {"common", "free"}
-        One τ for all, or one for each.
-    background : bool
-        Whether something else may be there.
-    """
+    """Oligomers of one monomer."""
 
     monomer_kda: float | None = None
     steps: tuple[int, ...] = ()
@@ -237,18 +132,7 @@ class Ladder:
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
-        """Fit the ladder, and find what is not given.
-
-        Parameters
-        ----------
-        events : Events
-            What was seen.
-
-        Returns
-        -------
-        Chosen
-            By rising n.
-        """
+        """Fit the ladder, and find what is not given."""
         if self.monomer_kda is not None:
             return self._from(events, self.monomer_kda)
         free = Searched().choose(events).best
@@ -283,20 +167,7 @@ class Ladder:
         return given if self.held else self.values(found)[0]
 
     def values(self, found: Chosen, mixture: Mixture | None = None) -> tuple[float, float]:
-        """Give m₁ and b of a ladder.
-
-        Parameters
-        ----------
-        found : Chosen
-            Which ladder.
-        mixture : Mixture, optional
-            Of this ladder's structure; default the chosen one.
-
-        Returns
-        -------
-        monomer, offset : float
-            m₁ and b [kDa].
-        """
+        """Give m₁ and b of a ladder."""
         mean = (found.best if mixture is None else mixture).mean[: len(found.steps)]
         steps = np.array(found.steps, dtype=np.float64)
         if self.held and self.monomer_kda is not None:
@@ -364,31 +235,7 @@ def rungs(
 ) -> tuple[Structure, Limits]:
     """Make a structure of species whose means are linear in few parameters.
 
-    Parameters
-    ----------
-    events : Events
-        What was seen; sets where a background lies.
-    origin : ndarray, shape (k,)
-        Means where the parameters are 0 [kDa].
-    slopes : ndarray, shape (k, p)
-        Of the means with respect to their parameters.
-    ranges : ndarray, shape (2, p)
-        Where these may lie.
-    units : ndarray, shape (p,)
-        In which a step of 1 matters.
-    widths : {"common", "free"}
-        One τ² for all, or one for each.
-    background : bool
-        Whether a species of fixed width stands behind them.
-    unit_kda : float
-        Smallest distance of species; no width is more than a part of it [kDa].
-
-    Returns
-    -------
-    Structure
-        θ = (logits from the second on, parameters of the means, τ² or τ_k²).
-    Limits
-        Of θ.
+    Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,).
     """
     k, p = slopes.shape
     q = 1 if widths == "common" else k

@@ -27,18 +27,7 @@ def common_change(
 ) -> float:
     """Say by how much the masses of all tracks change together.
 
-    Parameters
-    ----------
-    tracks : sequence of (ndarray, ndarray, ndarray), shape (n,) each
-        Frames, masses and their standard errors of every track.
-    frames : (int, int)
-        Half-open range that was analysed.
-
-    Returns
-    -------
-    float
-        The largest mass over the smallest in these frames, minus 1; 0 where the tracks do not say
-        that there is any change.
+    Shapes: `tracks` (n,).
     """
     first, last = frames
     information, pull = [], []

@@ -35,24 +35,7 @@ _SETTLED = 1e-9  # of the mass
 
 @dataclass(frozen=True)
 class CommonMass:
-    """The mass of a track.
-
-    Attributes
-    ----------
-    mass_kda : float
-        Best linear combination of the frames [kDa].
-    sigma_mass_kda : float
-        Its standard error, from those of the frames [kDa].
-    crb_mass_kda : float
-        The same from the frames' Cramér–Rao bounds [kDa].
-    scatter : float
-        Standard deviation of the frames about it over their σ; 1 where σ is right and the mass is
-        common.
-    p_value : float
-        Chance of at least as much scatter.
-    frames : int
-        How many were combined.
-    """
+    """The mass of a track."""
 
     mass_kda: float
     sigma_mass_kda: float
@@ -72,21 +55,7 @@ def combine_masses(
 ) -> CommonMass:
     """Combine the frames of one track.
 
-    Parameters
-    ----------
-    mass_kda : ndarray, shape (n,)
-        Estimates of the frames, without bias of their own [kDa].
-    sigma_kda, crb_kda : ndarray, shape (n,)
-        Their standard errors and Cramér–Rao bounds, at their own estimates [kDa].
-    power : float
-        p of J ∝ m^p, from `information_power`.
-    correlation : ndarray, shape (n, n), optional
-        Of the errors; absent, they are independent.
-
-    Returns
-    -------
-    CommonMass
-        Mass, error, bound, and whether the frames agree.
+    Shapes: `mass_kda` (n,), `sigma_kda, crb_kda` (n,), `correlation` (n, n).
     """
     factor = None if correlation is None else scipy.linalg.cho_factor(correlation)
     mass = float(np.median(mass_kda))
@@ -115,16 +84,6 @@ def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
 
     A line through ln J against ln m inside the tracks, with one slope for all, so that what differs
     between particles takes no part.
-
-    Parameters
-    ----------
-    tracks : sequence of (ndarray, ndarray)
-        Estimates and standard errors of each track's frames [kDa].
-
-    Returns
-    -------
-    float
-        p; 0 where there is nothing to learn from.
     """
     product = square = 0.0
     for mass, sigma in tracks:

@@ -63,17 +63,7 @@ _TOLERANCE = 1e-9  # of the log-likelihood per event: 2·10⁻⁵ of χ² for 10
 
 @dataclass(frozen=True)
 class Test:
-    """A likelihood-ratio test.
-
-    Attributes
-    ----------
-    chi2 : float
-        Twice the difference of the log-likelihoods.
-    dof : int
-        Parameters that the hypothesis lacks.
-    p_value : float
-        Chance of at least as much where the hypothesis is true; NaN without degrees of freedom.
-    """
+    """A likelihood-ratio test."""
 
     chi2: float
     dof: int
@@ -129,25 +119,7 @@ def compare(
     first: Events, other: Events, *, choice: Choice | None = None, start: Mixture | None = None,
     background: bool = False,
 ) -> Comparison:  # fmt: skip
-    """Compare the species of two samples.
-
-    Parameters
-    ----------
-    first, other : Events
-        What was seen of each, with its own errors and detector.
-    choice : Searched, Number, Given or Ladder, optional
-        Which species to look for in both together; default as many as BIC likes.  Their masses are
-        where the comparison begins, and are then free.
-    start : Mixture, optional
-        Species that are known already, in place of `choice`, by rising mass, a background last.
-    background : bool
-        Whether the last of `start` is a background, whose place and width are held.
-
-    Returns
-    -------
-    Comparison
-        Shifts, differences of fractions, and tests.
-    """
+    """Compare the species of two samples."""
     if start is None:
         pooled = Events(
             np.concatenate([first.x, other.x]),

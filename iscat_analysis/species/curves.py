@@ -24,37 +24,13 @@ _NOISES = np.linspace(0.05, 0.95, 10)  # quantiles that stand for the events' ow
 
 
 def bandwidth_of(events: Events, species: int) -> float:
-    """Apply Scott's rule to one peak no wider than the measurement error.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen, one event or more.
-    species : int
-        Peaks that share the events.
-
-    Returns
-    -------
-    float
-        Of the kernel density [kDa].
-    """
+    """Apply Scott's rule to one peak no wider than the measurement error."""
     each = max(events.x.size / species, 1.0)
     return float(1.06 * np.median(events.sigma) * each**-0.2)
 
 
 def histogram_of(events: Events) -> pd.DataFrame:
-    """Count, with 95 % Poisson intervals (Garwood, Biometrika 28, 437, 1936).
-
-    Parameters
-    ----------
-    events : Events
-        What was seen, one event or more.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `HISTOGRAM_COLUMNS`.
-    """
+    """Count, with 95 % Poisson intervals (Garwood, Biometrika 28, 437, 1936)."""
     edges = _edges(events)
     counts = np.histogram(events.x, edges)[0]
     low = np.where(counts > 0, gammaincinv(np.maximum(counts, 1), 0.025), 0.0)
@@ -70,22 +46,7 @@ def histogram_of(events: Events) -> pd.DataFrame:
 
 
 def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
-    """Give densities per kDa: kernel with its Poisson error, model as seen and as it came.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    best : Mixture
-        The species.
-    bandwidth : float
-        Of the kernel [kDa].
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `CURVE_COLUMNS`.
-    """
+    """Give densities per kDa: kernel with its Poisson error, model as seen and as it came."""
     mass = np.linspace(0.0, _reach(events), _POINTS)
     z = (mass[:, np.newaxis] - events.x) / bandwidth
     kernel = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * bandwidth)

@@ -143,46 +143,13 @@ def describe(
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
-    Parameters
-    ----------
-    masses : array_like, shape (n,)
-        Masses, negative for particles that leave [kDa]; NaN is left out.
-    sigmas : array_like, shape (n,)
-        Standard deviation of each, positive [kDa].
-    efficiency : Efficiency, optional
-        Corrects for what was missed; without it nothing was.
-    max_species : int
-        Largest number to try.
-    seed : int
-        Of the bootstrap.
-    branch : {"magnitude", "landing", "leaving"}
-        Which events: |mass| of all, or one side.
-    draws : int
-        Simulated repetitions for the intervals; 0 for none.
-    scale_error : callable, optional
-        Gives the standard deviation of the mass scale at masses [kDa]; it is common to all events
-        and widens the intervals of the species' masses.
-    window_frames : int, optional
-        Frames that the search averages: the efficiency is that of particles that stay as long.  A
-        visitor of fewer frames d changes their mean by d/window_frames of its contrast only.
-    choice : Searched, Number, Given or Ladder, optional
-        Which species to look for; default as many as BIC likes, up to `max_species`.
-
-    Returns
-    -------
-    Distribution
-        With an empty table of species where there are fewer than `LEAST_EVENTS` events.
-
-    Raises
-    ------
-    ValueError
-        The arrays differ in shape, or an option is impossible.
-
     Notes
     -----
     Intervals are the 2.5 and 97.5 % quantiles of the bootstrap, which draws the number of events
     from its own Poisson distribution.  The error of the mass scale is added in quadrature to the
     distance of these quantiles from the estimate.
+
+    Shapes: `masses` (n,), `sigmas` (n,).
     """
     mass, sigma = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (masses, sigmas))
     if mass.shape != sigma.shape:

@@ -162,31 +162,7 @@ def estimate_diffusion(
     exposure_ms: float | None = None,
     counted: ArrayLike | None = None,
 ) -> tuple[float, float]:
-    """D of one track and its standard error, as in `fit_diffusion`, and nothing else.
-
-    Parameters
-    ----------
-    frames, positions_nm, sigma_nm : array_like
-        As there.
-    frame_rate_hz : float
-        Frames per second.
-    exposure_ms : float, optional
-        As there [ms].
-    counted : array_like of bool, optional
-        As there.
-
-    Returns
-    -------
-    d_um2_s, sigma_d_um2_s : float
-        Of highest likelihood [µm²/s].
-
-    Raises
-    ------
-    ConfigError
-        The frame rate or exposure is impossible.
-    DataError
-        The arrays are not those of a track.
-    """
+    """D of one track and its standard error, as in `fit_diffusion`, and nothing else."""
     track = gather(
         frames, positions_nm, sigma_nm,
         frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
@@ -264,18 +240,7 @@ def hydrodynamic_diameter(
 
 
 def most_likely(track: Displacements) -> float:
-    """Maximise the likelihood of free diffusion.
-
-    Parameters
-    ----------
-    track : Displacements
-        A track.
-
-    Returns
-    -------
-    float
-        D, at least 0 [nm²/s].
-    """
+    """Maximise the likelihood of free diffusion."""
     scale = float(np.mean(track.steps_nm**2 / track.rate[0])) or float(
         np.mean(track.error[0] / track.rate[0])
     )

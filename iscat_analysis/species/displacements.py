@@ -35,17 +35,7 @@ _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this
 
 
 class Likelihood(NamedTuple):
-    """Log-likelihood of a diffusion coefficient D [nm²/s].
-
-    Attributes
-    ----------
-    value, slope, curvature : float
-        Log-likelihood and its derivatives with respect to D.
-    information : float
-        Fisher information on D.
-    log_determinant, log_determinant_slope : float
-        Of the covariance.
-    """
+    """Log-likelihood of a diffusion coefficient D [nm²/s]."""
 
     value: float
     slope: float
@@ -57,23 +47,7 @@ class Likelihood(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Displacements:
-    """A track, checked; build it with `gather`.
-
-    Attributes
-    ----------
-    positions_nm : ndarray, shape (c, n)
-        Along each axis.
-    variance_nm2 : ndarray, shape (c, n)
-        Of the error of each.
-    frames : ndarray of int, shape (n,)
-        When.
-    interval_s : float
-        Δ, from frame to frame.
-    exposure_s : float
-        e.
-    counted : ndarray of int, shape (m,)
-        Displacements that count, by the position from which they go.
-    """
+    """A track, checked; build it with `gather`."""
 
     positions_nm: FloatArray
     variance_nm2: FloatArray
@@ -113,33 +87,14 @@ class Displacements:
     def moved(self, positions_nm: FloatArray) -> Displacements:
         """Give a track of the same frames and errors at other places.
 
-        Parameters
-        ----------
-        positions_nm : ndarray, shape (c, n)
-            The places.
-
-        Returns
-        -------
-        Displacements
-            It has what is known of this one's times and errors, which takes longer than its D.
+        Shapes: `positions_nm` (c, n).
         """
         track = replace(self, positions_nm=positions_nm)
         vars(track).update({name: getattr(self, name) for name in _OF_TIMES})
         return track
 
     def likelihood(self, d_nm2_s: float) -> Likelihood:
-        """Log-likelihood of free diffusion.
-
-        Parameters
-        ----------
-        d_nm2_s : float
-            D, at least 0.
-
-        Returns
-        -------
-        Likelihood
-            With derivatives and Fisher information.
-        """
+        """Log-likelihood of free diffusion."""
         return Likelihood(*displacement_likelihood(self.steps_nm, *self.error, *self.rate, d_nm2_s))
 
 
@@ -154,30 +109,7 @@ def gather(
 ) -> Displacements:
     """Check a track.
 
-    Parameters
-    ----------
-    frames : array_like of int, shape (n,)
-        As in `fit_diffusion`.
-    positions_nm : array_like, shape (n,) or (n, c)
-        As in `fit_diffusion`.
-    sigma_nm : array_like
-        As in `fit_diffusion`.
-    frame_rate_hz : float
-        As in `fit_diffusion`.
-    exposure_ms : float, optional
-        As in `fit_diffusion`.
-    counted : array_like of bool, optional
-        As in `fit_diffusion`.
-
-    Returns
-    -------
-    Displacements
-        Ready for a likelihood.
-
-    Raises
-    ------
-    ConfigError, DataError
-        As in `fit_diffusion`.
+    Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """
     rate = real_array("frame_rate_hz", frame_rate_hz)
     if rate.ndim or not _RATES_HZ[0] <= rate <= _RATES_HZ[1]:

@@ -56,38 +56,7 @@ _FIRST_BACKGROUND = -3.0  # its logit
 
 @dataclass(frozen=True, eq=False)
 class EquilibriumFit:
-    """An equilibrium constant and what it rests on; `fit_equilibrium` makes it.
-
-    Attributes
-    ----------
-    kd_nm, kd_low, kd_high : float
-        K_D and its 95 % profile interval [nM]; an end is 0 or infinite where the data set none.
-    inactive, inactive_se : float
-        β and its standard error; 0 and NaN where it was not fitted.
-    inactive_p : float
-        Chance of at least as much gain by fitting β if there is no inactive part.
-    masses_kda : ndarray, shape (k,)
-        Of the species [kDa].
-    width_kda : float
-        Common width [kDa].
-    chi2 : float
-        Twice the gain of weights that are free in every table.
-    dof : int
-        Its degrees of freedom.
-    p_value : float
-        Chance of at least as much if the model is true.
-    complexes, complexes_low, complexes_high : ndarray, shape (n,)
-        Fraction of complexes among the particles that came to each table, weights free, and its
-        95 % interval.
-    predicted : ndarray, shape (n,)
-        The same by the equilibrium.
-    pull : ndarray, shape (n,)
-        Distance of the two in standard errors, of the logits.
-    background : ndarray, shape (n,)
-        Share of each table that is background, among the particles that came.
-    profile_ln_kd, profile_deviance : ndarray
-        Points of the profile.
-    """
+    """An equilibrium constant and what it rests on; `fit_equilibrium` makes it."""
 
     kd_nm: float
     kd_low: float
@@ -121,25 +90,7 @@ def fit_equilibrium(
 ) -> EquilibriumFit:
     """Fit K_D to the events of all tables together.
 
-    Parameters
-    ----------
-    tables : sequence of Events
-        What was seen of each sample.
-    totals_nm : ndarray, shape (n, 1) or (n, 2)
-        Monomers in all, or A and B in all, of each sample [nM].
-    model : {"dimer", "ab"}
-        Which reaction.
-    masses_kda : sequence of float
-        About the mass of the monomer, or of A and B; fitted [kDa].
-    power : float
-        p of landings ∝ c·m^p.
-    inactive : bool
-        Fit the part of monomers, or of A, that does not bind.
-
-    Returns
-    -------
-    EquilibriumFit
-        K_D, interval, and whether the model describes the tables.
+    Shapes: `totals_nm` (n, 1) or (n, 2).
     """
     series = _Series(tables, totals_nm, model, np.array(masses_kda, float), power, inactive)
     free, free_value = series.fit_free()

@@ -15,15 +15,7 @@ from iscat_analysis.records import FloatArray
 
 @dataclass(frozen=True)
 class Efficiency:
-    """The chance that a particle is detected.
-
-    Attributes
-    ----------
-    threshold_snr : float
-        u, the matched filter's threshold [standard deviations].
-    sigma_kda : float
-        σ_d, standard deviation of its estimate of mass [kDa].
-    """
+    """The chance that a particle is detected."""
 
     threshold_snr: float
     sigma_kda: float
@@ -41,50 +33,18 @@ class Efficiency:
         return self.threshold_snr * self.sigma_kda
 
     def __call__(self, mass_kda: ArrayLike) -> FloatArray:
-        """Probability of detection.
-
-        Parameters
-        ----------
-        mass_kda : array_like
-            |mass| [kDa].
-
-        Returns
-        -------
-        ndarray
-            Φ(m/σ_d − u).
-        """
+        """Probability of detection."""
         mass = np.asarray(mass_kda, dtype=np.float64)
         return np.asarray(ndtr(mass / self.sigma_kda - self.threshold_snr))
 
     def extra_sigma(self, sigma: FloatArray) -> FloatArray:
-        """Noise of the filter's estimate beyond that of the fit.
-
-        Parameters
-        ----------
-        sigma : ndarray
-            σ_i, standard deviation of the fit's estimate [kDa].
-
-        Returns
-        -------
-        ndarray
-            √(σ_d² − σ_i²), or 0 [kDa].
-        """
+        """Noise of the filter's estimate beyond that of the fit."""
         return np.asarray(np.sqrt(np.maximum(self.sigma_kda**2 - sigma**2, 0.0)))
 
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Events that were seen.
-
-    Attributes
-    ----------
-    x : ndarray, shape (n,)
-        |mass| [kDa].
-    sigma : ndarray, shape (n,)
-        Standard deviation of each [kDa].
-    efficiency : Efficiency or None
-        Of the detector; None where nothing was missed.
-    """
+    """Events that were seen."""
 
     x: FloatArray
     sigma: FloatArray

@@ -31,17 +31,7 @@ _SMALL = 80  # rows of a matrix that is not halved to be inverted
 
 
 class Fractional(NamedTuple):
-    """Fractional Brownian motion of highest likelihood.
-
-    Attributes
-    ----------
-    value : float
-        Log-likelihood.
-    d_nm2_s, exponent : float
-        D [nm²/s] and α.
-    sigma_exponent : float
-        Standard error of α, D being unknown as well, from the Fisher information.
-    """
+    """Fractional Brownian motion of highest likelihood."""
 
     value: float
     d_nm2_s: float
@@ -59,33 +49,14 @@ class _There(NamedTuple):
 
 
 class Lags(NamedTuple):
-    """Every distance in time between two frames, in frames, and which pair has which.
-
-    Attributes
-    ----------
-    distinct : ndarray, shape (m,)
-        The distances.
-    which : ndarray of int, shape (n, n)
-        That of each pair.
-    """
+    """Every distance in time between two frames, in frames, and which pair has which."""
 
     distinct: FloatArray
     which: NDArray[np.int64]
 
     @classmethod
     def of(cls, track: Displacements) -> Lags:
-        """Find those of a track.
-
-        Parameters
-        ----------
-        track : Displacements
-            With all displacements.
-
-        Returns
-        -------
-        Lags
-            Of its frames.
-        """
+        """Find those of a track."""
         pairs = np.abs(np.subtract.outer(track.frames, track.frames))
         longest = int(pairs[0, -1])
         if longest < pairs.size:  # few gaps or none: all lags up to the longest
@@ -95,22 +66,7 @@ class Lags(NamedTuple):
 
 
 def most_likely_power(track: Displacements, free: float) -> Fractional:
-    """Maximise the likelihood of D and α by Newton's method.
-
-    Parameters
-    ----------
-    track : Displacements
-        With all displacements.
-    free : float
-        D of free diffusion of highest likelihood, above 0 [nm²/s].
-
-    Returns
-    -------
-    Fractional
-        Its last step is shorter than a tenth of the errors, so that the gain that the parabola
-        promises is that of the likelihood, and the information before it that after it.  Where
-        rounding spoils the likelihood of free diffusion, the standard error is NaN.
-    """
+    """Maximise the likelihood of D and α by Newton's method."""
     lags = Lags.of(track)
     at = np.array([math.log(free), 1.0])
     low, high = np.array([at[0] - _LN_D, _EXPONENTS[0]]), np.array([at[0] + _LN_D, _EXPONENTS[1]])
@@ -235,17 +191,7 @@ def _msd(track: Displacements, lags: FloatArray, exponent: float) -> FloatArray:
 def covariance(lags: Lags, msd: FloatArray) -> FloatArray:
     """Covariance of displacements along an axis: −½ of the second difference of an MSD.
 
-    Parameters
-    ----------
-    lags : Lags
-        Of n positions.
-    msd : ndarray, shape (m,)
-        At each of the distinct lags.
-
-    Returns
-    -------
-    ndarray, shape (n − 1, n − 1)
-        In the unit of the MSD.
+    Shapes: `msd` (m,), result (n − 1, n − 1).
     """
     pairs = msd[lags.which]
     twice = pairs[1:, :-1] + pairs[:-1, 1:]

@@ -48,23 +48,7 @@ _ALIKE = 4.0  # standard errors between the masses of a pair
 
 @dataclass(frozen=True)
 class LandingRate:
-    """How fast particles land.
-
-    Attributes
-    ----------
-    landings : int
-        Landings that were seen.
-    seconds : float
-        Time in which they were [s].
-    per_second, per_second_low, per_second_high : float
-        λ₀, the rate in the beginning, and its 95 % interval [1/s].
-    depletion_per_s, depletion_low, depletion_high : float
-        k and its 95 % interval [1/s]; negative where the rate grows.
-    depletion_p : float
-        Chance of at least as much change if the rate is constant.
-    p_value : float
-        Chance of times at least as far from the fitted law if it is true.
-    """
+    """How fast particles land."""
 
     landings: int
     seconds: float
@@ -80,19 +64,7 @@ class LandingRate:
 
 @dataclass(frozen=True)
 class UnbindingRate:
-    """How fast particles leave.
-
-    Attributes
-    ----------
-    landings : int
-        Landings whose stay is known to be longer than the window.
-    pairs : int
-        Those with a leaving.
-    chance_pairs : int
-        Pairs that are found where leavings are moved by half of the field.
-    per_second, per_second_low, per_second_high : float
-        κ and its 95 % interval [1/s]; 0 without any pair.
-    """
+    """How fast particles leave."""
 
     landings: int
     pairs: int
@@ -105,17 +77,7 @@ class UnbindingRate:
 def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     """Fit the rate of landings and its depletion.
 
-    Parameters
-    ----------
-    times_s : ndarray, shape (n,)
-        When particles landed, from the beginning of the observation [s].
-    seconds : float
-        How long it lasted [s].
-
-    Returns
-    -------
-    LandingRate
-        NaN where there are fewer than `LEAST_LANDINGS`.
+    Shapes: `times_s` (n,).
     """
     n = times_s.size
     if n < LEAST_LANDINGS:
@@ -164,21 +126,8 @@ def pair_events(
 ) -> tuple[IndexArray, IndexArray]:
     """Pair landings with the leavings of the same particles.
 
-    Parameters
-    ----------
-    frame : ndarray, shape (n,)
-        First frame of the new state.
-    place_px : ndarray, shape (n, 2)
-        Where [px].
-    mass_kda, sigma_kda : ndarray, shape (n,)
-        Signed mass and its error [kDa].
-    radius_px : float
-        Farthest that the two may lie apart [px].
-
-    Returns
-    -------
-    landing, leaving : ndarray of int, shape (pairs,)
-        Rows of the events; every event is in one pair at most.
+    Shapes: `frame` (n,), `place_px` (n, 2), `mass_kda, sigma_kda` (n,), `landing, leaving`
+    (pairs,).
     """
     lands, leaves = np.flatnonzero(mass_kda > 0), np.flatnonzero(mass_kda < 0)
     if not lands.size or not leaves.size:
@@ -201,21 +150,7 @@ def unbinding_rate(
 ) -> UnbindingRate:
     """Fit the rate at which particles leave.
 
-    Parameters
-    ----------
-    stay_s : ndarray, shape (n,)
-        d_i, how long a particle stayed beyond d₀; NaN where no leaving was seen [s].
-    censor_s : ndarray, shape (n,)
-        c_i, how long its leaving could have been seen [s].
-    detected : ndarray, shape (n,)
-        q_i, the chance that a leaving is detected.
-    chance_pairs : int
-        Handed on to the result.
-
-    Returns
-    -------
-    UnbindingRate
-        With an upper end where nothing left.
+    Shapes: `stay_s` (n,), `censor_s` (n,), `detected` (n,).
     """
     paired = np.isfinite(stay_s)
     number, stayed = int(paired.sum()), float(stay_s[paired].sum())

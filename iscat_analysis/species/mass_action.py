@@ -44,21 +44,7 @@ def at_equilibrium(
 ) -> FloatArray:
     """Give the concentrations of all species.
 
-    Parameters
-    ----------
-    model : {"dimer", "ab"}
-        Which reaction.
-    totals_nm : ndarray, shape (n, 1) or (n, 2)
-        Monomers in all, or A and B in all [nM].
-    kd_nm : float
-        K_D [nM].
-    inactive : float
-        β, the part of monomers, or of A, that does not bind.
-
-    Returns
-    -------
-    ndarray, shape (n, 2) or (n, 3)
-        Monomer and dimer, or A, B and AB [nM]; never quite zero.
+    Shapes: `totals_nm` (n, 1) or (n, 2), result (n, 2) or (n, 3).
     """
     active = (1 - inactive) * totals_nm[:, 0]
     idle = inactive * totals_nm[:, 0]
@@ -84,25 +70,7 @@ def landing_logits(
 ) -> FloatArray:
     """Give the logarithm of how many of each species land, less that of the first.
 
-    Parameters
-    ----------
-    model : {"dimer", "ab"}
-        Which reaction.
-    totals_nm : ndarray, shape (n, 1) or (n, 2)
-        As in `at_equilibrium` [nM].
-    kd_nm : float
-        K_D [nM].
-    inactive : float
-        β.
-    masses_kda : ndarray, shape (k,)
-        Of the species [kDa].
-    power : float
-        p.
-
-    Returns
-    -------
-    ndarray, shape (n, k)
-        ln(c_k m_k^p) − ln(c_1 m_1^p).
+    Shapes: `totals_nm` (n, 1) or (n, 2), `masses_kda` (k,), result (n, k).
     """
     logits = np.log(at_equilibrium(model, totals_nm, kd_nm, inactive))
     logits = logits + power * np.log(masses_kda)

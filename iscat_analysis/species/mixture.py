@@ -17,21 +17,7 @@ _EM_STEPS = 40
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Species, each a normal distribution of masses.
-
-    Attributes
-    ----------
-    weight : ndarray, shape (k,)
-        w, shares of the particles that came.
-    mean : ndarray, shape (k,)
-        μ [kDa].
-    variance : ndarray, shape (k,)
-        τ² [kDa²].
-    log_likelihood : float
-        Of the events that it was fitted to.
-    parameters : int
-        How many were fitted; 0 stands for all, 3 k − 1.
-    """
+    """Species, each a normal distribution of masses."""
 
     weight: FloatArray
     mean: FloatArray
@@ -79,40 +65,14 @@ class Mixture:
 
 
 def climb(events: Events, start: Mixture) -> Mixture:
-    """Climb towards the maximum as if nothing were missed: a start for `structure.polish`.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    start : Mixture
-        Where to begin.
-
-    Returns
-    -------
-    Mixture
-        After some steps of expectation and maximisation.
-    """
+    """Climb towards the maximum as if nothing were missed: a start for `structure.polish`."""
     weight, mean, variance = start.weight.copy(), start.mean.copy(), start.variance.copy()
     mixture_em(events.x, events.variance, weight, mean, variance, _EM_STEPS)
     return Mixture(weight, mean, variance)
 
 
 def height(events: Events, start: Mixture) -> float:
-    """Say how good a start is, as if nothing were missed.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    start : Mixture
-        A candidate.
-
-    Returns
-    -------
-    float
-        Log-likelihood.
-    """
+    """Say how good a start is, as if nothing were missed."""
     return float(
         mixture_score(events.x, events.variance, start.weight, start.mean, start.variance)[0]
     )

@@ -240,36 +240,12 @@ def steadiness_test(
 
     A track that was continued by another particle after they met has not.
 
-    Parameters
-    ----------
-    frames : array_like of int, shape (n,)
-        As in `fit_diffusion`.
-    positions_nm : array_like, shape (n,) or (n, c)
-        As in `fit_diffusion` [nm].
-    sigma_nm : array_like
-        As in `fit_diffusion` [nm].
-    frame_rate_hz : float
-        As in `fit_diffusion`.
-    exposure_ms : float, optional
-        As in `fit_diffusion` [ms].
-
-    Returns
-    -------
-    float
-        Chance that the likelihoods of the stretches, each with its own D, exceed those with the
-        one D of all by at least as much; 1 of a track too short for two stretches.
-
-    Raises
-    ------
-    ConfigError
-        The frame rate or exposure is impossible.
-    DataError
-        The arrays are not those of a track.
-
     Notes
     -----
     Twice the difference of the logarithms is χ² with one degree of freedom fewer than there are
     stretches (S. S. Wilks, Ann. Math. Stat. 9, 60, 1938).
+
+    Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """
     track = gather(
         frames, positions_nm, sigma_nm, frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms

@@ -15,22 +15,7 @@ _POLISHED = 2  # starts, the best after climbing
 
 
 def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mixture]:
-    """Fit 1, 2, … species; stop after two numbers that BIC likes no better.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    max_species : int
-        Largest number to try.
-    least : int
-        Smallest number to try all the same.
-
-    Returns
-    -------
-    list of Mixture
-        The best fit of each number.
-    """
+    """Fit 1, 2, … species; stop after two numbers that BIC likes no better."""
     fits: list[Mixture] = []
     most = min(max_species, max(1, events.x.size // 5))
     for k in range(1, most + 1):
@@ -57,20 +42,7 @@ def _spread_start(events: Events, k: int) -> Mixture:
 
 
 def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
-    """Add a narrow species where events crowd most above the model, or split the widest.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    fit : Mixture
-        With one species less.
-
-    Returns
-    -------
-    list of Mixture
-        Starts with one species more.
-    """
+    """Add a narrow species where events crowd most above the model, or split the widest."""
     starts = []
     sigma = float(np.median(events.sigma))
     places = np.sort(events.x)
@@ -107,18 +79,7 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
 
 
 def joined_starts(fit: Mixture) -> list[Mixture]:
-    """Join two neighbours.
-
-    Parameters
-    ----------
-    fit : Mixture
-        By rising mass.
-
-    Returns
-    -------
-    list of Mixture
-        Starts with one species less; none for a single species.
-    """
+    """Join two neighbours."""
     starts = []
     k = fit.weight.size
     for i in range(k - 1):

@@ -30,15 +30,7 @@ LOGIT_REACH = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """How the species of one sample follow from the parameters.
-
-    Attributes
-    ----------
-    design : ndarray, shape (3, k, p)
-        Slopes of ln w, μ [kDa] and τ² [kDa²] with respect to θ.
-    origin : ndarray, shape (3, k)
-        Their values where θ is 0.
-    """
+    """How the species of one sample follow from the parameters."""
 
     design: FloatArray
     origin: FloatArray
@@ -46,15 +38,7 @@ class Structure:
     def mixture(self, theta: FloatArray) -> Mixture:
         """Give the species that parameters stand for.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (p,)
-            The parameters.
-
-        Returns
-        -------
-        Mixture
-            Without a log-likelihood.
+        Shapes: `theta` (p,).
         """
         logits, mean, variance = self.origin + self.design @ theta
         weight = np.exp(logits - logits.max())
@@ -63,15 +47,7 @@ class Structure:
     def parameters(self, mixture: Mixture) -> FloatArray:
         """Give the parameters of species that this structure made.
 
-        Parameters
-        ----------
-        mixture : Mixture
-            Its logits count from the first species, whose own must not be free.
-
-        Returns
-        -------
-        ndarray, shape (p,)
-            By least squares, which is exact for such species.
+        Shapes: result (p,).
         """
         logits = np.log(np.maximum(mixture.weight, 1e-300))
         values = np.array([logits - logits[0], mixture.mean, mixture.variance]) - self.origin
@@ -81,13 +57,7 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Where parameters may lie, and how far they typically move.
-
-    Attributes
-    ----------
-    low, high, scale : ndarray, shape (p,)
-        Ends of the range, and a unit in which a step of 1 matters.
-    """
+    """Where parameters may lie, and how far they typically move."""
 
     low: FloatArray
     high: FloatArray
@@ -96,15 +66,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """Where the likelihood is largest.
-
-    Attributes
-    ----------
-    theta : ndarray, shape (p,)
-        The parameters.
-    log_likelihood : float
-        Of the events of all samples.
-    """
+    """Where the likelihood is largest."""
 
     theta: FloatArray
     log_likelihood: float
@@ -113,19 +75,7 @@ class Optimum:
 def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
     """Log-likelihood of the events seen, and its slope.
 
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    mixture : Mixture
-        The species.
-
-    Returns
-    -------
-    value : float
-        Log-likelihood.
-    slopes : ndarray, shape (3, k)
-        With respect to ln w, the others following so that Σ w = 1, to μ and to τ².
+    Shapes: `slopes` (3, k).
     """
     n = events.x.size
     value, slopes = mixture_score(
@@ -146,19 +96,7 @@ def log_likelihood(
 ) -> tuple[float, FloatArray]:
     """Log-likelihood of several samples and its slope.
 
-    Parameters
-    ----------
-    samples : sequence of (Events, Structure)
-        What was seen, and how its species follow.
-    theta : ndarray, shape (p,)
-        The parameters.
-
-    Returns
-    -------
-    value : float
-        Sum over the samples.
-    slope : ndarray, shape (p,)
-        With respect to θ.
+    Shapes: `theta` (p,), `slope` (p,).
     """
     total, slope = 0.0, np.zeros(theta.shape)
     for events, structure in samples:
@@ -178,23 +116,7 @@ def maximise(
 ) -> Optimum:
     """Maximise the likelihood of the events of all samples.
 
-    Parameters
-    ----------
-    samples : sequence of (Events, Structure)
-        What was seen, and how its species follow.
-    start : ndarray, shape (p,)
-        Where to begin.
-    limits : Limits
-        Of the parameters.
-    evaluations : int
-        Of the likelihood, at most.
-    tolerance : float
-        Of the log-likelihood per event.
-
-    Returns
-    -------
-    Optimum
-        The best that was found.
+    Shapes: `start` (p,).
     """
     n = sum(events.x.size for events, _ in samples)
     if not start.size:
@@ -215,22 +137,7 @@ def maximise(
 
 
 def free_structure(events: Events, k: int) -> tuple[Structure, Limits]:
-    """Let every weight, mean and variance be free.
-
-    Parameters
-    ----------
-    events : Events
-        Which give the scale.
-    k : int
-        Species.
-
-    Returns
-    -------
-    Structure
-        θ = (ln w_2/w_1, …, μ_1, …, τ_1², …).
-    Limits
-        Means up to a little beyond the largest event.
-    """
+    """Let every weight, mean and variance be free."""
     unit = max(float(np.median(events.sigma)), 1e-9)
     top = float(events.x.max())
     full = np.eye(3 * k)[:, 1:].reshape(3, k, 3 * k - 1)
@@ -243,24 +150,7 @@ def free_structure(events: Events, k: int) -> tuple[Structure, Limits]:
 def polish(
     events: Events, start: Mixture, *, evaluations: int = 400, tolerance: float = 1e-9
 ) -> Mixture:
-    """Maximise the likelihood of the events seen over all mixtures of as many species.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    start : Mixture
-        Where to begin.
-    evaluations : int
-        Of the likelihood, at most.
-    tolerance : float
-        Of the log-likelihood per event.
-
-    Returns
-    -------
-    Mixture
-        With its log-likelihood.
-    """
+    """Maximise the likelihood of the events seen over all mixtures of as many species."""
     structure, limits = free_structure(events, start.weight.size)
     return settle(events, start, structure, limits, evaluations=evaluations, tolerance=tolerance)
 
@@ -274,28 +164,7 @@ def settle(
     evaluations: int = 400,
     tolerance: float = 1e-9,
 ) -> Mixture:
-    """Maximise the likelihood of one sample's events over the mixtures of a structure.
-
-    Parameters
-    ----------
-    events : Events
-        What was seen.
-    start : Mixture
-        Where to begin, one of this structure's.
-    structure : Structure
-        Which mixtures there are.
-    limits : Limits
-        Of the parameters.
-    evaluations : int
-        Of the likelihood, at most.
-    tolerance : float
-        Of the log-likelihood per event.
-
-    Returns
-    -------
-    Mixture
-        With its log-likelihood and the number of its parameters.
-    """
+    """Maximise the likelihood of one sample's events over the mixtures of a structure."""
     begun = replace(start, weight=np.maximum(start.weight, _SIZE_FLOOR))
     found = maximise(
         [(events, structure)], structure.parameters(begun), limits,
@@ -313,19 +182,7 @@ def information(
 ) -> FloatArray:
     """Observed information: minus the second derivatives of the log-likelihood.
 
-    Parameters
-    ----------
-    samples : sequence of (Events, Structure)
-        What was seen, and how its species follow.
-    theta : ndarray, shape (p,)
-        Where, usually at the maximum.
-    limits : Limits
-        Whose scale sets the steps.
-
-    Returns
-    -------
-    ndarray, shape (p, p)
-        Symmetric; from differences of the slope, one-sided at an end of a range.
+    Shapes: `theta` (p,), result (p, p).
     """
     n = sum(events.x.size for events, _ in samples)
     step = limits.scale / math.sqrt(n) * _STEP

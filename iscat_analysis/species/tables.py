@@ -50,27 +50,7 @@ _LARGEST = 2_000_000_000  # bytes
 
 @dataclass(frozen=True, eq=False)
 class EventTable:
-    """Events that have a mass.
-
-    Attributes
-    ----------
-    name : str
-        What messages call it.
-    mass_kda, sigma_kda : ndarray, shape (n,)
-        Masses, negative for particles that leave, and their standard deviations [kDa].
-    frame : ndarray, shape (n,)
-        First frame of the new state; NaN where the table has none.
-    x_px, y_px : ndarray, shape (n,)
-        Where [px]; NaN where the table has no places.
-    efficiency : Efficiency or None
-        Of the detector; None where nothing is said to be missed.
-    window_frames : int or None
-        Frames that the search averaged.
-    scale_error : callable or None
-        Standard deviation of the mass scale at masses [kDa].
-    notes : tuple of str
-        What the user should know, one sentence each.
-    """
+    """Events that have a mass."""
 
     name: str
     mass_kda: FloatArray
@@ -90,22 +70,7 @@ class EventTable:
 
 
 def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
-    """Refuse masses of species that no event is near, as those in another unit.
-
-    Parameters
-    ----------
-    tables : sequence of EventTable
-        What was seen.
-    masses_kda : sequence of float
-        Lightest and heaviest species that are looked for, and others [kDa].
-    argument : str
-        That gave them, and its value.
-
-    Raises
-    ------
-    DataError
-        Every event is lighter than half of the lightest, or heavier than twice the heaviest.
-    """
+    """Refuse masses of species that no event is near, as those in another unit."""
     seen = np.abs(np.concatenate([table.mass_kda for table in tables]))
     low, high = _NEAREST * min(masses_kda), max(masses_kda) / _NEAREST
     if not seen.size or ((seen >= low) & (seen <= high)).any():
@@ -127,38 +92,7 @@ def event_table(
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
 ) -> EventTable:
-    """Take events from a file or a table in memory.
-
-    Parameters
-    ----------
-    events : str, Path or pandas.DataFrame
-        A folder of ``iscat fit``, ``fits.csv``, ``fits.parquet``, a table of Refeyn's or for
-        PhotoMol (h5 or csv), localisations of Picasso's with masses, or any table with a column
-        ``mass_kda`` and, if possible, ``sigma_mass_kda``, ``snr``, ``frame`` and ``status``, of
-        which only ``ok`` is used.
-    name : str, optional
-        What messages call it; default its path.
-    sigma_kda : float, optional
-        Standard deviation of every event, in place of the table's [kDa].
-    limit_kda : float, optional
-        Mass of which every other particle is detected [kDa].
-    limit_sigma_kda : float, optional
-        Standard deviation of the estimate that decides on detection [kDa]; default the median σ.
-    above_kda : float, optional
-        Use only events above this |mass|, and correct for the cut [kDa].
-
-    Returns
-    -------
-    EventTable
-        Its events, and what is known of those that were missed.
-
-    Raises
-    ------
-    DataError
-        The file cannot be read, or holds no masses.
-    ConfigError
-        An option is impossible.
-    """
+    """Take events from a file or a table in memory."""
     for option, value in (
         ("sigma_kda", sigma_kda),
         ("limit_kda", limit_kda),
@@ -203,22 +137,7 @@ def event_table(
 
 
 def filter_efficiency(good: pd.DataFrame, threshold_snr: float) -> Efficiency | None:
-    """Read the matched filter's efficiency off the events that it found.
-
-    Parameters
-    ----------
-    good : pandas.DataFrame
-        With mass_kda [kDa] and snr.
-    threshold_snr : float
-        Of the filter [standard deviations].
-
-    Returns
-    -------
-    Efficiency or None
-        σ_d is the median of |m|/snr, of events clearly above the threshold where there are enough,
-        and otherwise that of the largest likelihood of what was selected; None where no event has
-        mass and snr.
-    """
+    """Read the matched filter's efficiency off the events that it found."""
     mass, snr = (good[name].to_numpy(dtype=float) for name in ("mass_kda", "snr"))
     known = np.isfinite(mass) & (mass != 0) & (snr > 0) & np.isfinite(snr)
     mass, snr = np.abs(mass[known]), snr[known]
@@ -263,16 +182,6 @@ def shared_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | Non
     """Read the error that all events share, as a function of mass, off the events themselves.
 
     Without calibration the species are contrasts in units of the model, and share their error.
-
-    Parameters
-    ----------
-    good : pandas.DataFrame
-        With mass_kda and, where it is known, systematic_mass_kda [kDa].
-
-    Returns
-    -------
-    callable or None
-        Standard deviation of the mass scale at masses [kDa].
     """
     if "systematic_mass_kda" not in good or good.empty:
         return None

@@ -36,18 +36,7 @@ class TrackRows:
     status: NDArray[np.object_]
 
     def only(self, kept: BoolArray | NDArray[np.int64]) -> TrackRows:
-        """Give some of the rows.
-
-        Parameters
-        ----------
-        kept : ndarray
-            Which, as an index.
-
-        Returns
-        -------
-        TrackRows
-            These.
-        """
+        """Give some of the rows."""
         return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
 
     def massive(self) -> TrackRows:
@@ -75,18 +64,7 @@ class TrackRows:
 
 
 def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
-    """Part a table by its tracks.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        One row per particle and frame, with its track.
-
-    Returns
-    -------
-    dict of int to TrackRows
-        Rows of each track, by its number.
-    """
+    """Part a table by its tracks."""
     numbers = track_numbers(fits)
     known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
     rows = TrackRows(
@@ -99,18 +77,7 @@ def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
 
 
 def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
-    """Measure how near each track comes to any other in the same frame.
-
-    Parameters
-    ----------
-    groups : mapping of int to TrackRows
-        Rows of each track, by its number.
-
-    Returns
-    -------
-    dict of int to float
-        Smallest distance of each [nm]; infinite where it never has company.
-    """
+    """Measure how near each track comes to any other in the same frame."""
     own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
     frame, x, y = (
         np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
@@ -131,19 +98,6 @@ def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
 
 
 def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> float:
-    """Take a statistic of what is known.
-
-    Parameters
-    ----------
-    statistic : callable
-        Such as `numpy.median`.
-    values : ndarray
-        NaN where nothing is known.
-
-    Returns
-    -------
-    float
-        NaN where nothing is known at all.
-    """
+    """Take a statistic of what is known."""
     known = values[~np.isnan(values)]
     return float(statistic(known)) if known.size else np.nan

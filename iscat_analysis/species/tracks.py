@@ -76,39 +76,7 @@ _UM2 = 1e6  # nm²
 
 @dataclass(frozen=True)
 class TrackSetup:
-    """What a movie and its configuration say of all tracks.
-
-    Attributes
-    ----------
-    frame_rate_hz : float or None
-        Without it there is no D [Hz].
-    exposure_ms : float or None
-        Absent, all of the time from frame to frame [ms].
-    frames : (int, int)
-        Half-open range that was analysed.
-    field_nm : (float, float)
-        Height and width of the field [nm].
-    near_nm : float
-        Tracks that come nearer than this to each other have crossed, and those that end nearer
-        than a step to the border of the field have left it [nm].
-    min_frames : int
-        Fewer positions make no D.
-    volume : bool
-        Whether particles move freely in the liquid, so that D tells their size.
-    viscosity_mpa_s, temperature_c : float
-        Of the liquid.
-    index : float or None
-        Refractive index of the material of the mass scale; None where it absorbs.
-    density_kg_m3 : float
-        Its density [kg/m³].
-    n_medium : float
-        Refractive index of the liquid.
-    change : float
-        By how much, relative, the masses of all tracks change together; from `changes_together`.
-    hidden_nm : float
-        How far a particle must go not to be taken up by a background that was learnt with the
-        tracks; 0 where it was not [nm].
-    """
+    """What a movie and its configuration say of all tracks."""
 
     frame_rate_hz: float | None
     exposure_ms: float | None
@@ -140,32 +108,7 @@ def describe_tracks(
     workers: int = 1,
     progress: Progress = silent,
 ) -> pd.DataFrame:
-    """Make the table of tracks.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        One row per particle and frame, with its track; columns as in ``fits.csv``.
-    setup : TrackSetup
-        Frame rate, field, liquid.
-    correlation : callable, optional
-        Correlation of the masses that frames give, by place; absent, they are independent.
-    masses : pandas.DataFrame, optional
-        Masses that the likelihood of all frames together gave: ``mass_kda``, ``sigma_mass_kda`` and
-        ``crb_mass_kda``, indexed by track.  They take the place of combinations of the frames.
-    seed : int
-        Of the free tracks that the test of confinement draws.
-    workers : int
-        Threads that test tracks; the result does not depend on it.
-    progress : Progress
-        Told the tracks; an interrupt leaves out the tests of those that remain.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `TRACK_COLUMNS`, one row per track in the order of their numbers, and
-        ``systematic_mass_kda`` where `fits` has it.
-    """
+    """Make the table of tracks."""
     groups = rows_by_track(fits)
     massive = {track: rows.massive() for track, rows in groups.items()}
     power = information_power(
@@ -192,20 +135,7 @@ def describe_tracks(
 
 
 def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
-    """Say by how much the masses of all tracks change together.
-
-    Parameters
-    ----------
-    fits : pandas.DataFrame
-        As for `describe_tracks`.
-    frames : (int, int)
-        Half-open range that was analysed.
-
-    Returns
-    -------
-    float
-        As from `iscat_analysis.species.common_change.common_change`.
-    """
+    """Say by how much the masses of all tracks change together."""
     massive = [rows.massive() for rows in rows_by_track(fits).values()]
     return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
 

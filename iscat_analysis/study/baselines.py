@@ -25,19 +25,7 @@ _EVALUATIONS = 200
 
 @dataclass(frozen=True)
 class Baselines:
-    """Two-dimensional Gaussian least squares, and the peak contrast; build it with `calibrated`.
-
-    Attributes
-    ----------
-    polarity : float
-        +1 for bright particles, −1 for dark ones.
-    sigma_nm : float
-        Width that the Gaussian starts from [nm].
-    half_px : int
-        Half the side of the square that the Gaussian is fitted to, less one half [pixels].
-    kda_per_gauss, kda_per_peak : float
-        Mass over amplitude [kDa].
-    """
+    """Two-dimensional Gaussian least squares, and the peak contrast; build it with `calibrated`."""
 
     polarity: float
     sigma_nm: float
@@ -47,18 +35,7 @@ class Baselines:
 
     @classmethod
     def calibrated(cls, setting: Setting) -> Baselines:
-        """Take the proportionality from the noiseless image.
-
-        Parameters
-        ----------
-        setting : Setting
-            The experiment; its truth is the standard.
-
-        Returns
-        -------
-        Baselines
-            Ready to measure.
-        """
+        """Take the proportionality from the noiseless image."""
         truth, pixel = setting.truth, setting.scene.pixel_nm
         likelihood = setting.likelihood(setting.draw(truth, None))
         image = likelihood.measured_signal()
@@ -81,17 +58,7 @@ class Baselines:
     def measure(self, likelihood: Likelihood, start: Candidate) -> tuple[FloatArray, FloatArray]:
         """Run both on one region.
 
-        Parameters
-        ----------
-        likelihood : Likelihood
-            Gives the measured signal.
-        start : Candidate
-            Where to begin.
-
-        Returns
-        -------
-        gauss, peak : ndarray, shape (4,)
-            x, y [nm], NaN, mass [kDa].
+        Shapes: `gauss, peak` (4,).
         """
         gauss, peak = self._gauss(likelihood, start), self._peak(likelihood, start)
         gauss[3] *= self.kda_per_gauss

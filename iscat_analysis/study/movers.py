@@ -46,25 +46,7 @@ _UM2 = 1e6  # nm²
 
 @dataclass(frozen=True, eq=False)
 class MovingParticle:
-    """One particle and where it was; places are in the sample, which may drift itself.
-
-    Attributes
-    ----------
-    first : int
-        Its first frame.
-    mass_kda : float
-        Its mass.
-    d_um2_s : float
-        Its diffusion coefficient.
-    points_nm : ndarray, shape (t, points, 3)
-        Places x, y, z whose pictures are averaged, for each of its frames.
-    mean_nm : ndarray, shape (t, 3)
-        Its place averaged over the exposure.
-    middle_nm : ndarray, shape (t, 3)
-        Its place in the middle of the exposure.
-    turn : ndarray of int, shape (t,)
-        How often it was replaced by another that enters where it left, far from the field.
-    """
+    """One particle and where it was; places are in the sample, which may drift itself."""
 
     first: int
     mass_kda: float
@@ -91,27 +73,7 @@ class _Clock:
 def place_movers(
     config: Config, margin_px: float, generator: Callable[[int], np.random.Generator]
 ) -> tuple[MovingParticle, ...]:
-    """Draw the paths of all particles that move.
-
-    Parameters
-    ----------
-    config : Config
-        With ``[[simulation.movers]]``.
-    margin_px : float
-        How far around the field particles matter: there they diffuse too, and leave and enter.
-    generator : callable
-        Random numbers of the particle of a given number.
-
-    Returns
-    -------
-    tuple of MovingParticle
-        Kind by kind.
-
-    Raises
-    ------
-    ConfigError
-        The frame rate is missing, or the exposure is longer than the time between frames.
-    """
+    """Draw the paths of all particles that move."""
     if not config.simulation.movers:
         return ()
     clock = _clock(config)
@@ -137,23 +99,7 @@ def track_rows(
 ) -> Iterator[tuple[object, ...]]:
     """Tell the truth of particles that move, in every frame in which they are in the field.
 
-    Parameters
-    ----------
-    movers : sequence of MovingParticle
-        All of them.
-    shape : tuple of int
-        Rows and columns of the field.
-    pixel_nm : float
-        Side of a pixel [nm].
-    drift_px : ndarray, shape (frames, 2)
-        How far the sample has moved, along y and x.
-    contrasts : mapping of tuple to float
-        Peak contrasts by height and mass; left open where a particle moves up and down.
-
-    Yields
-    ------
-    tuple
-        The columns `TRUTH_COLUMNS` without the first, and `TRACK_COLUMNS`, of `study.simulate`.
+    Shapes: `drift_px` (frames, 2).
     """
     rows, columns = shape
     track = -1

@@ -24,20 +24,7 @@ class SimulatedParticle:
 
 
 def place_particles(config: Config, rng: np.random.Generator) -> tuple[SimulatedParticle, ...]:
-    """Place the particles that stand still: those that are listed, or so many anywhere.
-
-    Parameters
-    ----------
-    config : Config
-        ``[simulation]``, with a pixel size.
-    rng : numpy.random.Generator
-        Draws places, times and masses where particles are not listed.
-
-    Returns
-    -------
-    tuple of SimulatedParticle
-        In order of landing.
-    """
+    """Place the particles that stand still: those that are listed, or so many anywhere."""
     simulation, particle = config.simulation, config.particle
     pixel_nm = float(config.camera.pixel_size_nm or math.nan)
     nominal = material(particle, config.optics.wavelength_nm).mass_kda

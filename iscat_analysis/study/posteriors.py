@@ -31,21 +31,7 @@ WALKERS, STEPS = 32, 300
 
 @dataclass(frozen=True)
 class PosteriorRanks:
-    """Ranks and credible intervals over draws from the prior.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Free parameters.
-    ranks : ndarray of int, shape (n, k)
-        Of the truth among the draws; −1 where the chain was refused.
-    width_over_crb : ndarray, shape (n, k)
-        Posterior standard deviation over the bound at the truth.
-    inside68, inside95 : ndarray of bool, shape (n, k)
-        Whether the central credible interval holds the truth.
-    refused : int
-        Chains that did not converge.
-    """
+    """Ranks and credible intervals over draws from the prior."""
 
     names: tuple[str, ...]
     ranks: NDArray[np.int64]
@@ -79,28 +65,7 @@ def calibrate_posterior(
 ) -> PosteriorRanks:
     """Draw particles from a flat prior and rank each among the draws of its posterior.
 
-    Parameters
-    ----------
-    setting : Setting
-        The experiment.
-    draws : int
-        Particles.
-    lower, upper : ndarray, shape (4,)
-        The prior's box, x, y, z [nm], mass [kDa], in the frame of the region; equal where fixed.
-    seed, stream : int
-        Choose the random numbers.
-    workers : int
-        Threads; without influence on the result.
-    gain : float
-        1; anything else is a wrong likelihood, which the test must notice: the camera's gain is
-        misjudged by this factor.
-    advance : callable, optional
-        Told how many more draws are done.
-
-    Returns
-    -------
-    PosteriorRanks
-        In the order of the draws.
+    Shapes: `lower, upper` (4,).
     """
     index = [PARAMETERS.index(name) for name in setting.free]
     k = len(index)

@@ -26,31 +26,7 @@ PULL_EDGES = np.linspace(-5, 5, 41)
 
 @dataclass(frozen=True)
 class Score:
-    """One parameter of one mode, estimated again and again.
-
-    Attributes
-    ----------
-    bias, bias_se : float
-        Mean error and its standard error.
-    spread : float
-        Standard deviation of the estimates.
-    spread_ci95 : (float, float)
-        Its 95 % confidence interval, see `spread_interval`.
-    spread_robust : float
-        From the quartiles, for a normal distribution.
-    crb, qcrb : float
-        Joint Cramér–Rao bound over the free parameters, and quantum bound for the collected light.
-    spread_over_crb, spread_over_qcrb : float
-        Ratios.
-    spread_over_crb_ci95, spread_over_qcrb_ci95 : (float, float)
-        Their intervals.
-    coverage68, coverage95 : float
-        Share of trials whose truth lies within 1 and 1.96 stated σ; 68.3 % and 95 % if σ is right.
-    coverage68_ci95, coverage95_ci95 : (float, float)
-        Their intervals, see `share_interval`.
-    pull_mean, pull_std : float
-        Of (estimate − truth)/σ.
-    """
+    """One parameter of one mode, estimated again and again."""
 
     bias: float
     bias_se: float
@@ -78,19 +54,7 @@ class Score:
 def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Score:
     """Set one parameter's estimates beside its bounds.
 
-    Parameters
-    ----------
-    error : ndarray, shape (n,)
-        Estimate minus truth; NaN is left out.
-    sigma : ndarray, shape (n,)
-        Stated standard deviations; NaN where the estimator states none.
-    crb, qcrb : float
-        Bounds, in the same unit.
-
-    Returns
-    -------
-    Score
-        NaN throughout for fewer than `MIN_TRIALS` trials.
+    Shapes: `error` (n,), `sigma` (n,).
     """
     kept = np.isfinite(error)
     error, sigma = error[kept], sigma[kept]
@@ -130,15 +94,7 @@ def score(error: FloatArray, sigma: FloatArray, crb: float, qcrb: float) -> Scor
 def spread_error(error: FloatArray) -> float:
     """Relative standard error of a standard deviation.
 
-    Parameters
-    ----------
-    error : ndarray, shape (n,)
-        A sample of any distribution with a fourth moment.
-
-    Returns
-    -------
-    float
-        √[(κ − 1)/4n] with κ the sample's unbiased kurtosis; 1/√(2n) for a normal distribution.
+    Shapes: `error` (n,).
     """
     n = error.size
     centred = error - np.mean(error)
@@ -153,16 +109,7 @@ def spread_error(error: FloatArray) -> float:
 def spread_interval(error: FloatArray) -> tuple[float, float]:
     """Give the 95 % interval of a standard deviation.
 
-    Parameters
-    ----------
-    error : ndarray, shape (n,)
-        Sample.
-
-    Returns
-    -------
-    low, high : float
-        Symmetric in the logarithm, with the sample's own kurtosis in place of the normal one
-        (D. G. Bonett, Comput. Stat. Data Anal. 50, 775, 2006).
+    Shapes: `error` (n,).
     """
     spread = float(np.std(error, ddof=1))
     reach = float(norm.ppf(0.975)) * spread_error(error)
@@ -174,15 +121,7 @@ def spread_interval(error: FloatArray) -> tuple[float, float]:
 def share(inside: BoolArray) -> float:
     """Share of trials that something holds for.
 
-    Parameters
-    ----------
-    inside : ndarray of bool, shape (n,)
-        For which it holds.
-
-    Returns
-    -------
-    float
-        NaN without trials.
+    Shapes: `inside` (n,).
     """
     return float(np.mean(inside)) if inside.size else math.nan
 
@@ -190,16 +129,7 @@ def share(inside: BoolArray) -> float:
 def share_interval(inside: BoolArray) -> tuple[float, float]:
     """Give the 95 % interval of a share.
 
-    Parameters
-    ----------
-    inside : ndarray of bool, shape (n,)
-        For which trials it holds.
-
-    Returns
-    -------
-    low, high : float
-        Of the score test, which is right for few trials too and stays within 0 and 1
-        (E. B. Wilson, J. Am. Stat. Assoc. 22, 209, 1927); NaN without trials.
+    Shapes: `inside` (n,).
     """
     n = inside.size
     if not n:
@@ -212,15 +142,7 @@ def share_interval(inside: BoolArray) -> tuple[float, float]:
 def pull_histogram(pull: FloatArray) -> dict[str, list[float]]:
     """Histogram of pulls beside the normal expectation.
 
-    Parameters
-    ----------
-    pull : ndarray, shape (n,)
-        (estimate − truth)/σ; NaN is left out.
-
-    Returns
-    -------
-    dict
-        ``edges``, ``counts``, ``expected``.
+    Shapes: `pull` (n,).
     """
     finite = pull[np.isfinite(pull)]
     counts = np.histogram(np.clip(finite, PULL_EDGES[0], PULL_EDGES[-1]), PULL_EDGES)[0]
@@ -236,30 +158,11 @@ def pull_histogram(pull: FloatArray) -> dict[str, list[float]]:
 def rank_test(ranks: NDArray[np.int64], possible: int, bins: int = 20) -> tuple[float, FloatArray]:
     """Test whether ranks are uniform.
 
-    Parameters
-    ----------
-    ranks : ndarray of int, shape (n,)
-        0 … possible − 1.
-    possible : int
-        Number of possible ranks, a multiple of `bins`.
-    bins : int
-        Cells of the χ² test.
-
-    Returns
-    -------
-    p_value : float
-        Of Pearson's χ² for equal cells.
-    counts : ndarray, shape (bins,)
-        Ranks in each cell.
-
-    Raises
-    ------
-    ConfigError
-        `possible` is not a multiple of `bins`.
-
     Notes
     -----
     S. Talts et al., arXiv:1804.06788 (2018).
+
+    Shapes: `ranks` (n,), `counts` (bins,).
     """
     if possible % bins:
         raise ConfigError(f"possible = {possible} ranks do not fall evenly into bins = {bins}")

@@ -35,26 +35,7 @@ START_MASS = 1.5
 
 @dataclass(frozen=True)
 class Setting:
-    """One experiment to be repeated; build it with `make_setting`.
-
-    Attributes
-    ----------
-    config : Config
-        Resolved for the mode, the photons and the height of this experiment.
-    scene : Scene
-        The main job's models.
-    region : Region
-        The pixels that are fitted.
-    experiment : Experiment
-        Gives the bounds.
-    truth : ndarray, shape (4,)
-        x, y, z [nm], mass [kDa], in the frame of the region.
-    read_variance_e2 : float
-        Read-noise variance of a frame [e²].
-    level : bool
-        Whether fits and bounds count the level of the light among what is unknown, as they do where
-        ``background.method = "sliding"``.
-    """
+    """One experiment to be repeated; build it with `make_setting`."""
 
     config: Config
     scene: Scene
@@ -103,17 +84,7 @@ class Setting:
     def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:
         """Draw the counts of one experiment.
 
-        Parameters
-        ----------
-        truth : ndarray, shape (4,)
-            Particle, in the frame of the region.
-        random : numpy.random.Generator or None
-            Its own for every trial; None gives the expectations.
-
-        Returns
-        -------
-        Windows
-            Sums before and after, as `measure_windows` makes them of a movie.
+        Shapes: `truth` (4,).
         """
         return self.windows(self.level_e() + self.signal_e(truth), random)
 
@@ -122,19 +93,7 @@ class Setting:
     ) -> Windows:
         """Draw counts around any expected frame, for studies of wrong models.
 
-        Parameters
-        ----------
-        frame_e : ndarray, shape (ny, nx)
-            Expected counts per frame after landing [e].
-        random : numpy.random.Generator or None
-            Its own for every trial; None gives the expectations.
-        gain : float
-            Factor by which the camera's gain was misjudged: counts are multiplied by it.
-
-        Returns
-        -------
-        Windows
-            Sums before and after.
+        Shapes: `frame_e` (ny, nx).
         """
         at, shape = self.config.bounds, frame_e.shape
         level, read = np.full(shape, self.level_e()), self.read_variance_e2
@@ -171,17 +130,7 @@ class Setting:
     def start(self, truth: FloatArray, random: np.random.Generator) -> Candidate:
         """Where a fit begins: near the particle, as a detection would be.
 
-        Parameters
-        ----------
-        truth : ndarray, shape (4,)
-            The particle.
-        random : numpy.random.Generator
-            Its own for every trial.
-
-        Returns
-        -------
-        Candidate
-            What is not free is known.
+        Shapes: `truth` (4,).
         """
         shift = random.uniform(-START_PX, START_PX, 2)
         place = truth[:2] / self.scene.pixel_nm + shift
@@ -229,33 +178,7 @@ def make_setting(
     z_nm: float | None = None,
     scene: Scene | None = None,
 ) -> Setting:
-    """Set up one experiment.
-
-    Parameters
-    ----------
-    config : Config
-        ``[bounds]`` gives photons and frames; ``fit.roi_nm`` the region.
-    mode : str
-        ``"mass"``, ``"localize"`` or ``"joint"``.
-    collected : float, optional
-        Scattered photons collected in all frames; ``bounds.photons_per_pixel`` is scaled to it.
-    z_nm : float, optional
-        Height of the particle; default ``bounds.z_nm``, or ``particle.height_nm``, raised where z
-        is free until it lies `CLEARANCE` standard deviations inside ``fit.z_range_nm``.
-    scene : Scene, optional
-        The models of an earlier setting of the same optics and mode.
-
-    Returns
-    -------
-    Setting
-        Ready to draw from.
-
-    Raises
-    ------
-    ConfigError
-        The particle lies outside the region or the heights that fits search, and as in `plan` and
-        `make_scene`.
-    """
+    """Set up one experiment."""
     pixel_nm = config.camera.pixel_size_nm
     side = config.fit.roi_px(pixel_nm) if pixel_nm else config.bounds.pixels
     changes: dict[str, Mapping[str, Any]] = {

@@ -56,17 +56,7 @@ _NO_UUID = "urn:uuid:00000000-0000-0000-0000-000000000000"
 
 @dataclass(frozen=True, eq=False)
 class _Still:
-    """What does not change until a particle comes or leaves.
-
-    Attributes
-    ----------
-    field : ndarray of complex
-        Of the particles that stand still, on the samples inside each pixel.
-    expected : ndarray, shape (y, x)
-        Photoelectrons of the sample with them.
-    spectrum : ndarray or None
-        Its Fourier transform, where the sample drifts.
-    """
+    """What does not change until a particle comes or leaves."""
 
     field: ComplexArray
     expected: FloatArray
@@ -81,35 +71,7 @@ def write_stack(
     overwrite: bool = False,
     progress: Progress = silent,
 ) -> pd.DataFrame:
-    """Simulate a movie into a TIFF file, with its truth in ``<stem>.truth.csv`` beside it.
-
-    Parameters
-    ----------
-    config : Config
-        ``[simulation]`` and everything the forward model reads.
-    path : Path
-        Where the movie goes: OME-TIFF metadata, 16-bit counts, BigTIFF where needed.
-    seed : int, optional
-        In place of ``simulation.seed``; the same seed gives the same bytes.
-    overwrite : bool
-        Replace an existing file.
-    progress : Progress
-        Told how many frames are done.
-
-    Returns
-    -------
-    pandas.DataFrame
-        One row per particle, columns `TRUTH_COLUMNS`; with particles that move, one row for each
-        and every frame in which it is in the field, and `TRACK_COLUMNS`.
-
-    Raises
-    ------
-    ConfigError
-        The pixel size is missing, the counts do not fit into 16 bits, or particles move and the
-        frame rate is missing or the exposure longer than the time between frames.
-    DataError
-        The file exists, or cannot be written.
-    """
+    """Simulate a movie into a TIFF file, with its truth in ``<stem>.truth.csv`` beside it."""
     if config.camera.pixel_size_nm is None:
         raise ConfigError(
             "camera.pixel_size_nm is needed to simulate: add it, as in camera.pixel_size_nm = 84.4"
@@ -141,28 +103,7 @@ def write_stack(
 
 
 class Movie:
-    """A simulated movie, made frame by frame.
-
-    Parameters
-    ----------
-    config : Config
-        Validated, with a pixel size.
-    seed : int
-        Of every random number in it.
-
-    Attributes
-    ----------
-    background_e : ndarray, shape (y, x)
-        Expected photoelectrons without particles, per frame; the first frame's where it drifts.
-    drift_px : ndarray, shape (t, 2)
-        How far the sample has moved since the first frame, along y and x.
-    power : ndarray, shape (t,)
-        Laser power of each frame, mean 1.
-    particles : tuple of SimulatedParticle
-        In order of landing.
-    movers : tuple of MovingParticle
-        Those that diffuse.
-    """
+    """A simulated movie, made frame by frame."""
 
     def __init__(self, config: Config, seed: int) -> None:
         simulation = config.simulation

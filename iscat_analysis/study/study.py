@@ -68,37 +68,7 @@ def run_benchmark(
     command: str = "",
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure what the fits achieve, in every mode, on synthetic shot noise.
-
-    Parameters
-    ----------
-    config : Config
-        ``[bounds]`` describes the particle, the light and the frames, ``fit.roi_nm`` the region.
-    trials : int
-        Repetitions of the experiment in the table.
-    seed : int
-        Same seed, same numbers.
-    workers : int, optional
-        Threads; default ``compute.workers``.  Without influence on the result, timings apart.
-    posterior : bool
-        Also sample posteriors, one in `POSTERIOR_SHARE` trials.
-    command : str
-        The command line, for the record.
-    progress : Progress
-        Told how far the study is.
-
-    Returns
-    -------
-    dict
-        What ``benchmark.json`` holds: for ``"mass"``, ``"localize"`` and ``"joint"`` one entry for
-        each free parameter (the fields of `Score`, posterior coverage, baselines) and the counts;
-        curves, histograms and provenance beside them.
-
-    Raises
-    ------
-    ConfigError
-        Fewer than `LEAST_TRIALS` trials, or the configuration does not describe an experiment.
-    """
+    """Measure what the fits achieve, in every mode, on synthetic shot noise."""
     if trials < LEAST_TRIALS:
         raise ConfigError(
             f"trials = {trials} say nothing about a spread: give at least {LEAST_TRIALS}"
@@ -173,27 +143,7 @@ def run_benchmark(
 
 
 def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool = False) -> Path:
-    """Write ``benchmark.json``, ``benchmark.html``, ``config.toml`` and ``figures/``.
-
-    Parameters
-    ----------
-    study : mapping
-        From `run_benchmark`.
-    folder : Path
-        Appears complete or not at all.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-
-    Returns
-    -------
-    Path
-        The folder.
-
-    Raises
-    ------
-    DataError
-        The folder exists and may not be replaced, or cannot be written.
-    """
+    """Write ``benchmark.json``, ``benchmark.html``, ``config.toml`` and ``figures/``."""
     with atomic_folder(folder, overwrite, known=BENCHMARK_NAMES) as building:
         text = to_json("benchmark", study)
         (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
@@ -205,20 +155,7 @@ def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool =
 
 
 def check_benchmark_output(folder: Path, overwrite: bool) -> None:
-    """Refuse a folder that must not be written, before any work is done.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the results shall go.
-    overwrite : bool
-        Whether an earlier result may be replaced.
-
-    Raises
-    ------
-    DataError
-        As in `write_benchmark`.
-    """
+    """Refuse a folder that must not be written, before any work is done."""
     check_output(folder, overwrite, known=BENCHMARK_NAMES)
 
 

@@ -27,27 +27,7 @@ CHUNK = 16
 
 @dataclass(frozen=True)
 class Trials:
-    """Estimates of repeated experiments.
-
-    Attributes
-    ----------
-    truth : ndarray, shape (n, 4)
-        What was simulated, in the order of `PARAMETERS`.
-    estimate, sigma : ndarray, shape (n, 4)
-        What was found, and its stated standard deviation.
-    status : ndarray of str, shape (n,)
-        Verdict of each fit.
-    flags : tuple of frozenset of str
-        Every flag of each fit.
-    p_value, chi2_reduced, gap : ndarray, shape (n,)
-        Goodness of fit, and log-likelihood ahead of the next height (infinite without one).
-    gauss : ndarray, shape (n, 4)
-        Gaussian least squares: x, y [nm], NaN, mass [kDa]; NaN where not run or failed.
-    peak : ndarray, shape (n, 4)
-        Peak contrast, likewise.
-    seconds : float
-        Processor time spent in the fits, summed over threads.
-    """
+    """Estimates of repeated experiments."""
 
     truth: FloatArray
     estimate: FloatArray
@@ -85,22 +65,7 @@ class Trials:
 
 
 def trial_generator(seed: int, stream: int, trial: int) -> np.random.Generator:
-    """Random numbers of one trial.
-
-    Parameters
-    ----------
-    seed : int
-        Of the whole study.
-    stream : int
-        Which setting of the study.
-    trial : int
-        Number of the trial.
-
-    Returns
-    -------
-    numpy.random.Generator
-        Independent of every other trial's.
-    """
+    """Random numbers of one trial."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, stream, trial])))
 
 
@@ -119,29 +84,7 @@ def run_trials(
 ) -> Trials:
     """Draw and fit.
 
-    Parameters
-    ----------
-    setting : Setting
-        The experiment.
-    count : int
-        Trials.
-    seed, stream : int
-        Choose the random numbers.
-    workers, chunk : int
-        Threads, and trials that one takes at a time; without influence on the result.
-    truths : ndarray, shape (count, 4), optional
-        A particle for each trial, in place of the setting's.
-    baselines : Baselines, optional
-        Also run the estimators that labs use.
-    correct_bias : bool
-        As in `fit_particle`; False shows what the bare maximum of the likelihood does.
-    advance : callable, optional
-        Told how many more trials are done.
-
-    Returns
-    -------
-    Trials
-        In the order of their numbers.
+    Shapes: `truths` (count, 4).
     """
     truth = np.tile(setting.truth, (count, 1)) if truths is None else np.array(truths, dtype=float)
     estimate, sigma = np.full((count, 4), np.nan), np.full((count, 4), np.nan)

@@ -30,28 +30,12 @@ def noise_curve(
 ) -> pd.DataFrame:
     """Set contrast noise between successive averages of 1, 2, 4 … frames against shot noise.
 
-    Parameters
-    ----------
-    stack : FrameSource
-        Read once, a block at a time.
-    found : Moments
-        Its moments.
-    used : ndarray of bool, shape (y, x)
-        Pixels to use.
-    result : Solution
-        The camera.
-    progress : Progress
-        Told how many frames are done.
-
-    Returns
-    -------
-    pandas.DataFrame
-        Columns `NOISE_COLUMNS`.
-
     Notes
     -----
     The spread over pixels is taken from a median, so that a few particles do not count; what moves
     or drifts everywhere does.
+
+    Shapes: `used` (y, x).
     """
     frames = stack.shape[0]
     light = found.mean[used] - result.offset.value
@@ -102,20 +86,7 @@ def noise_curve(
 
 
 def verdict_of(noise: pd.DataFrame) -> tuple[int, str]:
-    """Say up to which average the noise is shot noise.
-
-    Parameters
-    ----------
-    noise : pandas.DataFrame
-        What `noise_curve` gives.
-
-    Returns
-    -------
-    frames : int
-        The longest such average; 0 for none.
-    verdict : str
-        The same in one sentence.
-    """
+    """Say up to which average the noise is shot noise."""
     within = noise["excess"] <= 1 + EXCESS + _SIGMAS * noise["excess_se"]
     first = noise.iloc[0]
     if not within.iloc[0]:

@@ -59,31 +59,6 @@ def measure_camera(
     """Measure gain, offset and read noise, and how far averaging lowers the noise.
 
     Every stack is read twice at most, a block at a time.
-
-    Parameters
-    ----------
-    light : sequence of FrameSource
-        Flats, or the movie itself, at one or several levels, each of `LEAST_FRAMES` frames or more;
-        may be empty where `dark` is given.
-    dark : FrameSource, optional
-        Frames without light.
-    offset_adu : float, optional
-        The offset, where it is known and there is no dark [counts].
-    maps : bool
-        Give maps as well as numbers.
-    progress : Progress
-        Told how many frames are done.
-
-    Returns
-    -------
-    CameraCalibration
-        Estimates with standard errors from the scatter over pixels, curves and a verdict.
-
-    Raises
-    ------
-    DataError
-        The stacks differ in shape, are too short, are saturated, or hold no noise that grows with
-        the light.
     """
     _checked(light, dark, maps)
     notes: list[str] = []

@@ -21,19 +21,7 @@ _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Moments of one stack, per pixel [counts].
-
-    Attributes
-    ----------
-    mean, variance : ndarray, shape (y, x)
-        Over the frames; the variance without the laser's flicker where that was taken out.
-    slope, slope_variance : ndarray, shape (y, x)
-        Of the pixel against the mean frame, 1 on average; NaN where nothing flickers.
-    highest, lowest : ndarray, shape (y, x)
-        Largest and least count, of the stack's own type.
-    n_frames : int
-        Frames read.
-    """
+    """Moments of one stack, per pixel [counts]."""
 
     mean: FloatArray
     variance: FloatArray
@@ -50,18 +38,7 @@ class Moments:
 
 
 def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
-    """Divide a stack into ranges of frames that fit into memory.
-
-    Parameters
-    ----------
-    stack : FrameSource
-        Of any length.
-
-    Yields
-    ------
-    start, stop : int
-        Half-open ranges, in order.
-    """
+    """Divide a stack into ranges of frames that fit into memory."""
     frames, rows, columns = stack.shape
     size = max(2, _BLOCK_BYTES // (8 * rows * columns))
     for start in range(0, frames, size):
@@ -69,33 +46,14 @@ def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
 
 
 def robust_sigma(deviations: FloatArray) -> float:
-    """Estimate the standard deviation of normal deviations from their median size.
-
-    Parameters
-    ----------
-    deviations : ndarray
-        Distances from the centre, of either sign.
-
-    Returns
-    -------
-    float
-        Indifferent to a few outliers.
-    """
+    """Estimate the standard deviation of normal deviations from their median size."""
     return float(np.median(np.abs(deviations))) / _MAD
 
 
 def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
     """Group pixels of like brightness, equally many in each group.
 
-    Parameters
-    ----------
-    mean : ndarray, shape (n,)
-        Of each pixel.
-
-    Returns
-    -------
-    list of ndarray of int
-        Indices into `mean`, by rising brightness.
+    Shapes: `mean` (n,).
     """
     return np.array_split(np.argsort(mean), max(1, min(_BINS, mean.size // 32)))
 
@@ -109,27 +67,6 @@ def moments_of(
 ) -> Moments:
     """Measure mean and variance of every pixel; with `used`, the light's flicker is taken out.
 
-    Parameters
-    ----------
-    stack : FrameSource
-        Read once, a block at a time.
-    used : ndarray of bool, shape (y, x), or None
-        Pixels whose mean is the laser's power; None for a dark.
-    advance : callable
-        Told how many more frames are done.
-    flickering : {"frames", "rows", "columns"}
-        Which pixels flicker together.
-
-    Returns
-    -------
-    Moments
-        Of every pixel, used or not.
-
-    Raises
-    ------
-    DataError
-        The counts are not finite, or successive frames are identical.
-
     Notes
     -----
     Differences d_k of successive frames have the covariance v·(2, −1 beside the diagonal).  Their
@@ -137,6 +74,8 @@ def moments_of(
     squares that are expected, with M that matrix; the mean carries 1/P of each pixel's noise, of
     which a pixel that follows it s times as strongly loses s/P.
     Where rows or columns flicker, the mean is that of each.
+
+    Shapes: `used` (y, x).
     """
     together = _TOGETHER[flickering]
     frames, rows, columns = stack.shape

@@ -24,22 +24,7 @@ _OUTLIER_SIGMAS = 8.0
 def saturated(highest: NDArray[Any], name: str) -> BoolArray:
     """Find saturated pixels: at the largest number of their type, or of an ADC of 8 to 16 bits.
 
-    Parameters
-    ----------
-    highest : ndarray, shape (y, x)
-        Largest count of each pixel, of the stack's own type.
-    name : str
-        What messages call the stack.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Where they are.
-
-    Raises
-    ------
-    DataError
-        They are more than half of all.
+    Shapes: `highest` (y, x), result (y, x).
     """
     top = float(highest.max())
     ceiling = converter_ceiling(highest)
@@ -57,17 +42,7 @@ def saturated(highest: NDArray[Any], name: str) -> BoolArray:
 def unlike_neighbours(light: FloatArray, *, low: float = _DARK, high: float = _BRIGHT) -> BoolArray:
     """Find pixels far darker or brighter than their neighbours.
 
-    Parameters
-    ----------
-    light : ndarray, shape (y, x)
-        Counts above the offset.
-    low, high : float
-        Share of the neighbours' median below and above which a pixel is unlike them.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Where they are.
+    Shapes: `light` (y, x), result (y, x).
     """
     local = np.maximum(median_filter(light, size=5, mode="nearest"), 0.0)
     with np.errstate(invalid="ignore"):
@@ -78,15 +53,7 @@ def unlike_neighbours(light: FloatArray, *, low: float = _DARK, high: float = _B
 def clipped(lowest: NDArray[Any]) -> BoolArray:
     """Find pixels that reached zero counts, below which nothing is stored.
 
-    Parameters
-    ----------
-    lowest : ndarray, shape (y, x)
-        Least count of each pixel, of the stack's own type.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Where noise may have been cut off; nowhere in signed numbers.
+    Shapes: `lowest` (y, x), result (y, x).
     """
     unsigned = np.issubdtype(lowest.dtype, np.unsignedinteger)
     return np.asarray((lowest == 0) & unsigned, dtype=np.bool_)
@@ -95,15 +62,7 @@ def clipped(lowest: NDArray[Any]) -> BoolArray:
 def stand_out(values: FloatArray) -> BoolArray:
     """Find pixels far above the others, in robust standard deviations.
 
-    Parameters
-    ----------
-    values : ndarray, shape (y, x)
-        Mean or variance of a dark.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Where they are.
+    Shapes: `values` (y, x), result (y, x).
     """
     centre = float(np.median(values))
     spread = robust_sigma(values - centre)
@@ -113,17 +72,7 @@ def stand_out(values: FloatArray) -> BoolArray:
 def unsteady(found: Sequence[Moments], used: BoolArray) -> BoolArray:
     """Find pixels that blink, or through which a particle moved.
 
-    Parameters
-    ----------
-    found : sequence of Moments
-        One per stack of light.
-    used : ndarray of bool, shape (y, x)
-        Among which to look.
-
-    Returns
-    -------
-    ndarray of bool, shape (y, x)
-        Where the variance is far above that of pixels as bright.
+    Shapes: `used` (y, x), result (y, x).
     """
     out = np.zeros(used.shape, dtype=np.bool_)
     for item in found:
@@ -139,15 +88,7 @@ def unsteady(found: Sequence[Moments], used: BoolArray) -> BoolArray:
 def mask_notes(masked: Mapping[str, BoolArray]) -> list[str]:
     """Say how many pixels are left out, and where.
 
-    Parameters
-    ----------
-    masked : mapping of str to ndarray of bool, shape (y, x)
-        By what is wrong with them.
-
-    Returns
-    -------
-    list of str
-        One sentence for each kind that there is.
+    Shapes: `masked` (y, x).
     """
     notes = []
     for name, mask in masked.items():

@@ -32,21 +32,7 @@ _TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlat
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A camera, and the line of variance against mean that it stands for.
-
-    Attributes
-    ----------
-    gain, offset : Estimate
-        [e/count] and [counts].
-    offset_from : str
-        As in `CameraCalibration`.
-    read_adu, read_e : Estimate or None
-        Read noise [counts] and [e]; None where not identifiable.
-    read_below_e : float or None
-        95 % upper limit where it is too small to be seen [e].
-    intercept, slope : float
-        Of the fitted variance against the mean [counts²] and [counts].
-    """
+    """A camera, and the line of variance against mean that it stands for."""
 
     gain: Estimate
     offset: Estimate
@@ -67,28 +53,7 @@ def solve(
 ) -> Solution:
     """Solve for the camera, as far as the recordings allow.
 
-    Parameters
-    ----------
-    found : sequence of Moments
-        One per stack of light.
-    used : ndarray of bool, shape (y, x)
-        Pixels to use.
-    dark : Moments or None
-        Of the dark; it gives offset and read noise by itself.
-    given : float or None
-        The offset, where it is known [counts].
-    notes : list of str
-        Gets what the user should know.
-
-    Returns
-    -------
-    Solution
-        Standard errors are from the scatter over pixels.
-
-    Raises
-    ------
-    DataError
-        The noise does not grow with the light, or the recordings leave the gain open.
+    Shapes: `used` (y, x).
     """
     mean, variance, frames = _pooled(found, used)
     if dark is not None:
@@ -189,20 +154,6 @@ def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Est
 def _unselected(whole: _ReadVariance, half: Estimate, threshold: float) -> Estimate:
     """Estimate without bias what is reported only where half of the data exceed a threshold.
 
-    Parameters
-    ----------
-    whole : _ReadVariance
-        From all data: M ± τ [counts²], and what is wanted [e²].
-    half : Estimate
-        A ± a, from those that decide [counts²].
-    threshold : float
-        c, which A has exceeded.
-
-    Returns
-    -------
-    Estimate
-        The other half's estimate, averaged over all halves that give the same whole [e²].
-
     Notes
     -----
     The other half knows nothing of the decision, so that its estimate has no bias, and by the
@@ -279,17 +230,7 @@ def _with_dark(
 def dark_numbers(dark: Moments, used: BoolArray) -> tuple[Estimate, Estimate]:
     """Average a dark over its pixels, with standard errors from their scatter.
 
-    Parameters
-    ----------
-    dark : Moments
-        Of the dark.
-    used : ndarray of bool, shape (y, x)
-        Pixels to use.
-
-    Returns
-    -------
-    offset, read_noise : Estimate
-        [counts].
+    Shapes: `used` (y, x).
     """
     pixels = math.sqrt(np.count_nonzero(used))
     mean, variance = dark.mean[used], dark.variance[used]
@@ -335,21 +276,7 @@ def variance_line(
 ) -> tuple[FloatArray, FloatArray]:
     """Fit y = a + b·x with the variance of y as (fit)²/frames.
 
-    Parameters
-    ----------
-    x, y : ndarray, shape (n,)
-        Mean and variance of each pixel.
-    frames : ndarray, shape (n,)
-        Degrees of freedom of each variance.
-    tiles : ndarray of int, shape (n,), optional
-        Which pixels may differ from the line together; default each by itself.
-
-    Returns
-    -------
-    theta : ndarray, shape (2,)
-        a and b.
-    covariance : ndarray, shape (2, 2)
-        Sandwich covariance.
+    Shapes: `x, y` (n,), `frames` (n,), `tiles` (n,), `theta` (2,), `covariance` (2, 2).
     """
     centre, scale = float(x.mean()), float(x.std())
     design = np.stack([np.ones_like(x), (x - centre) / scale], axis=1)
@@ -418,19 +345,7 @@ def zero_of_flicker(
 ) -> Estimate | None:
     """Find the mean at which pixels follow the power no more, from a weighted line.
 
-    Parameters
-    ----------
-    slope, variance : ndarray, shape (n,)
-        How strongly each pixel follows the power, and the variance of that.
-    mean : ndarray, shape (n,)
-        Of each pixel.
-    tiles : ndarray of int, shape (n,), optional
-        As in `variance_line`.
-
-    Returns
-    -------
-    Estimate or None
-        None where nothing flickers enough, or the scene has moved.
+    Shapes: `slope, variance` (n,), `mean` (n,), `tiles` (n,).
     """
     if not np.isfinite(slope).all() or mean.std() == 0:
         return None

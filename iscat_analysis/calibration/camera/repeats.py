@@ -17,28 +17,7 @@ _NAMED = 4
 
 
 def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSource:
-    """Leave out frames that are zero throughout or the same as the frame before.
-
-    Parameters
-    ----------
-    stack : FrameSource
-        Read once, a block at a time.
-    least : int
-        Frames that must remain.
-    notes : list of str
-        Told what was left out.
-
-    Returns
-    -------
-    FrameSource
-        The stack itself where nothing is left out, or where no two frames differ, which the caller
-        refuses with the reason.
-
-    Raises
-    ------
-    DataError
-        Fewer than `least` different frames remain.
-    """
+    """Leave out frames that are zero throughout or the same as the frame before."""
     total = stack.shape[0]
     good = np.zeros(total, dtype=np.bool_)
     last: NDArray[Any] | None = None

@@ -14,13 +14,7 @@ _Z95 = 1.959964
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and how well it is known.
-
-    Attributes
-    ----------
-    value, se : float
-        Estimate and standard error, in the same unit.
-    """
+    """A number and how well it is known."""
 
     value: float
     se: float
@@ -33,42 +27,7 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class CameraCalibration:
-    """What the noise says of a camera; `measure_camera` makes it.
-
-    Attributes
-    ----------
-    gain_e_per_adu : Estimate or None
-        Photoelectrons per count [e/count]; None from a dark alone.
-    offset_adu : Estimate
-        Counts in the dark [counts]; where `offset_from` is ``"line"`` it is o − σ_r²/g.
-    offset_from : str
-        ``"dark"``, ``"given"``, ``"flicker"`` or ``"line"``.
-    read_noise_adu : Estimate or None
-        Standard deviation per frame, rounding included [counts]; None where not identifiable.
-    read_noise_e : Estimate or None
-        The same [e].
-    read_noise_below_e : float or None
-        95 % upper limit where the read noise is too small to be seen [e].
-    curve : pandas.DataFrame
-        Photon-transfer curve: mean_adu, variance_adu2, variance_se, fit_adu2, pixels.
-    noise : pandas.DataFrame
-        Noise against averaging: n_frames, contrast_noise, contrast_noise_se, shot_noise, excess
-        (noise variance over shot-noise variance), excess_se, comparisons.
-    shot_limited_frames : int or None
-        Longest average whose noise is shot noise; 0 for none, None where it cannot be told.
-    verdict : str
-        The same in one sentence.
-    masked : dict of str to ndarray of bool, shape (y, x)
-        ``"saturated"``, ``"clipped"`` (at zero counts, where noise is cut off), ``"dead"``,
-        ``"hot"`` (bright or noisy beyond its neighbours).
-    maps : dict of str to ndarray, shape (y, x)
-        As far as the recordings give them and they were asked for: ``"gain_e_per_adu"``,
-        ``"offset_adu"``, ``"read_noise_e"``.
-    frames : int
-        Frames of light that were used.
-    notes : tuple of str
-        What the user should know, one sentence each.
-    """
+    """What the noise says of a camera; `measure_camera` makes it."""
 
     gain_e_per_adu: Estimate | None
     offset_adu: Estimate
@@ -86,13 +45,7 @@ class CameraCalibration:
     notes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``camera.json`` holds.
-
-        Returns
-        -------
-        dict
-            Nested plain values, the curves by column; maps are left out.
-        """
+        """Give what ``camera.json`` holds."""
 
         def plain(estimate: Estimate | None) -> dict[str, Any] | None:
             if estimate is None:
@@ -116,18 +69,7 @@ class CameraCalibration:
         }
 
     def to_toml(self, maps: dict[str, str] | None = None) -> str:
-        """Write the section ``[camera]`` to paste into a configuration.
-
-        Parameters
-        ----------
-        maps : dict of str to str, optional
-            Paths of maps, by key, to name in place of the numbers.
-
-        Returns
-        -------
-        str
-            TOML text; a value that is not known is left out.
-        """
+        """Write the section ``[camera]`` to paste into a configuration."""
         lines = ["[camera]"]
         for key, estimate in (
             ("gain_e_per_adu", self.gain_e_per_adu),

@@ -41,20 +41,7 @@ _TILE_PX = 16  # within which pixels may differ from the line together, as a spe
 
 @dataclass(frozen=True)
 class LightZero:
-    """Where the light is zero.
-
-    Attributes
-    ----------
-    share : float
-        The light that is none, over the mean light, as configured; 0 where the offset is right.
-    se : float
-        Its standard error.
-    electrons : float
-        The same light [e].
-    flickers : bool
-        Whether it is told by the flicker of the laser; else by the noise, which light that is
-        noisy by itself and read noise that is not declared add to.
-    """
+    """Where the light is zero."""
 
     share: float
     se: float
@@ -67,18 +54,7 @@ class LightZero:
         return abs(self.share) > TOLERANCE + _SIGMAS * self.se
 
     def may_be(self, share: float) -> bool:
-        """Tell whether the light that is none may be another share.
-
-        Parameters
-        ----------
-        share : float
-            Of the mean light.
-
-        Returns
-        -------
-        bool
-            Within the errors.
-        """
+        """Tell whether the light that is none may be another share."""
         return abs(self.share - share) < TOLERANCE + _SIGMAS * self.se
 
 
@@ -87,23 +63,11 @@ def find_zero(
 ) -> LightZero | None:
     """Find where the light is zero.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Successive frames in which little happens; the first of them are used.
-    camera : Camera
-        As configured.
-    masked : ndarray of bool, shape (y, x), optional
-        Pixels to leave out; saturated ones, and those unlike their neighbours, always are.
-
-    Returns
-    -------
-    LightZero or None
-        None where the pixels are too alike, too few or too dark to tell.
-
     Notes
     -----
     Errors are from the scatter of squares of `_TILE_PX` pixels about the line.
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     pixels = counts.shape[1] * counts.shape[2]
     most = min(_MOST_FRAMES, max(_LEAST_FRAMES, _MOST_COUNTS // pixels))

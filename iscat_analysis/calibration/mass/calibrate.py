@@ -42,33 +42,7 @@ def calibrate_mass(
 ) -> MassCalibration:
     """Calibrate contrast against the masses of standards.
 
-    Parameters
-    ----------
-    contrasts : array_like, shape (n,)
-        Signed peak contrasts of landing and leaving events; the landing ones are used.
-    standards_kda : sequence of float
-        Masses of the standards, two or more [kDa].
-    standards_se_kda : sequence of float, optional
-        Their standard errors [kDa]; default `STANDARD_ERROR` of each.
-    sigmas : array_like, shape (n,), optional
-        Standard deviation of each contrast, where known; then a peak's width is what exceeds them.
-    landing : {"dark", "bright"}
-        What a landing particle does to its place.
-    name : str
-        What messages call the events.
-
-    Returns
-    -------
-    MassCalibration
-        The line, its covariance and the peaks.
-
-    Raises
-    ------
-    ConfigError
-        The standards are not two or more different positive masses.
-    DataError
-        There are too few events, most have the sign of leaving, no peaks match the standards, or
-        their line is one of other units.
+    Shapes: `contrasts` (n,), `sigmas` (n,).
     """
     masses, masses_se = _standards(standards_kda, standards_se_kda)
     signed = np.asarray(contrasts, dtype=np.float64)

@@ -12,19 +12,7 @@ from iscat_analysis.records import FloatArray
 
 @dataclass(frozen=True)
 class Line:
-    """A straight line y = slope·x + intercept.
-
-    Attributes
-    ----------
-    slope, intercept : float
-        Best estimate.
-    covariance : ndarray, shape (2, 2)
-        Of (slope, intercept), from the errors of the points alone.
-    chi2 : float
-        Weighted sum of squared distances.
-    dof : int
-        Points less two.
-    """
+    """A straight line y = slope·x + intercept."""
 
     slope: float
     intercept: float
@@ -36,22 +24,7 @@ class Line:
 def york_line(x: ArrayLike, x_se: ArrayLike, y: ArrayLike, y_se: ArrayLike) -> Line:
     """Fit a line to points with independent errors in both coordinates.
 
-    Parameters
-    ----------
-    x, x_se : array_like, shape (n,)
-        First coordinates, n ≥ 2, and their standard errors, which may be zero.
-    y, y_se : array_like, shape (n,)
-        Second coordinates and their standard errors, positive.
-
-    Returns
-    -------
-    Line
-        The maximum-likelihood line (York et al., Am. J. Phys. 72, 367, 2004, eqs 13a–e).
-
-    Raises
-    ------
-    ValueError
-        There are fewer than two different x, or an error of y is not positive.
+    Shapes: `x, x_se` (n,), `y, y_se` (n,).
     """
     xs, sx, ys, sy = (np.asarray(v, dtype=np.float64) for v in (x, x_se, y, y_se))
     if np.unique(xs).size < 2 or (sy <= 0).any():

@@ -28,24 +28,7 @@ _MOST_STANDARDS = 8  # of more, no subsets are tried for a message
 def match(peaks: Sequence[ContrastPeak], masses: FloatArray, name: str) -> list[ContrastPeak]:
     """Choose the peaks that a line with a small offset puts nearest the standards.
 
-    Parameters
-    ----------
-    peaks : sequence of ContrastPeak
-        By rising contrast.
-    masses : ndarray, shape (n,)
-        Of the standards, rising [kDa].
-    name : str
-        What messages call the events.
-
-    Returns
-    -------
-    list of ContrastPeak
-        One per standard.
-
-    Raises
-    ------
-    DataError
-        There are fewer peaks than standards.
+    Shapes: `masses` (n,).
     """
     if len(peaks) < masses.size:
         raise DataError(
@@ -64,23 +47,7 @@ def check_match(
 ) -> None:
     """Refuse a line that misses its standards by its χ², or does not begin near zero.
 
-    Parameters
-    ----------
-    line : Line
-        Signed contrast against mass.
-    chosen : sequence of ContrastPeak
-        One per standard.
-    peaks : sequence of ContrastPeak
-        All that were found.
-    masses : ndarray, shape (n,)
-        Of the standards [kDa].
-    name : str
-        What messages call the events.
-
-    Raises
-    ------
-    DataError
-        It does.
+    Shapes: `masses` (n,).
     """
     contrast = np.array([peak.contrast for peak in chosen])
     slope, offset = abs(line.slope), math.copysign(1.0, line.slope) * line.intercept

@@ -27,17 +27,7 @@ _ROOT_2PI = math.sqrt(2 * math.pi)
 
 @dataclass(frozen=True)
 class ContrastPeak:
-    """A peak of |contrast|.
-
-    Attributes
-    ----------
-    contrast, contrast_se : float
-        Mean of the fitted normal distribution, unsigned, and its standard error.
-    width : float
-        Its standard deviation.
-    count : float
-        Events in it, the background taken off.
-    """
+    """A peak of |contrast|."""
 
     contrast: float
     contrast_se: float
@@ -53,19 +43,7 @@ def find_contrast_peaks(
     Modes of a kernel density that stand out by three standard errors, each then fitted to the
     events of its own window: a normal distribution on a flat background.
 
-    Parameters
-    ----------
-    size : ndarray, shape (n,)
-        |contrast|, positive.
-    errors : ndarray, shape (n,)
-        Standard deviations of each; zero where unknown.
-    detail : float
-        Divides the kernel's width; more shows peaks that lie closer together.
-
-    Returns
-    -------
-    list of ContrastPeak
-        By rising contrast, at most ten: those with most events.
+    Shapes: `size` (n,), `errors` (n,).
     """
     kept = size <= np.quantile(size, 0.995) * 1.5
     x, sigma = size[kept], errors[kept]

@@ -21,27 +21,7 @@ Landing = Literal["dark", "bright"]
 def mass_from_contrast(
     contrast: ArrayLike, gradient_per_kda: float, offset: float = 0.0
 ) -> FloatArray:
-    """Convert signed peak contrasts to masses.
-
-    Parameters
-    ----------
-    contrast : array_like
-        Signed peak contrasts.
-    gradient_per_kda : float
-        Contrast per kDa of a landing particle, negative where landing darkens.
-    offset : float
-        Contrast of a landing particle of zero mass.
-
-    Returns
-    -------
-    ndarray
-        Masses, negative for a particle that leaves [kDa].
-
-    Raises
-    ------
-    ConfigError
-        The gradient is zero or not finite.
-    """
+    """Convert signed peak contrasts to masses."""
     if gradient_per_kda == 0 or not math.isfinite(gradient_per_kda):
         raise ConfigError(f"gradient_per_kda = {gradient_per_kda:g} says nothing about mass")
     c = np.asarray(contrast, dtype=np.float64)
@@ -60,21 +40,7 @@ def line_sigma_kda(
 ) -> FloatArray:
     """Propagate the errors of the line, and of a contrast, into a mass.
 
-    Parameters
-    ----------
-    mass_kda : array_like
-        Masses by the line, of either sign [kDa].
-    gradient_per_kda : float
-        Contrast per kDa.
-    covariance : ndarray, shape (2, 2)
-        Of gradient and offset.
-    sigma_contrast : array_like
-        Standard deviations of the contrasts; 0 leaves those of the line alone.
-
-    Returns
-    -------
-    ndarray
-        Standard deviations [kDa], by linear propagation.
+    Shapes: `covariance` (2, 2).
     """
     mass = np.abs(np.asarray(mass_kda, dtype=np.float64))
     variance = (
@@ -88,33 +54,7 @@ def line_sigma_kda(
 
 @dataclass(frozen=True, eq=False)
 class MassCalibration:
-    """The line between contrast and mass; `calibrate_mass` makes it.
-
-    Attributes
-    ----------
-    gradient_per_kda : float
-        s, signed peak contrast per kDa of a landing particle.
-    offset : float
-        o, contrast of a landing particle of zero mass.
-    covariance : ndarray, shape (2, 2)
-        Of (s, o), widened by χ²/dof where that exceeds one.
-    chi2 : float
-        Of the line, before widening.
-    dof : int
-        Standards less two.
-    standards : pandas.DataFrame
-        mass_kda, mass_se, contrast (signed), contrast_se, width, count, found_kda (the peak's mass
-        by the line), residual_percent, low_kda and high_kda (95 % prediction interval of a mass
-        that the line gives there).
-    peaks : tuple of ContrastPeak
-        Every peak that was found, matched or not.
-    landing : str
-        ``"dark"`` or ``"bright"``.
-    events : int
-        Landing events used.
-    notes : tuple of str
-        What the user should know, one sentence each.
-    """
+    """The line between contrast and mass; `calibrate_mass` makes it."""
 
     gradient_per_kda: float
     offset: float
@@ -128,35 +68,11 @@ class MassCalibration:
     notes: tuple[str, ...] = ()
 
     def mass_kda(self, contrast: ArrayLike) -> FloatArray:
-        """Convert signed peak contrasts to masses.
-
-        Parameters
-        ----------
-        contrast : array_like
-            Signed peak contrasts.
-
-        Returns
-        -------
-        ndarray
-            Masses, negative for a particle that leaves [kDa].
-        """
+        """Convert signed peak contrasts to masses."""
         return mass_from_contrast(contrast, self.gradient_per_kda, self.offset)
 
     def sigma_kda(self, contrast: ArrayLike, sigma_contrast: ArrayLike = 0.0) -> FloatArray:
-        """Give the standard deviation of such a mass.
-
-        Parameters
-        ----------
-        contrast : array_like
-            Signed peak contrasts.
-        sigma_contrast : array_like
-            Their standard deviations; 0 leaves that of the line alone.
-
-        Returns
-        -------
-        ndarray
-            Standard deviations [kDa].
-        """
+        """Give the standard deviation of such a mass."""
         return line_sigma_kda(
             self.mass_kda(contrast), self.gradient_per_kda, self.covariance, sigma_contrast
         )
@@ -164,20 +80,7 @@ class MassCalibration:
     def prediction_interval(
         self, contrast: ArrayLike, sigma_contrast: ArrayLike = 0.0
     ) -> tuple[FloatArray, FloatArray]:
-        """Give the interval that holds the true mass with a probability of 95 %.
-
-        Parameters
-        ----------
-        contrast : array_like
-            Signed peak contrasts.
-        sigma_contrast : array_like
-            Their standard deviations.
-
-        Returns
-        -------
-        low, high : ndarray
-            Ends of the interval [kDa].
-        """
+        """Give the interval that holds the true mass with a probability of 95 %."""
         reach = float(ndtri(0.975)) * self.sigma_kda(contrast, sigma_contrast)
         mass = self.mass_kda(contrast)
         return mass - reach, mass + reach
@@ -187,11 +90,6 @@ class MassCalibration:
 
         The standard errors of the line and their correlation are part of it, so that analyses can
         say what the calibration contributes to the error of each mass.
-
-        Returns
-        -------
-        str
-            TOML text.
         """
         s_se, o_se = (math.sqrt(self.covariance[k, k]) for k in (0, 1))
         return (
@@ -204,13 +102,7 @@ class MassCalibration:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``calibration.json`` holds.
-
-        Returns
-        -------
-        dict
-            Nested plain values.
-        """
+        """Give what ``calibration.json`` holds."""
         return {
             "gradient_per_kda": self.gradient_per_kda,
             "gradient_se": math.sqrt(self.covariance[0, 0]),

@@ -71,28 +71,7 @@ _MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
 
 @dataclass(frozen=True)
 class Estimate:
-    """A maximum of the joint likelihood.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Parameters of the optics that were free.
-    values : mapping
-        All parameters of the optics.
-    sights : tuple of Sight
-        The sights, each with its own unknowns at their estimates.
-    information : ndarray, shape (n, n)
-        Fisher information about the free parameters with every private unknown eliminated.
-    scatter : ndarray, shape (n, n)
-        Covariance of the score as the residuals have it; equal to `information` where the noise is
-        the camera's.
-    log_likelihood : float
-        Relative to no particle.
-    converged : bool
-        Whether the last step promised less than the tolerance.
-    passes : int
-        Evaluations of all pictures.
-    """
+    """A maximum of the joint likelihood."""
 
     names: tuple[str, ...]
     values: Settings
@@ -122,18 +101,7 @@ class Estimate:
 
 
 def prior_range(name: str) -> float:
-    """Give the plausible distance of a parameter from the configured value.
-
-    Parameters
-    ----------
-    name : str
-        The parameter.
-
-    Returns
-    -------
-    float
-        In its unit.
-    """
+    """Give the plausible distance of a parameter from the configured value."""
     return PRIOR_RANGE.get(name, TERM_RANGE_NM)
 
 
@@ -148,32 +116,7 @@ def maximise(
     passes: int = 40,
     mapper: Mapper = map,
 ) -> Estimate:
-    """Maximise the joint likelihood over the microscope and all particles.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        The pictures.
-    build : callable
-        Makes the microscope.
-    start : mapping
-        Parameters of the optics, the free ones among them.
-    names : sequence of str
-        The free ones; none: only the particles are fitted.
-    limits : mapping of str to (float, float), optional
-        Bounds of free parameters beyond which no microscope exists.
-    tolerance : float
-        Expected gain in log-likelihood of the last step.
-    passes : int
-        Evaluations of all pictures at most.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Estimate
-        The maximum that this start leads to.
-    """
+    """Maximise the joint likelihood over the microscope and all particles."""
     names = tuple(names)
     values = dict(start)
     walls = _walls(sights)
@@ -215,25 +158,7 @@ def first_step(
 ) -> tuple[FloatArray, FloatArray]:
     """Say how far pictures ask to change some parameters, to first order.
 
-    Parameters
-    ----------
-    sights : sequence of Sight
-        The pictures, with their own unknowns fitted.
-    build : callable
-        Makes the microscope.
-    settings : mapping
-        Its parameters.
-    names : sequence of str
-        Those that may change, which every picture tells.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    step : ndarray, shape (n,)
-        In the units of the parameters.
-    covariance : ndarray, shape (n, n)
-        Of it, as `Estimate.covariance`.
+    Shapes: `step` (n,), `covariance` (n, n).
     """
     private, walls = np.array([sight.private for sight in sights]), _walls(sights)
     at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
@@ -269,18 +194,7 @@ def _limited(
 
 
 def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, float]]:
-    """Bounds of the parameters of a microscope that can exist.
-
-    Parameters
-    ----------
-    n_immersion, n_glass : float
-        Refractive indices; the numerical aperture stays below both.
-
-    Returns
-    -------
-    dict of str to (float, float)
-        By name.
-    """
+    """Bounds of the parameters of a microscope that can exist."""
     top = min(n_immersion, n_glass) - _NA_ROOM
     return {
         "na": (_LOWEST_NA, top),

@@ -53,31 +53,7 @@ _ZERO = 1e-9  # what symmetry makes 0 [nm, kDa]
 
 @dataclass(frozen=True, eq=False)
 class OpticsForecast:
-    """What a number of particles would tell of the microscope.
-
-    Attributes
-    ----------
-    config : Config
-        The experiment.
-    events : int
-        Particles that are fitted.
-    snr : float
-        Signal-to-noise ratio of one picture.
-    values : dict of str to float
-        The free parameters that the pictures determine, as configured.
-    covariance : ndarray, shape (n, n)
-        Of these parameters, fitted together, in that order.
-    hidden : tuple of Hidden
-        Parameters that would be held as configured, and why.
-    moves : dict of str to ndarray
-        Mode → D of `displacement`, shape (free parameters of the mode, n).
-    sigma : dict of str to ndarray
-        Mode → Cramér–Rao bounds of one particle when the optics are known.
-    needed : pandas.DataFrame
-        Events that the precisions of `GOALS` take: columns ``mass_kda``, ``snr``, ``identified``
-        (events from which everything is identified that can be) and ``focus_nm`` and ``mass_rel``;
-        NaN where no number suffices.
-    """
+    """What a number of particles would tell of the microscope."""
 
     config: Config
     events: int
@@ -146,13 +122,7 @@ class OpticsForecast:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``iscat bounds --for optics --json`` prints.
-
-        Returns
-        -------
-        dict
-            Nested plain values.
-        """
+        """Give what ``iscat bounds --for optics --json`` prints."""
         optics, at = self.config.optics, self.config.bounds
         mass = float(self.needed["mass_kda"][FACTORS.index(1.0)])
         return {
@@ -192,28 +162,7 @@ class OpticsForecast:
 def forecast_optics(
     config: Config, *, events: int = EVENTS, free: str | Sequence[str] | None = None
 ) -> OpticsForecast:
-    """Foresee what particles would tell of the microscope.
-
-    Parameters
-    ----------
-    config : Config
-        The optics, the camera, the particle, the region ``fit.roi_nm`` around it, and from
-        ``[bounds]`` the light and the frames before and after.
-    events : int
-        Particles of that mass that are fitted, all at ``particle.height_nm``.
-    free : str or sequence of str, optional
-        What is fitted, of ``focus, na, phase, mask, zernike, polarization``; default all.
-
-    Returns
-    -------
-    OpticsForecast
-        Standard deviations, what is not identifiable, and what it leaves in fits.
-
-    Raises
-    ------
-    ConfigError
-        There is no reference, no pixel size or no event, or a name in `free` is unknown.
-    """
+    """Foresee what particles would tell of the microscope."""
     names = _names(config, free)
     number_in("`events`", events, least=1, whole=True)
     model, grid = _model(config)

@@ -15,18 +15,7 @@ _TAKES_PART = 0.3  # component of a direction, in prior ranges, above which a pa
 
 @dataclass(frozen=True)
 class Hidden:
-    """A parameter that pictures do not determine within its plausible range.
-
-    Attributes
-    ----------
-    name : str
-        The parameter that takes the largest part in the direction.
-    others : tuple of str
-        Parameters from which it is not told apart; empty if it is simply not visible.
-    direction : mapping of str to float
-        One standard deviation along the direction, each parameter in its own unit; of infinite
-        length where the pictures say nothing at all.
-    """
+    """A parameter that pictures do not determine within its plausible range."""
 
     name: str
     others: tuple[str, ...]
@@ -41,17 +30,7 @@ class Hidden:
 def find_hidden(information: FloatArray, names: Sequence[str]) -> Hidden | None:
     """Find the worst determined direction, if it is wider than what is plausible.
 
-    Parameters
-    ----------
-    information : ndarray, shape (n, n)
-        About the parameters, all other unknowns eliminated.
-    names : sequence of str
-        The parameters.
-
-    Returns
-    -------
-    Hidden or None
-        None where every direction is narrower than the prior range.
+    Shapes: `information` (n, n).
     """
     if not names:
         return None

@@ -66,15 +66,7 @@ Judge = Callable[[Sight, Settings], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Judgement:
-    """How the pictures that were not fitted agree with the microscope.
-
-    Attributes
-    ----------
-    p_values, chi2_reduced : ndarray, shape (n,)
-        Of each picture, its own unknowns fitted.
-    uniform_p : float
-        Chance that uniform p-values look less uniform (Kolmogorov and Smirnov).
-    """
+    """How the pictures that were not fitted agree with the microscope."""
 
     p_values: FloatArray
     chi2_reduced: FloatArray
@@ -88,15 +80,7 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Twin:
-    """A second microscope that makes the same pictures.
-
-    Attributes
-    ----------
-    settings : mapping
-        Its parameters.
-    gap : float
-        Log-likelihood by which it is worse.
-    """
+    """A second microscope that makes the same pictures."""
 
     settings: Settings
     gap: float
@@ -104,33 +88,7 @@ class Twin:
 
 @dataclass(frozen=True)
 class Measured:
-    """What the pictures say about the microscope.
-
-    Attributes
-    ----------
-    settings : mapping
-        Every parameter: measured, or as configured.
-    estimate : Estimate
-        The joint fit of all pictures.
-    held : mapping of str to str
-        Parameters that the pictures do not determine, held as configured, and why.
-    dropped : tuple of str
-        Aberrations that do not improve the pictures that were not fitted; 0.
-    undecided : tuple of str
-        Discrete properties that the pictures do not tell, taken as configured.
-    judgement : Judgement
-        On the pictures that were not fitted.
-    configured : Judgement
-        The same with the configured microscope.
-    held_out : tuple of Sight
-        The pictures that were not fitted.
-    twin : Twin or None
-        Another microscope that is as likely.
-    contaminated : int
-        Pictures left out because something else happened in them.
-    refusals : tuple of str
-        Why the result must not be used; empty if it may.
-    """
+    """What the pictures say about the microscope."""
 
     settings: Settings
     estimate: Estimate
@@ -148,24 +106,7 @@ class Measured:
 def judge(
     sights: Sequence[Sight], settings: Settings, judge_one: Judge, mapper: Mapper = map
 ) -> Judgement:
-    """Judge fitted pictures one by one and all together.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        With their own unknowns fitted.
-    settings : mapping
-        The microscope.
-    judge_one : callable
-        Goodness of fit of one.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Judgement
-        The p-value and χ² of each, and whether all p-values together are uniform.
-    """
+    """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
 
     found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
@@ -189,42 +130,7 @@ def measure_microscope(
     known: Settings | None = None,
     mapper: Mapper = map,
 ) -> Measured:
-    """Measure the microscope from pictures of particles.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        At least `LEAST_SIGHTS`, of one shape.
-    configured : mapping
-        Every parameter as configured.
-    build : callable
-        Makes the microscope.
-    judge_one : callable
-        Goodness of fit of one sight.
-    free : sequence of str
-        Keys of `FREE`.
-    limits : mapping of str to (float, float)
-        Bounds of a microscope that can exist.
-    side : int
-        Sign of the focus that was configured, which decides between twins; 0 where none was.
-    landing : int
-        1 where more particles land than leave, so that most masses are positive; 0 where that is
-        not known, and the reference phase is taken within 90° of the configured one.
-    others : sequence of Sight
-        Every particle that `Sight.neighbours` counts, these sights among them.
-    build_wide : callable, optional
-        Makes the microscope as far as rings matter; needed where there are neighbours.
-    known : mapping, optional
-        A microscope of the same kind that is near it, in which the sights have their places and
-        masses; without it every kind is tried.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Measured
-        Parameters, errors and verdict.
-    """
+    """Measure the microscope from pictures of particles."""
     search = _Search(
         configured, build, judge_one, tuple(free), limits, side, landing, mapper,
         tuple(others), build_wide, known,

@@ -87,19 +87,7 @@ class _Waves:
 
 @dataclass(frozen=True)
 class PictureFit:
-    """A template and the pictures that made it.
-
-    Attributes
-    ----------
-    template : Template
-        The picture.
-    sights : tuple of Sight
-        With their places, amplitudes and levels fitted.
-    effective : float
-        How many numbers of the picture the data determine.
-    rounds : int
-        Rounds that were needed.
-    """
+    """A template and the pictures that made it."""
 
     template: Template
     sights: tuple[Sight, ...]
@@ -116,28 +104,7 @@ def fit_picture(
     level: bool,
     mapper: Mapper = map,
 ) -> PictureFit:
-    """Fit the picture that all particles share.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Pictures of single particles, of one shape, from `place_sights` or an earlier fit.
-    nominal : ForwardModel
-        The microscope as configured; only its scale of masses and its pixels matter.
-    roi_nm : float
-        Side of the square that will be fitted with it [nm].
-    step_nm : float
-        Step of the template's lattice, from `lattice_step_nm` [nm].
-    level : bool
-        Whether the level of the light of each picture is unknown.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    PictureFit
-        The template has its centre of energy at the origin, and the sign that landings have.
-    """
+    """Fit the picture that all particles share."""
     pixel = sights[0].grid.pixel_nm
     side = max(sights[0].grid.shape) * pixel
     waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + _ROOM_NM))
@@ -168,22 +135,7 @@ def fit_picture(
 
 
 def fit_own(sight: Sight, model: ForwardModel, *, level: bool) -> Sight:
-    """Fit what is a picture's own.
-
-    Parameters
-    ----------
-    sight : Sight
-        With a start.
-    model : ForwardModel
-        The microscope.
-    level : bool
-        Whether the level of the light is fitted.
-
-    Returns
-    -------
-    Sight
-        With its place, amplitude and level at the maximum of the likelihood.
-    """
+    """Fit what is a picture's own."""
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
     start = np.array([sight.x_nm, sight.y_nm, model.height_nm, sight.mass_kda, sight.level])
     room = np.array([_ROAM_NM, _ROAM_NM, 0.0, 20 * abs(sight.mass_kda), float(level)])
@@ -198,20 +150,7 @@ def fit_own(sight: Sight, model: ForwardModel, *, level: bool) -> Sight:
 
 
 def place_sights(sights: Sequence[Sight], nominal: ForwardModel) -> list[Sight]:
-    """Register pictures on their average, and say how much of it each shows.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        The brightest first, all of one shape.
-    nominal : ForwardModel
-        The microscope as configured; only its scale of masses matters.
-
-    Returns
-    -------
-    list of Sight
-        With starts of place and mass; the sign of all may be the wrong one.
-    """
+    """Register pictures on their average, and say how much of it each shows."""
     (average,), placed = average_sights(sights)
     scale = peak_per_amplitude(nominal)
     shown = average.data[0] / (average.data[1] - average.data[0]) - 1

@@ -17,15 +17,7 @@ _PASSES = 6
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Particles with the rings that they make in one microscope.
-
-    Attributes
-    ----------
-    particles : tuple of Sight
-        What `Sight.neighbours` counts, fitted.
-    wide : Microscope
-        The microscope, as far as rings matter.
-    """
+    """Particles with the rings that they make in one microscope."""
 
     particles: tuple[Sight, ...]
     wide: Microscope
@@ -39,24 +31,7 @@ class Neighbours:
         settings: Settings,
         mapper: Mapper = map,
     ) -> Neighbours:
-        """Fit them, and once more among each other's rings.
-
-        Parameters
-        ----------
-        others : sequence of Sight
-            Every particle that `Sight.neighbours` counts.
-        build, build_wide : callable
-            Make the microscope as far as the pictures and as far as rings matter.
-        settings : mapping
-            Which microscope.
-        mapper : callable
-            `map`, or the one of a pool.
-
-        Returns
-        -------
-        Neighbours
-            Where they are and how bright.
-        """
+        """Fit them, and once more among each other's rings."""
 
         def own(sights: Sequence[Sight]) -> tuple[Sight, ...]:
             return maximise(sights, build, settings, (), passes=_PASSES, mapper=mapper).sights
@@ -68,18 +43,6 @@ class Neighbours:
         """Put their rings into what is expected of pictures.
 
         Every particle is drawn into all pictures at once: its field at its height takes longest.
-
-        Parameters
-        ----------
-        sights : sequence of Sight
-            Pictures, which say whose rings reach into them.
-        mapper : callable
-            `map`, or the one of a pool.
-
-        Returns
-        -------
-        tuple of Sight
-            The pictures among them.
         """
         reached: list[list[tuple[int, float]]] = [[] for _ in self.particles]
         for index, sight in enumerate(sights):

@@ -20,25 +20,7 @@ PUPIL_POINTS = 129
 
 @dataclass(frozen=True, eq=False)
 class Pictures:
-    """Pictures of a calibration.
-
-    Attributes
-    ----------
-    measured, model : ndarray, shape (ny, nx)
-        Average contrast of the particles, each moved to the centre and scaled to the median mass.
-    residual : ndarray, shape (ny, nx)
-        Their difference in standard deviations of the average.
-    pixel_nm : float
-        Pixel side [nm].
-    radius_nm, radial, radial_se, radial_model : ndarray, shape (n,)
-        Averages over rings.
-    wavefront_nm : ndarray, shape (k, k)
-        Aberrations over the pupil, focus not included [nm]; NaN outside.
-    transmission : ndarray, shape (k, k)
-        Amplitude that the mask passes; NaN outside.
-    na : float
-        Radius of the pupil.
-    """
+    """Pictures of a calibration."""
 
     measured: FloatArray
     model: FloatArray
@@ -57,20 +39,6 @@ def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> 
     """Average the pictures and what the microscope makes of them.
 
     Data and model are moved by the same interpolation, so that it shows in neither residual.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        With their own unknowns fitted.
-    build : callable
-        Makes the microscope.
-    settings : mapping
-        The microscope's parameters.
-
-    Returns
-    -------
-    Pictures
-        Measured picture, model, residual, and the pupil.
     """
     shape, pixel = sights[0].grid.shape, sights[0].grid.pixel_nm
     sums, weight, noise = np.zeros((2, *shape)), 0.0, np.zeros(shape)

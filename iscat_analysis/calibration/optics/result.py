@@ -27,31 +27,7 @@ COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
 
 @dataclass(frozen=True, eq=False)
 class OpticsCalibration:
-    """A microscope as a movie shows it.
-
-    Attributes
-    ----------
-    config : Config
-        The configuration with the measured optics; as it was given where the result is refused.
-    parameters : pandas.DataFrame
-        One row per parameter, columns `COLUMNS`: its value, standard error, Cramér–Rao bound, the
-        configured value, and ``"measured"``, ``"held"`` (not determined, as configured),
-        ``"dropped"`` (an aberration that improves nothing, 0) or ``"given"`` (not asked for).
-    names : tuple of str
-        The measured parameters, in the order of `covariance`.
-    covariance : ndarray, shape (n, n)
-        Of the measured parameters.
-    measured : Measured
-        Fits, verdicts and pictures in full.
-    pictures : Pictures
-        What a report shows.
-    sights : int
-        Pictures used, those that were not fitted included.
-    source : mapping of str to str
-        Where the pictures came from.
-    notes : tuple of str
-        What the user should know, one sentence each.
-    """
+    """A microscope as a movie shows it."""
 
     config: Config
     parameters: pd.DataFrame
@@ -80,15 +56,7 @@ class OpticsCalibration:
     def less_sure(self, error: FloatArray) -> OpticsCalibration:
         """Add an error of known size to the uncertainty.
 
-        Parameters
-        ----------
-        error : ndarray, shape (n,)
-            Of the measured parameters, one standard error in one direction.
-
-        Returns
-        -------
-        OpticsCalibration
-            With the same values.
+        Shapes: `error` (n,).
         """
         covariance = self.covariance + np.outer(error, error)
         parameters = self.parameters.copy()
@@ -101,18 +69,7 @@ class OpticsCalibration:
         return replace(self, config=config, parameters=parameters, covariance=covariance)
 
     def headline(self, pictures_of: str = "particles") -> str:
-        """Say in one line what was found.
-
-        Parameters
-        ----------
-        pictures_of : str
-            What was looked at, in the plural.
-
-        Returns
-        -------
-        str
-            Focus, aperture, phase and aberrations, and how well they describe the pictures.
-        """
+        """Say in one line what was found."""
         judged, before = self.measured.judgement, self.measured.configured
         parts = []
         for name, unit in (("focus_nm", "nm"), ("na", ""), ("reference_phase_deg", "deg")):
@@ -142,20 +99,7 @@ class OpticsCalibration:
         )
 
     def with_phase(self, phase_deg: float, note: str) -> OpticsCalibration:
-        """Take the reference phase half a turn away, which explains the pictures as well.
-
-        Parameters
-        ----------
-        phase_deg : float
-            That phase; particles that landed then have left, and the other way round.
-        note : str
-            Why it is taken, for the user.
-
-        Returns
-        -------
-        OpticsCalibration
-            With this phase and the same errors.
-        """
+        """Take the reference phase half a turn away, which explains the pictures as well."""
         name = "reference_phase_deg"
         parameters = self.parameters.copy()
         parameters.loc[parameters["parameter"] == name, "value"] = phase_deg
@@ -170,14 +114,7 @@ class OpticsCalibration:
         )
 
     def to_toml(self) -> str:
-        """Write what ``[optics] file`` reads.
-
-        Returns
-        -------
-        str
-            Tables ``[optics]``, ``[uncertainty]`` (standard errors), ``[covariance]`` and
-            ``[provenance]``.
-        """
+        """Write what ``[optics] file`` reads."""
         optics = self.config.optics
         lines = ["# Optics measured by `iscat calibrate optics`", "", "[optics]"]
         keys = ("polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na",
@@ -201,13 +138,7 @@ class OpticsCalibration:
         return "\n".join([*lines, f"particles = {self.sights}", ""])
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``optics.json`` holds.
-
-        Returns
-        -------
-        dict
-            Nested plain values.
-        """
+        """Give what ``optics.json`` holds."""
         found = self.measured
         twin, shown = found.twin, vars(self.pictures)
         return {
@@ -239,26 +170,7 @@ def make_result(
     pictures: Pictures,
     source: Mapping[str, str],
 ) -> OpticsCalibration:
-    """Put a result together.
-
-    Parameters
-    ----------
-    config : Config
-        As it was given.
-    configured : mapping
-        The parameters in it.
-    measured : Measured
-        What the pictures say.
-    pictures : Pictures
-        What a report shows.
-    source : mapping of str to str
-        Where the pictures came from.
-
-    Returns
-    -------
-    OpticsCalibration
-        The parameters, their errors, and what is to be told of them.
-    """
+    """Put a result together."""
     estimate = measured.estimate
     covariance, bound = estimate.covariance, estimate.bound
     rows = []
@@ -371,37 +283,14 @@ def _judged(judgement: Judgement) -> dict[str, Any]:
 def correlation(covariance: FloatArray) -> FloatArray:
     """Give the correlation matrix of a covariance.
 
-    Parameters
-    ----------
-    covariance : ndarray, shape (n, n)
-        The covariance.
-
-    Returns
-    -------
-    ndarray, shape (n, n)
-        Correlations.
+    Shapes: `covariance` (n, n), result (n, n).
     """
     sigma = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
 
 
 def with_error(label: str, value: float, sigma: float, unit: str) -> str:
-    """Write a value with as many digits as its error deserves.
-
-    Parameters
-    ----------
-    label : str
-        What it is.
-    value, sigma : float
-        The value and its standard error.
-    unit : str
-        Unit of both.
-
-    Returns
-    -------
-    str
-        As in ``focus -371.4 ± 2.0 nm``.
-    """
+    """Write a value with as many digits as its error deserves."""
     digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 3
     return f"{label} {value:.{digits}f} ± {sigma:.{digits}f} {unit}".rstrip()
 

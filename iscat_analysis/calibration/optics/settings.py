@@ -32,23 +32,7 @@ linear or circular is a choice beside them."""
 
 
 def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
-    """Read which groups of parameters are free.
-
-    Parameters
-    ----------
-    text : str or sequence of str, optional
-        Keys of `FREE`, as one text with commas between them or one by one; default all.
-
-    Returns
-    -------
-    tuple of str
-        In the order of `FREE`.
-
-    Raises
-    ------
-    ConfigError
-        A name is none of them, or there is none.
-    """
+    """Read which groups of parameters are free."""
     if text is None:
         return tuple(FREE)
     if not isinstance(text, (str, list, tuple)):
@@ -65,21 +49,7 @@ def free_groups(text: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def exists(name: str, settings: Settings) -> bool:
-    """Tell whether a microscope has a parameter.
-
-    Parameters
-    ----------
-    name : str
-        One of `FREE`.
-    settings : mapping
-        The microscope: without a mask it has no edge and no transmission, circular light has no
-        direction, and only a scan has steps, only a movie a drift.
-
-    Returns
-    -------
-    bool
-        Whether it can be fitted.
-    """
+    """Tell whether a microscope has a parameter."""
     if name in ("mask_na", "attenuation"):
         return bool(settings["mask_na"] > 0)
     if name == "polarization_deg":
@@ -88,22 +58,7 @@ def exists(name: str, settings: Settings) -> bool:
 
 
 def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) -> tuple[str, ...]:
-    """Name the continuous parameters that are free in a microscope.
-
-    Parameters
-    ----------
-    groups : sequence of str
-        From `free_groups`.
-    settings : mapping
-        The microscope; only what `exists` in it is free.
-    terms : sequence of str
-        Aberrations that may be.
-
-    Returns
-    -------
-    tuple of str
-        Keys of the settings.
-    """
+    """Name the continuous parameters that are free in a microscope."""
     return tuple(
         name
         for group in groups
@@ -113,35 +68,13 @@ def free_names(groups: Sequence[str], settings: Settings, terms: Sequence[str]) 
 
 
 def heights_free(config: Config) -> bool:
-    """Tell whether every particle has a height of its own, which is fitted.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    bool
-        Whether it asks for that.
-    """
+    """Tell whether every particle has a height of its own, which is fitted."""
     mode = config.fit.mode
     return (config.track.free if mode == "track" else mode) in ("localize", "joint")
 
 
 def settings_of(config: Config) -> dict[str, Any]:
-    """Parameters that a calibration may change, as configured.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-
-    Returns
-    -------
-    dict
-        Every key of ``[optics]`` concerned and every aberration of `FREE`, 0 where absent.
-    """
+    """Parameters that a calibration may change, as configured."""
     optics = config.optics
     keys = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation",
             "polarization", "polarization_deg", "analyzer")  # fmt: skip
@@ -150,20 +83,7 @@ def settings_of(config: Config) -> dict[str, Any]:
 
 
 def with_settings(config: Config, settings: Settings) -> Config:
-    """Put parameters into a configuration.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration.
-    settings : mapping
-        From `settings_of`, changed.
-
-    Returns
-    -------
-    Config
-        With these optics; aberrations of exactly 0 are left out.
-    """
+    """Put parameters into a configuration."""
     plain = {k: v for k, v in settings.items() if not is_term(k) and k != FOCUS_STEP}
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
     optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
@@ -171,43 +91,14 @@ def with_settings(config: Config, settings: Settings) -> Config:
 
 
 def is_term(name: str) -> bool:
-    """Tell whether a name is that of an aberration.
-
-    Parameters
-    ----------
-    name : str
-        A key of the settings.
-
-    Returns
-    -------
-    bool
-        True for ``z5`` and the like.
-    """
+    """Tell whether a name is that of an aberration."""
     return name[0] == "z" and name[1:].isdigit()
 
 
 def build_microscope(
     config: Config, reach_nm: float, settings: Settings, *, like: ForwardModel | None = None
 ) -> ForwardModel:
-    """Make the forward model of a configuration with other optics and the model's own mass scale.
-
-    Parameters
-    ----------
-    config : Config
-        The configuration; its ``[calibration]`` is set aside, because the line through the
-        standards holds for the optics with which it was measured.
-    reach_nm : float
-        As in `forward_model` [nm].
-    settings : mapping
-        Parameters of the optics.
-    like : ForwardModel, optional
-        As in `forward_model`.
-
-    Returns
-    -------
-    ForwardModel
-        Ready to evaluate.
-    """
+    """Make the forward model of other optics, with the model's own mass scale."""
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
     highest = None if heights_free(config) else config.particle.height_nm
     return forward_model(changed, reach_nm, z_max_nm=highest, like=like)

@@ -64,44 +64,7 @@ Build = Callable[[Settings], Microscope]
 
 @dataclass(frozen=True)
 class Sight:
-    """The picture of one particle: counts of a region, and where the search begins.
-
-    Attributes
-    ----------
-    grid : PixelGrid
-        The region's pixels.
-    kind : int
-        Noise model of `data`: CONDITIONAL or POISSON of `iscat_analysis.inference.likelihood`.
-    data : ndarray, shape (4, ny, nx)
-        As in `Likelihood.data`.
-    x_nm, y_nm : float
-        Place from which the search starts [nm].
-    z_nm : float
-        Height of the particle, or where the search for it begins [nm].
-    mass_kda : float
-        Signed mass from which the search starts, 0 where unknown [kDa].
-    level : float
-        Logarithm of the background level from which the search starts.
-    focus_steps : float
-        Steps of the focus since the first picture of a scan, of which ``focus_step_nm`` of the
-        settings is the size; or thousands of frames since ``focus_nm``, in which the focus rises by
-        ``focus_drift_nm``.
-    frames : (float, float)
-        Middle of the frames before a step, and of those after it.
-    snr : float
-        Signal-to-noise ratio with which it was found.
-    neighbours : tuple of (int, float)
-        Other particles whose rings reach into the picture: their number, and the share of their
-        contrast that is new after the step.
-    rings : ndarray, shape (ny, nx), or float
-        Factor of the expected light that was put into `data` for them.
-    baseline : float
-        What they add to the log-likelihood where there is no particle.
-    owner : int
-        Pictures of one owner share errors, as those of one track share its background; -1: none.
-    heights_nm : (float, float), optional
-        Between which the particle's height is looked for [nm]; without them it is known.
-    """
+    """The picture of one particle: counts of a region, and where the search begins."""
 
     grid: PixelGrid
     kind: int

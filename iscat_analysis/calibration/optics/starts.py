@@ -41,17 +41,7 @@ _SHIFT_PX = 4.0  # a picture's first centre is off by no more
 
 @dataclass(frozen=True)
 class Start:
-    """A microscope that resembles the average picture.
-
-    Attributes
-    ----------
-    values : mapping
-        Parameters of the optics.
-    x_nm, y_nm, mass_kda : float
-        The particle of the average picture in it [nm, kDa].
-    explained : float
-        χ² of the average that it explains.
-    """
+    """A microscope that resembles the average picture."""
 
     values: Mapping[str, Any]
     x_nm: float
@@ -61,21 +51,7 @@ class Start:
 
 
 def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Sight, ...]]:
-    """Average the pictures of each focus, registered on each other, with the sign of each.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        The brightest first; all of the same shape and pixel.
-
-    Returns
-    -------
-    averages : tuple of Sight
-        One for each of at most `_FOCI` foci, on a grid centred at 0, with the counts of a movie
-        that would show the average contrast with its noise; of the sign and size of the brightest.
-    sights : tuple of Sight
-        With the places at which the average's centre lies in them.
-    """
+    """Average the pictures of each focus, registered on each other, with the sign of each."""
     placed = list(sights)
     averages = {}
     for offset in sorted({sight.focus_steps for sight in sights}):
@@ -134,15 +110,7 @@ def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
 def contrast_of(sight: Sight) -> tuple[FloatArray, FloatArray]:
     """Measured contrast of a sight and the variance of its noise.
 
-    Parameters
-    ----------
-    sight : Sight
-        The picture.
-
-    Returns
-    -------
-    contrast, variance : ndarray, shape (ny, nx)
-        The contrast without its mean; masked pixels hold 0 and a variance of 10⁶.
+    Shapes: `contrast, variance` (ny, nx).
     """
     _, _, information, by_signal, _ = pixel_terms(
         sight.kind, sight.data, np.zeros(sight.grid.shape), 0.0
@@ -178,22 +146,7 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
 def with_masses(
     sights: Sequence[Sight], build: Build, settings: Mapping[str, Any]
 ) -> tuple[Sight, ...]:
-    """Give every sight the mass that fits it best where it stands.
-
-    Parameters
-    ----------
-    sights : sequence of Sight
-        Placed.
-    build : callable
-        Makes the microscope.
-    settings : mapping
-        Its parameters.
-
-    Returns
-    -------
-    tuple of Sight
-        With signed masses.
-    """
+    """Give every sight the mass that fits it best where it stands."""
     models: dict[float, Any] = {}
     out = []
     for sight in sights:
@@ -269,24 +222,7 @@ def search_starts(
     *,
     most: int,
 ) -> tuple[Start, ...]:
-    """Rank microscopes by how much of the average pictures they explain.
-
-    Parameters
-    ----------
-    averages : sequence of Sight
-        From `average_sights`.
-    build : callable
-        Makes the microscope.
-    candidates : sequence of mapping
-        Parameters of the optics to try; their reference phase is set here.
-    most : int
-        Starts that are returned at most.
-
-    Returns
-    -------
-    tuple of Start
-        The best first; of neighbouring foci only the better one.
-    """
+    """Rank microscopes by how much of the average pictures they explain."""
     pixel, shape = averages[0].grid.pixel_nm, averages[0].grid.shape
     spectra = []
     for average in averages:
@@ -361,22 +297,7 @@ def _best_phase(
 def turned_starts(
     averages: Sequence[Sight], build: Build, starts: Sequence[Start]
 ) -> tuple[Start, ...]:
-    """Turn the linear light of every start to the direction that explains most.
-
-    Parameters
-    ----------
-    averages : sequence of Sight
-        From `average_sights`.
-    build : callable
-        Makes the microscope.
-    starts : sequence of Start
-        From `search_starts`.
-
-    Returns
-    -------
-    tuple of Start
-        As many; those of circular light as they were.
-    """
+    """Turn the linear light of every start to the direction that explains most."""
     out = []
     for start in starts:
         if start.values["polarization"] == "linear":

@@ -37,18 +37,7 @@ _FINER_TRANSMITS = (0.3, 0.75)
 
 
 def same_state(one: Estimate, other: Estimate) -> bool:
-    """Tell whether two microscopes have the same polarisation, and both a mask or none.
-
-    Parameters
-    ----------
-    one, other : Estimate
-        The microscopes.
-
-    Returns
-    -------
-    bool
-        Whether they are of a kind.
-    """
+    """Tell whether two microscopes have the same polarisation, and both a mask or none."""
     return _state(one.values) == _state(other.values)
 
 
@@ -58,21 +47,7 @@ def _state(values: Settings) -> tuple[str, bool]:
 
 @dataclass(frozen=True)
 class StateSearch:
-    """Search for the kind of microscope; `run` does it.
-
-    Attributes
-    ----------
-    configured : mapping
-        Parameters of the optics as configured.
-    build : callable
-        Makes the microscope.
-    free : tuple of str
-        From `free_groups`.
-    limits : mapping of str to (float, float)
-        Bounds of free parameters.
-    mapper : callable
-        `map`, or the one of a pool.
-    """
+    """Search for the kind of microscope; `run` does it."""
 
     configured: Settings
     build: Build
@@ -81,18 +56,7 @@ class StateSearch:
     mapper: Mapper = map
 
     def run(self, averages: Sequence[Sight]) -> list[Estimate]:
-        """Refine the most promising microscopes.
-
-        Parameters
-        ----------
-        averages : sequence of Sight
-            From `average_sights`.
-
-        Returns
-        -------
-        list of Estimate
-            Fits of the average pictures, the most likely first.
-        """
+        """Refine the most promising microscopes."""
         found = list(self.mapper(lambda state: self._begin(averages, state), self.states()))
         begun = [start for starts in found for start in starts if self._promising(start, found)]
         refined = self._refine(averages, begun)
@@ -101,13 +65,7 @@ class StateSearch:
         return sorted(refined, key=lambda e: -e.log_likelihood)
 
     def states(self) -> list[list[dict[str, Any]]]:
-        """Give the settings to start from, those of one state together.
-
-        Returns
-        -------
-        list of list of dict
-            Every combination of polarisation and mask, at every focus.
-        """
+        """Give the settings to start from, those of one state together."""
         now = dict(self.configured)
         lights = ["linear", "circular"] if "polarization" in self.free else [now["polarization"]]
         masks: list[list[dict[str, Any]]] = [[{}]]

@@ -25,22 +25,7 @@ _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doub
 
 @dataclass(frozen=True)
 class StepFrame:
-    """The frame of a step.
-
-    Attributes
-    ----------
-    frame : int
-        First frame of the new state.
-    half_width : int
-        The interval `frame` ± `half_width` holds at least 95 % of the posterior.
-    height : float
-        Step in units of the template that was used.
-    per_frame_snr : float
-        Its height over the noise of one frame.
-    p_constant : float
-        Chance that a height which is constant before the step and after it changes as much as
-        this one does within either side.
-    """
+    """The frame of a step."""
 
     frame: int
     half_width: int
@@ -59,20 +44,7 @@ class StepFrame:
 
     @classmethod
     def undated(cls, frame: int, half_width: int) -> StepFrame:
-        """Date a step as the search did, before its own frames are looked at.
-
-        Parameters
-        ----------
-        frame : int
-            At which a boundary between windows lies.
-        half_width : int
-            Frames from one boundary to the next.
-
-        Returns
-        -------
-        StepFrame
-            As high as the noise of one frame, and with no sign of another change.
-        """
+        """Date a step as the search did, before its own frames are looked at."""
         return cls(frame, half_width, height=1.0, per_frame_snr=1.0, p_constant=1.0)
 
 
@@ -89,21 +61,7 @@ def locate_step(
 ) -> StepFrame:
     """Find the frame of a step by the likelihood of the frames around it.
 
-    Parameters
-    ----------
-    patch : Patch
-        The frames; one step alone must lie in them.
-    image : ndarray, shape (ny, nx)
-        Contrast that appears.
-    search : (int, int)
-        Frames that may be the first of the new state, half-open.
-    known : ndarray, shape (t,), optional
-        Height that other events add to each frame, in units of `image`; from `crosstalk`.
-
-    Returns
-    -------
-    StepFrame
-        The most likely frame and its interval.
+    Shapes: `image` (ny, nx), `known` (t,).
     """
     heights, weight, scale = frame_heights(patch, image)
     if known is not None:
@@ -134,21 +92,7 @@ def locate_step(
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Measure how much of an image every frame holds, whatever its light.
 
-    Parameters
-    ----------
-    patch : Patch
-        The frames; `Patch.mean_e` is what they are set against.
-    image : ndarray, shape (ny, nx)
-        Contrast.
-
-    Returns
-    -------
-    heights : ndarray, shape (t,)
-        In units of `image`; without meaning where a frame has no power.
-    weight : ndarray, shape (t,)
-        One over their variance, by shot and read noise; 0 where a frame has no power.
-    scale : float
-        The weight of a frame of unit power.
+    Shapes: `image` (ny, nx), `heights` (t,), `weight` (t,).
     """
     weights, scale = _projector(patch, image)
     scores = np.empty((1, len(patch.counts)))
@@ -183,19 +127,7 @@ def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
 def crosstalk(patch: Patch, image: FloatArray, others: Sequence[FloatArray]) -> list[float]:
     """Heights that other particles' contrasts add to a frame, in units of `image`.
 
-    Parameters
-    ----------
-    patch : Patch
-        Gives the weights.
-    image : ndarray, shape (ny, nx)
-        Contrast.
-    others : sequence of ndarray of the same shape
-        Their contrasts.
-
-    Returns
-    -------
-    list of float
-        To be taken off in `locate_step`.
+    Shapes: `image` (ny, nx).
     """
     if not others:
         return []

@@ -29,33 +29,7 @@ _USUAL = 0.75  # quantile of the light of frames
 
 @dataclass(frozen=True)
 class Chunk:
-    """Consecutive frames in memory, with their power.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first frame.
-    counts : ndarray, shape (t, y, x)
-        Stored counts.
-    good : ndarray of bool, shape (t,)
-        Frames that may be used; others are as if they did not exist.
-    power : ndarray, shape (t,)
-        Light of every frame over the mean; 0 where not good.
-    camera : Camera
-        Counts → photoelectrons.
-    mean_e : ndarray, shape (y, x)
-        Mean photoelectrons of a frame of unit power.
-    usable : ndarray of bool, shape (y, x)
-        Pixels that are neither defective nor saturated.
-    saturated : ndarray of bool, shape (y, x)
-        Pixels that were saturated in some frame.
-    edges : ndarray of int, shape (k + 1,)
-        Blocks, relative to `first`.
-    blocks_e : ndarray, shape (k, y, x)
-        Photoelectrons summed over each block.
-    check : callable
-        Raises DataError where `counts` may no longer be looked at.
-    """
+    """Consecutive frames in memory, with their power."""
 
     first: int
     counts: NDArray[Any]
@@ -86,20 +60,7 @@ class Chunk:
     def patch(
         self, start: int, stop: int, rows: tuple[int, int], columns: tuple[int, int]
     ) -> Patch:
-        """Copy a region of frames together, for all that is asked of it.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range of frames, clipped to those held.
-        rows, columns : (int, int)
-            Half-open ranges of pixels.
-
-        Returns
-        -------
-        Patch
-            Counts and light of these frames and pixels.
-        """
+        """Copy a region of frames together, for all that is asked of it."""
         self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
@@ -118,21 +79,7 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Patch:
-    """A region of consecutive frames.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first frame.
-    counts : ndarray, shape (t, ny, nx)
-        Stored counts.
-    good, power : ndarray, shape (t,)
-        As in `Chunk`.
-    gain, offset, read_noise_e : float or ndarray, shape (ny, nx)
-        Of the camera.
-    mean_e, usable : ndarray, shape (ny, nx)
-        As in `Chunk`.
-    """
+    """A region of consecutive frames."""
 
     first: int
     counts: NDArray[Any]
@@ -150,18 +97,7 @@ class Patch:
         return self.counts.reshape(len(self.counts), self.mean_e.size)
 
     def frames(self, start: int, stop: int) -> Patch:
-        """Give some of the frames, where they lie.
-
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range, clipped to those held.
-
-        Returns
-        -------
-        Patch
-            Of the same pixels.
-        """
+        """Give some of the frames, where they lie."""
         here = slice(max(start - self.first, 0), max(stop - self.first, 0))
         return replace(
             self, first=self.first + here.start, counts=self.counts[here], good=self.good[here],
@@ -171,19 +107,7 @@ class Patch:
     def window(self, start: int, stop: int) -> tuple[FloatArray, int, float]:
         """Sum frames.
 
-        Parameters
-        ----------
-        start, stop : int
-            Half-open range, clipped to those held.
-
-        Returns
-        -------
-        electrons : ndarray, shape (ny, nx)
-            Summed photoelectrons [e].
-        frames : int
-            Good frames in the range.
-        power : float
-            Their power.
+        Shapes: `electrons` (ny, nx).
         """
         part = self.frames(start, stop)
         out = np.zeros(self.mean_e.shape)
@@ -194,19 +118,7 @@ class Patch:
     def windows(self, ends: Sequence[int]) -> tuple[FloatArray, NDArray[np.int64], FloatArray]:
         """Sum contiguous parts of the frames.
 
-        Parameters
-        ----------
-        ends : sequence of int
-            Where the parts begin and end, clipped to the frames held.
-
-        Returns
-        -------
-        electrons : ndarray, shape (n, ny, nx)
-            Summed photoelectrons of each [e].
-        frames : ndarray of int, shape (n,)
-            Good frames in each.
-        power : ndarray, shape (n,)
-            Their power.
+        Shapes: `electrons` (n, ny, nx), `frames` (n,), `power` (n,).
         """
         edges = np.clip(np.asarray(ends, dtype=np.int64) - self.first, 0, len(self.good))
         out = np.empty((edges.size - 1, *self.mean_e.shape))
@@ -242,22 +154,7 @@ def measure_frames(
 ) -> tuple[FloatArray, BoolArray]:
     """Light of every frame, and which frames repeat the one before them.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive frames.
-    camera : Camera
-        Counts → photoelectrons.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    light_e : ndarray, shape (t,)
-        Mean photoelectrons per pixel; a frame that is zero throughout, or that `cut_off` names, has
-        −∞.
-    repeats : ndarray of bool, shape (t,)
-        Bytes equal to the frame before.
+    Shapes: `counts` (t, y, x), `light_e` (t,), `repeats` (t,).
     """
     whole = np.issubdtype(counts.dtype, np.integer)
     totals = np.empty(len(counts), dtype=np.int64 if whole else np.float64)
@@ -290,17 +187,7 @@ def measure_frames(
 def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
     """Tell which frames lack their first or last row, as where a transfer broke off.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Frames, most of them whole.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    ndarray of bool, shape (t,)
-        Frames that have next to no light there, where others have at least a part of the field's.
+    Shapes: `counts` (t, y, x), result (t,).
     """
     ends = [0, counts.shape[1] // 2, -1]
     offset, gain = (
@@ -317,18 +204,7 @@ def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
 def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
     """Tell which frames have the light of most, and not that of a shutter that is closed or opens.
 
-    Parameters
-    ----------
-    light_e : ndarray, shape (t,)
-        Light of frames, as `measure_frames` gives it; not finite where there is none.
-    least : float
-        Share of the usual light, which a quarter of the frames exceeds.
-
-    Returns
-    -------
-    ndarray of bool, shape (t,)
-        Frames with at least that share, and those that miss it by no more than frames differ from
-        the next, as where a background is next to none.
+    Shapes: `light_e` (t,), result (t,).
     """
     lit: BoolArray = np.isfinite(light_e)
     if lit.any():
@@ -342,17 +218,7 @@ def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
 def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
     """Tell which frames have the light of most, and do not repeat the one before.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive frames.
-    camera : Camera
-        Counts → photoelectrons.
-
-    Returns
-    -------
-    ndarray of bool, shape (t,)
-        As `well_lit` and `measure_frames` tell them.
+    Shapes: `counts` (t, y, x), result (t,).
     """
     light, repeats = measure_frames(counts, camera)
     return well_lit(light) & ~repeats
@@ -361,15 +227,7 @@ def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
 def summed(counts: NDArray[Any]) -> tuple[FloatArray, NDArray[Any]]:
     """Sum frames, and find the highest count of every pixel.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        At least one frame.
-
-    Returns
-    -------
-    sums, highest : ndarray, shape (y, x)
-        The sums are exact where counts are whole numbers.
+    Shapes: `counts` (t, y, x), `sums, highest` (y, x).
     """
     sums, highest = np.empty(counts.shape[1:]), counts[0].copy()
     block_sums(counts, np.ones(len(counts), dtype=np.bool_), _scratch(counts), sums, highest)
@@ -398,31 +256,7 @@ def make_chunk(
 ) -> Chunk:
     """Sum consecutive frames in blocks.
 
-    Parameters
-    ----------
-    first : int
-        Number of the first frame.
-    counts : ndarray, shape (t, y, x)
-        The frames.
-    good : ndarray of bool, shape (t,)
-        Frames that may be used.
-    light_e : ndarray, shape (t,)
-        From `measure_frames`.
-    camera : Camera
-        Counts → photoelectrons.
-    stride : int
-        Frames per block; the last may be shorter.
-    defects : callable
-        Summed photoelectrons and their read-noise variance → dead and hot pixels.
-    check : callable
-        Raises DataError where `counts` may no longer be looked at.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    Chunk
-        Ready to be searched.
+    Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
     frames, rows, columns = counts.shape
     edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)

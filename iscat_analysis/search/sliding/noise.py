@@ -37,16 +37,7 @@ _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which
 
 @dataclass(frozen=True)
 class NoiseCurve:
-    """Noise of the contrast between neighbouring averages, against their length.
-
-    Attributes
-    ----------
-    frames : tuple of int
-        Lengths n.
-    variance_over_shot : tuple of float
-        Robust variance of the contrast over that of shot noise; rises where averaging no longer
-        helps.
-    """
+    """Noise of the contrast between neighbouring averages, against their length."""
 
     frames: tuple[int, ...]
     variance_over_shot: tuple[float, ...]
@@ -82,28 +73,12 @@ def measure_noise(
 ) -> NoiseCurve:
     """Noise of averages over frames, as the Allan deviation has it: neighbours are compared.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive good frames.
-    camera : Camera
-        Counts → photoelectrons.
-    longest : int
-        Longest average wanted.
-    follows : bool
-        Whether to leave out what motion of the fixed pattern makes, to first order.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    NoiseCurve
-        For the lengths of which two fit into the frames.
-
     Notes
     -----
     D. W. Allan, Proc. IEEE 54, 221 (1966).  Variances are from the median deviation, so that
     particles, which cover few pixels at a time, do not count as noise.
+
+    Shapes: `counts` (t, y, x).
     """
     strip = _Strip.of(counts, camera, together=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
@@ -115,19 +90,7 @@ def measure_noise(
 def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
     """Noise of averages that motion of the fixed pattern makes.
 
-    Parameters
-    ----------
-    counts : ndarray, shape (t, y, x)
-        Consecutive good frames.
-    camera : Camera
-        Counts → photoelectrons.
-    length : int
-        Frames that are averaged.
-
-    Returns
-    -------
-    float
-        Its variance over that of the light; about 0 where nothing moves.
+    Shapes: `counts` (t, y, x).
     """
     return _Strip.of(counts, camera, together=True).compared(length).motion
 
@@ -205,34 +168,10 @@ def _variance(values: FloatArray) -> float:
 
 
 def choose_window(curve: NoiseCurve, frames: int) -> int:
-    """Choose the window from the noise.
-
-    Parameters
-    ----------
-    curve : NoiseCurve
-        Of the movie.
-    frames : int
-        Its length.
-
-    Returns
-    -------
-    int
-        The length whose contrast is least noisy, at most a tenth of the movie.
-    """
+    """Choose the window from the noise."""
     return max(SHORTEST_WINDOW, min(curve.best, longest_window(frames)))
 
 
 def longest_window(frames: int) -> int:
-    """Longest window that is chosen for a movie.
-
-    Parameters
-    ----------
-    frames : int
-        Frames in the movie.
-
-    Returns
-    -------
-    int
-        Frames.
-    """
+    """Longest window that is chosen for a movie."""
     return max(SHORTEST_WINDOW, min(LONGEST_WINDOW, frames // MOVIE_SHARE))

@@ -34,60 +34,18 @@ CORRELATION = 1 - 3 / (2 * STRIDES)
 
 
 def stride_of(window: int) -> int:
-    """Give the frames between two boundaries that are searched.
-
-    Parameters
-    ----------
-    window : int
-        Frames before and after a step.
-
-    Returns
-    -------
-    int
-        At least 1.
-    """
+    """Give the frames between two boundaries that are searched."""
     return max(1, window // STRIDES)
 
 
 def boundaries(frames: int, window: int) -> int:
-    """Count the boundaries that are searched in a movie.
-
-    Parameters
-    ----------
-    frames : int
-        Of the movie.
-    window : int
-        Frames before and after a step.
-
-    Returns
-    -------
-    int
-        At least 1.
-    """
+    """Count the boundaries that are searched in a movie."""
     return max(math.ceil(frames / stride_of(window)) - 1, 1)
 
 
 @dataclass(frozen=True)
 class Filter:
-    """Matched filter of one chunk; the weights are those of its mean image.
-
-    Attributes
-    ----------
-    spectrum : ndarray
-        Of the reversed template.
-    size : (int, int)
-        Of the transforms.
-    half : int
-        Half the template's side [pixels].
-    weight : ndarray, shape (y, x)
-        Information of a pixel about its contrast, per frame of unit power; 0 where not used.
-    norm : ndarray, shape (y, x)
-        Information about the amplitude, per frame.
-    noise : NoiseSpectrum or None
-        What the noise is where it is not white and of the expected size.
-    template : ndarray, shape (k, k)
-        Contrast per unit amplitude, k odd.
-    """
+    """Matched filter of one chunk; the weights are those of its mean image."""
 
     spectrum: NDArray[np.complex64]
     size: tuple[int, int]
@@ -102,20 +60,7 @@ class Filter:
     ) -> tuple[tuple[slice, slice], MapArray]:
         """Filter a small image alone, on a field without contrast and with white noise.
 
-        Parameters
-        ----------
-        corner : (int, int)
-            Row and column of its first pixel, all of which lie in the field.
-        contrast : ndarray, shape (ny, nx)
-            Its values.
-
-        Returns
-        -------
-        box : (slice, slice)
-            Pixels of the field that it reaches.
-        snr : ndarray of float32
-            There, what a map of `sliding_maps` gains where one frame before and infinitely many
-            after are compared; in others times the root of the effective frames.
+        Shapes: `contrast` (ny, nx).
         """
         half, field = self.half, self.weight.shape
         inside = tuple(slice(c, c + n) for c, n in zip(corner, contrast.shape, strict=True))
@@ -147,19 +92,7 @@ class Filter:
 def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None = None) -> Filter:
     """Prepare the matched filter.
 
-    Parameters
-    ----------
-    chunk : Chunk
-        Gives the weights.
-    template : ndarray, shape (k, k)
-        Contrast per unit amplitude, k odd.
-    noise : NoiseSpectrum, optional
-        Of the movie; without it the noise is white and of the expected size.
-
-    Returns
-    -------
-    Filter
-        What every window of the chunk is filtered with.
+    Shapes: `template` (k, k).
     """
     rows, columns = chunk.shape
     half = template.shape[0] // 2
@@ -205,29 +138,7 @@ def sliding_maps(
 ) -> tuple[MapArray, FloatArray]:
     """Signal-to-noise ratio of a step at every boundary between blocks and every pixel.
 
-    Parameters
-    ----------
-    chunk : Chunk
-        The sums.
-    matched : Filter
-        From `make_filter`.
-    strides : int
-        Blocks in a window; fewer near the ends.
-    explained : callable, optional
-        Boundary, and the frames before and after → contrast of known events, or None for none.
-    earlier : (ndarray, ndarray), optional
-        What an earlier call returned; overwritten where `changed`, and returned.
-    changed : sequence of int
-        Boundaries at which what is explained has changed since.
-    mapper : callable
-        `map`, or the one of a pool.
-
-    Returns
-    -------
-    snr : ndarray of float32, shape (k − 1, y, x)
-        Map j belongs to a step at ``edges[j + 1]``.
-    frames : ndarray, shape (k − 1,)
-        Effective frames: information at a boundary is `Filter.norm` times this.
+    Shapes: `snr` (k − 1, y, x), `frames` (k − 1,).
     """
     count = chunk.edges.size - 2
     rows, columns = chunk.shape
@@ -271,19 +182,7 @@ def sliding_maps(
 
 @dataclass(frozen=True)
 class Peak:
-    """A place and a boundary at which the contrast seems to step.
-
-    Attributes
-    ----------
-    frame : int
-        The boundary.
-    x_px, y_px : float
-        Sub-pixel position.
-    snr : float
-        With its sign.
-    amplitude : float
-        Linear estimate, with its sign.
-    """
+    """A place and a boundary at which the contrast seems to step."""
 
     frame: int
     x_px: float
@@ -301,24 +200,7 @@ def find_steps(
 ) -> list[Peak]:
     """Peaks in (t, y, x) above the threshold, strongest first.
 
-    Parameters
-    ----------
-    chunk : Chunk
-        The sums.
-    matched : Filter
-        From `make_filter`.
-    snr : ndarray, shape (n, y, x)
-        From `sliding_maps`.
-    effective : ndarray
-        From `sliding_maps`.
-    threshold : float
-        Least signal-to-noise ratio, between the pixels: where the field peaks, not where it is
-        sampled, it exceeds the threshold as often as the theory of smooth fields has it.
-
-    Returns
-    -------
-    list of Peak
-        With sub-pixel positions.
+    Shapes: `snr` (n, y, x).
     """
     at = step_peaks(snr, SAMPLED * threshold)
     k, i, j = at.T
