@@ -1,6 +1,6 @@
 """Check that every name of `iscat_analysis.__all__` has a whole numpydoc docstring.
 
-So have the methods of public classes.  Names inside the package have a sentence; Ruff asks for that.
+So have the methods of public classes.  Names inside have a sentence; Ruff asks for that.
 """
 
 from __future__ import annotations
