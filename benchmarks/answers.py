@@ -23,7 +23,7 @@ for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 import numpy as np  # noqa: E402  # after the thread counts
 import pandas as pd  # noqa: E402
 
-from iscat_analysis.pipeline.comparing import compare_tables  # noqa: E402
+from iscat_analysis.answers.comparing import compare_tables  # noqa: E402
 
 RESULTS = Path(__file__).resolve().parent / "results"
 EVENTS = 10_000

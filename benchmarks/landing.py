@@ -35,10 +35,10 @@ import numpy as np
 from _peer import peer_python
 
 from iscat_analysis._kernels.sliding import contrast_map
+from iscat_analysis.camera.background import find_defects
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import load_config
-from iscat_analysis.movie.background import find_defects
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.search.sliding import make_chunk, make_filter, measure_frames, sliding_maps
 from iscat_analysis.study.simulate import write_stack
 

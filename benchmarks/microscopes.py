@@ -40,11 +40,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.results import Found
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.instrument.learning import learn_optics
+from iscat_analysis.landing.find import analyse_landings
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SHAPE = (900, 160, 160)

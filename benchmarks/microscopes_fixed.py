@@ -20,13 +20,13 @@ from microscopes import MICROSCOPES, SEEDS, compare, nominal, tally
 
 from instruments import Instrument, InstrumentMovie, draw_landings  # isort: skip
 
+from iscat_analysis.camera.background import measure_windows
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
-from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.diagnosis import misfit_warning
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.results import table_of
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.diagnosis.causes import misfit_warning
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.results import table_of
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import FRAME_COLUMN
 
 SHAPE = (200, 200, 200)

@@ -25,10 +25,10 @@ import numpy as np
 import pandas as pd
 from scipy.stats import poisson
 
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.results import Found
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.study.simulate import Movie
 

@@ -19,9 +19,9 @@ from iscat_cli.options import (
 )
 
 if TYPE_CHECKING:
-    from iscat_analysis.calibration.camera import CameraCalibration, Estimate
     from iscat_analysis.calibration.mass import MassCalibration
-    from iscat_analysis.calibration.optics import OpticsCalibration
+    from iscat_analysis.camera.calibration import CameraCalibration, Estimate
+    from iscat_analysis.instrument.learner import OpticsCalibration
 
 SUMMARY = "Calibrate the camera, the optics, or contrast against mass."
 
@@ -84,9 +84,9 @@ def camera(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
+        from iscat_analysis.answers.calibrations import camera_calibration
         from iscat_analysis.errors import ConfigError
         from iscat_analysis.movie.addresses import beside
-        from iscat_analysis.pipeline.calibrations import camera_calibration
 
         given = [*(stacks or ()), *([dark] if dark is not None else [])]
         if not given:
@@ -152,8 +152,8 @@ def mass(
     with failures(messages, debug=debug):
         masses, errors = _standards(standards)
 
+        from iscat_analysis.answers.calibrations import mass_calibration
         from iscat_analysis.movie.addresses import beside
-        from iscat_analysis.pipeline.calibrations import mass_calibration
 
         folder = out if out is not None else beside(events, ".calibration")
         found = mass_calibration(
@@ -228,10 +228,10 @@ def optics(
                 overwrite=overwrite, as_json=as_json,
             )  # fmt: skip
             return
+        from iscat_analysis.answers.calibrations import optics_calibration
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
         from iscat_analysis.movie.addresses import beside
-        from iscat_analysis.pipeline.calibrations import optics_calibration
 
         folder = out if out is not None else beside(movie, ".optics")
         with messages.progress() as progress:
@@ -272,10 +272,10 @@ def _measure(
     as_json: bool,
 ) -> None:
     """Measure the picture of a particle."""
+    from iscat_analysis.answers.calibrations import template_calibration
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import ConfigError, DataError
     from iscat_analysis.movie.addresses import beside
-    from iscat_analysis.pipeline.calibrations import template_calibration
 
     if free is not None or focus_step is not None:
         raise ConfigError(

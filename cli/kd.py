@@ -21,7 +21,7 @@ from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOpt
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair
 
 if TYPE_CHECKING:
-    from iscat_analysis.pipeline.binding import Binding
+    from iscat_analysis.answers.binding import Binding
 
 EXAMPLE = """Example: series.csv has a row per table, columns path and concentration_nm.
 
@@ -95,7 +95,7 @@ def kd(
         middle, spread = pair("--limit", limit)
         given = None if masses is None else numbers("--masses", masses)
 
-        from iscat_analysis.pipeline.binding import fit_kd
+        from iscat_analysis.answers.binding import fit_kd
         from iscat_analysis.species.mass_action import LANDING_POWER
 
         found = fit_kd(

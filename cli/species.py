@@ -29,7 +29,7 @@ from iscat_cli.options import (
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair, whole
 
 if TYPE_CHECKING:
-    from iscat_analysis.pipeline.kinetics import Kinetics
+    from iscat_analysis.answers.kinetics import Kinetics
     from iscat_analysis.species import Comparison, Distribution
     from iscat_analysis.species.tables import EventTable
 
@@ -174,7 +174,7 @@ def species(
             )  # fmt: skip
             return
 
-        from iscat_analysis.pipeline.answers import find_species
+        from iscat_analysis.answers.species import find_species
         from iscat_analysis.species.tables import event_table
 
         notes: list[str] = []
@@ -250,7 +250,7 @@ def _compare(
     as_json: bool,
 ) -> None:
     """Compare tables with the first of them."""
-    from iscat_analysis.pipeline.comparing import compare_tables, comparison_document
+    from iscat_analysis.answers.comparing import compare_tables, comparison_document
 
     notes: list[str] = []
     with messages.progress() as progress:
@@ -344,8 +344,8 @@ def _rates(
     path: Path, events: EventTable, frame_rate: float | None, frames: str | None
 ) -> Kinetics | None:
     """Fit rates where the frames per second are known."""
+    from iscat_analysis.answers.kinetics import configured_frame_rate, fit_kinetics
     from iscat_analysis.errors import ConfigError
-    from iscat_analysis.pipeline.kinetics import configured_frame_rate, fit_kinetics
 
     between = None if frames is None else frame_range("--frames", frames)
     if frame_rate is None:

@@ -58,6 +58,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from iscat_analysis.answers.binding import Binding as Binding
+    from iscat_analysis.answers.binding import fit_kd as fit_kd
+    from iscat_analysis.answers.comparing import compare_samples as compare_samples
+    from iscat_analysis.answers.comparing import compare_tables as compare_tables
+    from iscat_analysis.answers.kinetics import Kinetics as Kinetics
+    from iscat_analysis.answers.kinetics import fit_kinetics as fit_kinetics
+    from iscat_analysis.answers.species import find_species as find_species
     from iscat_analysis.config import Calibration as Calibration
     from iscat_analysis.config import Config as Config
     from iscat_analysis.config import Optics as Optics
@@ -86,13 +93,6 @@ if TYPE_CHECKING:
     from iscat_analysis.pieces import psf as psf
     from iscat_analysis.pieces import qcrb as qcrb
     from iscat_analysis.pipeline import fit_stack as fit_stack
-    from iscat_analysis.pipeline.answers import find_species as find_species
-    from iscat_analysis.pipeline.binding import Binding as Binding
-    from iscat_analysis.pipeline.binding import fit_kd as fit_kd
-    from iscat_analysis.pipeline.comparing import compare_samples as compare_samples
-    from iscat_analysis.pipeline.comparing import compare_tables as compare_tables
-    from iscat_analysis.pipeline.kinetics import Kinetics as Kinetics
-    from iscat_analysis.pipeline.kinetics import fit_kinetics as fit_kinetics
     from iscat_analysis.pipeline.looks import Look as Look
     from iscat_analysis.pipeline.preview import Preview as Preview
     from iscat_analysis.pipeline.stored import StoredResult as StoredResult
@@ -158,13 +158,13 @@ _HOME = {
     "Result": "notebook",
     "simulate_movie": "notebook",
     "calibrate_optics": "notebook",
-    "find_species": "pipeline.answers",
-    "compare_samples": "pipeline.comparing",
-    "compare_tables": "pipeline.comparing",
-    "fit_kd": "pipeline.binding",
-    "Binding": "pipeline.binding",
-    "fit_kinetics": "pipeline.kinetics",
-    "Kinetics": "pipeline.kinetics",
+    "find_species": "answers.species",
+    "compare_samples": "answers.comparing",
+    "compare_tables": "answers.comparing",
+    "fit_kd": "answers.binding",
+    "Binding": "answers.binding",
+    "fit_kinetics": "answers.kinetics",
+    "Kinetics": "answers.kinetics",
     "Comparison": "species",
     "Distribution": "species",
     "compute_bounds": "notebook",

@@ -17,10 +17,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
-from iscat_analysis.calibration.optics import Pictures, make_pictures, maximise, settings_of
-from iscat_analysis.calibration.optics.starts import with_masses
-from iscat_analysis.pipeline.microscope import microscopes
-from iscat_analysis.pipeline.sights import reach_nm
+from iscat_analysis.instrument.learner import Pictures, make_pictures, maximise, settings_of
+from iscat_analysis.instrument.learner.starts import with_masses
+from iscat_analysis.instrument.microscope import microscopes
+from iscat_analysis.instrument.particle_images import reach_nm
 
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "tutorial.toml"

@@ -13,6 +13,7 @@ from typing import Any
 
 import pandas as pd
 
+from iscat_analysis.answers.calibrations import camera_calibration, mass_calibration
 from iscat_analysis.config import Config
 from iscat_analysis.config.files import read_toml
 from iscat_analysis.day.plan import Movie, Plan, configured
@@ -20,7 +21,6 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import hash_of, sha256_of
 from iscat_analysis.errors import DataError, SignError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.pipeline.calibrations import camera_calibration, mass_calibration
 
 _OPTICS = (
     "polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na", "focus_nm",

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from iscat_analysis.day.gather import Found
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.pipeline.binding import (
+from iscat_analysis.answers.binding import (
     CONCENTRATIONS,
     Binding,
     check_reaction,
     fit_kd,
     with_events,
 )
+from iscat_analysis.day.gather import Found
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.mass_action import Model
 from iscat_analysis.species.tables import event_table

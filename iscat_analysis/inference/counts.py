@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from iscat_analysis.camera.background import smooth_background
 from iscat_analysis.inference.checks import BoolArray, FloatArray, mask_of, pixels_of
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
-from iscat_analysis.movie.background import smooth_background
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2

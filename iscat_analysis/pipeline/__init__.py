@@ -19,26 +19,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.background_mode import Way, way_of
+from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept
+from iscat_analysis.fitting.compilation import compiling, needs_of
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.run import Notify, Run, unheard
 from iscat_analysis.hashing import BegunHash
 from iscat_analysis.inference.checks import path_in
+from iscat_analysis.landing.find import find_landings
 from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
-from iscat_analysis.pipeline.compilation import compiling, needs_of
 from iscat_analysis.pipeline.finish import gather
 from iscat_analysis.pipeline.injection import injected
-from iscat_analysis.pipeline.landing import find_landings
-from iscat_analysis.pipeline.prepare import Prepared, prepare
-from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.resume import is_resumable, partial_folder, parts_kept
-from iscat_analysis.pipeline.run import Notify, Run, unheard
-from iscat_analysis.pipeline.tracking import find_moving
-from iscat_analysis.pipeline.ways import Way, way_of
+from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, atomic_folder, fill_report
 from iscat_analysis.report.output import claim_output
+from iscat_analysis.tracking.find import find_moving
 
 if TYPE_CHECKING:
     from iscat_analysis.draughtsman import Draughtsman

@@ -12,26 +12,25 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.movie import Stack
-from iscat_analysis.pipeline.dark_frames import without_cut_off
-from iscat_analysis.pipeline.diagnosis import (
+from iscat_analysis.diagnosis.causes import (
     misfit_warning,
     pixel_warnings,
     repeats_warning,
     uneven_warning,
 )
-from iscat_analysis.pipeline.events import Event, posterior_of
-from iscat_analysis.pipeline.field import add_signal, fit_field
-from iscat_analysis.pipeline.fixed_pattern import drift_warning, examine_background
-from iscat_analysis.pipeline.noise import Noise, judge_background, judge_beside
-from iscat_analysis.pipeline.prepare import Prepared
-from iscat_analysis.pipeline.ranges import checked, frame_ranges, measured_windows
-from iscat_analysis.pipeline.regions import Region, contrast_image, photons_scale
-from iscat_analysis.pipeline.repeats import field_repeats
-from iscat_analysis.pipeline.results import Compared, Found, table_of, view_of
-from iscat_analysis.pipeline.run import Run
-from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.pipeline.tracking import track_frames
+from iscat_analysis.diagnosis.dark_frames import without_cut_off
+from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
+from iscat_analysis.diagnosis.noise import Noise, judge_background, judge_beside
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.fitting.events import Event, posterior_of
+from iscat_analysis.fitting.field import add_signal, fit_field
+from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
+from iscat_analysis.fitting.regions import Region, contrast_image, photons_scale
+from iscat_analysis.fitting.results import Compared, Found, table_of, view_of
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.fitting.scene import Scene, make_scene
+from iscat_analysis.landing.split_frame_estimates import field_repeats
+from iscat_analysis.movie import Stack
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     FloatArray,
@@ -42,6 +41,7 @@ from iscat_analysis.records import (
     verdict,
 )
 from iscat_analysis.threads import threads
+from iscat_analysis.tracking.find import track_frames
 from iscat_analysis.units import count
 
 CHANGES = 4.0

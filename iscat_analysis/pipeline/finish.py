@@ -11,25 +11,25 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.config import config_to_toml
-from iscat_analysis.movie.stack import printable
-from iscat_analysis.pipeline.achieved import spread_verdict
-from iscat_analysis.pipeline.diagnosis import (
+from iscat_analysis.diagnosis.causes import (
     bend_warning,
     course_warning,
     line_warning,
     plane_warning,
     sign_warning,
 )
-from iscat_analysis.pipeline.prepare import Prepared
-from iscat_analysis.pipeline.results import Compared, Found
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.fitting.results import Compared, Found
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.rows import reported_rows
-from iscat_analysis.pipeline.run import Run
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.pipeline.together import warnings_of
-from iscat_analysis.pipeline.tracks import make_films, tracks_of
 from iscat_analysis.places import versions
 from iscat_analysis.records import Analysis, Film, Provenance, silent
 from iscat_analysis.report.spread import rejection
+from iscat_analysis.tracking.common_motion import warnings_of
+from iscat_analysis.tracking.tracks import make_films, tracks_of
+from iscat_analysis.trust.empirical_spread import spread_verdict
 
 
 def gather(

@@ -20,17 +20,17 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import power_searched
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import Mover, Trajectory
 from iscat_analysis.config import Config
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.drift import Mover, Trajectory
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.run import Run, unheard
+from iscat_analysis.fitting.scene import Scene, reported_steps
+from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.prepare import Prepared
-from iscat_analysis.pipeline.ranges import fitted_frames
-from iscat_analysis.pipeline.results import Found
 from iscat_analysis.pipeline.rows import reported_rows
-from iscat_analysis.pipeline.run import Run, unheard
-from iscat_analysis.pipeline.scene import Scene, reported_steps
 from iscat_analysis.places import Place
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE

@@ -12,34 +12,19 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis._kernels.sliding import contrast_map
+from iscat_analysis.camera.background import measure_windows, start_power
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import judge_background, judge_opening
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.fitting.field import search_field
+from iscat_analysis.fitting.pattern import SPAN, corrected
+from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.regions import contrast_image
+from iscat_analysis.fitting.scene import Scene, make_scene, reported_steps
+from iscat_analysis.landing.sidelobes import Sieve
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.background import measure_windows, start_power
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
-from iscat_analysis.pipeline.chunks import reader_of
-from iscat_analysis.pipeline.field import search_field
-from iscat_analysis.pipeline.moving_field import (
-    LEAST_FRAMES,
-    load_field,
-    opening_ground,
-    search_frames,
-    track_scene,
-)
-from iscat_analysis.pipeline.noise import judge_background, judge_opening
-from iscat_analysis.pipeline.pattern import SPAN, corrected
-from iscat_analysis.pipeline.ranges import (
-    checked,
-    fitted_frames,
-    frame_ranges,
-    measured_windows,
-)
-from iscat_analysis.pipeline.regions import contrast_image
-from iscat_analysis.pipeline.scene import Scene, make_scene, reported_steps
-from iscat_analysis.pipeline.sidelobes import Sieve
 from iscat_analysis.records import FloatArray, silent
 from iscat_analysis.search.sliding import (
     STRIDES,
@@ -51,7 +36,17 @@ from iscat_analysis.search.sliding import (
     sliding_maps,
     stride_of,
 )
+from iscat_analysis.search.sliding.chunks import reader_of
 from iscat_analysis.threads import threads
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.moving_field import (
+    LEAST_FRAMES,
+    load_field,
+    opening_ground,
+    search_frames,
+    track_scene,
+)
 
 FOUND_COLUMNS = ("x_px", "y_px", "snr", "contrast", "mass_kda")
 """Columns of what a `Look` finds."""

@@ -3,66 +3,43 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
+from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.copies import LostError, aside
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.movie import Stack
-from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_overflow, refuse_ratio
-from iscat_analysis.movie.lines import Lines
-from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.pipeline.chunks import reader_of, sum_first_chunk
-from iscat_analysis.pipeline.contrast_sign import learn_sign, wrong_sign
-from iscat_analysis.pipeline.diagnosis import axes_warning
-from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.light import JudgedLight, judge_light
-from iscat_analysis.pipeline.noise import Opening, judge_opening
-from iscat_analysis.pipeline.ranges import fitted_frames, tracked_frames
-from iscat_analysis.pipeline.recognise import (
+from iscat_analysis.diagnosis.causes import axes_warning
+from iscat_analysis.diagnosis.changes import Changes
+from iscat_analysis.diagnosis.light import JudgedLight, judge_light
+from iscat_analysis.diagnosis.noise import Opening, judge_opening
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.diagnosis.recognise import (
     as_landing,
     as_moving,
     changes_summary,
     look_at_changes,
 )
-from iscat_analysis.pipeline.run import Run
-from iscat_analysis.pipeline.stage import followed, motion_said
-from iscat_analysis.pipeline.tracks import judge_times
-from iscat_analysis.pipeline.ways import Way, way_of, way_said
-from iscat_analysis.search.changes import Changes
+from iscat_analysis.diagnosis.stage import followed, motion_said
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.background_mode import way_of, way_said
+from iscat_analysis.fitting.ranges import fitted_frames, tracked_frames
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
+from iscat_analysis.instrument.learning import learn_optics
+from iscat_analysis.movie import Stack
+from iscat_analysis.pieces.setups import darkfield_photons
+from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import beside, one_thread_algebra, processors
+from iscat_analysis.tracking.tracks import judge_times
 
 _OPENING = 64  # frames that are looked at before anything else
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A movie that can be searched."""
-
-    movie: Stack
-    steady: Stack
-    config: Config
-    camera: Camera
-    way: Way
-    lines: Lines | None
-    opening: Opening | None
-    other_kind: str
-    digest: Future[str]
-    summary: Mapping[str, Any]
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rows and columns."""
-        return self.movie.shape[1], self.movie.shape[2]
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 
+from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_ratio
+from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.background_mode import Way, way_of
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.camera import Camera, camera_from_config, refuse_ratio
-from iscat_analysis.movie.lines import Lines
-from iscat_analysis.movie.metadata import resolve_metadata
-from iscat_analysis.pipeline.light import judge_light
 from iscat_analysis.pipeline.looks import (
     BoundSearch,
     LandingSearch,
@@ -25,7 +26,6 @@ from iscat_analysis.pipeline.looks import (
     Search,
     positive,
 )
-from iscat_analysis.pipeline.ways import Way, way_of
 
 _SEARCHES: Mapping[Way, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
     "fixed": BoundSearch,

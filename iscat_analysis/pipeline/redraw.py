@@ -16,49 +16,39 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.background import refine_power
+from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.events import Fitted, PlaceAndMass
+from iscat_analysis.fitting.field import add_signal
+from iscat_analysis.fitting.pattern import corrected
+from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.regions import Region, photons_scale, region_around, region_likelihood
+from iscat_analysis.fitting.results import view_of
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Rows
+from iscat_analysis.landing.neighbours import Neighbours, Step
+from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.background import refine_power
-from iscat_analysis.movie.camera import Camera, camera_from_config
-from iscat_analysis.movie.lines import Lines, SteadyFrames, steady
-from iscat_analysis.pipeline.block_store import row_view
-from iscat_analysis.pipeline.chunks import HALO, reader_of
-from iscat_analysis.pipeline.events import Fitted, PlaceAndMass
-from iscat_analysis.pipeline.field import add_signal
-from iscat_analysis.pipeline.light import judge_light
-from iscat_analysis.pipeline.moving import blurred_rows
-from iscat_analysis.pipeline.moving_field import (
+from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
+from iscat_analysis.search.sliding import StepFrame, stride_of
+from iscat_analysis.search.sliding.chunks import HALO, reader_of
+from iscat_analysis.threads import threads
+from iscat_analysis.tracking.block_store import row_view
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.moving import blurred_rows
+from iscat_analysis.tracking.moving_field import (
     exposure_of,
     give_back,
     load_field,
     opening_ground,
     track_scene,
 )
-from iscat_analysis.pipeline.neighbours import Neighbours, Step
-from iscat_analysis.pipeline.pattern import corrected
-from iscat_analysis.pipeline.ranges import (
-    checked,
-    fitted_frames,
-    frame_ranges,
-    measured_windows,
-)
-from iscat_analysis.pipeline.regions import (
-    Region,
-    photons_scale,
-    region_around,
-    region_likelihood,
-)
-from iscat_analysis.pipeline.results import view_of
-from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.pipeline.tasks import TaskBuilder
-from iscat_analysis.pipeline.ways import way_of
-from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
-from iscat_analysis.search.sliding import StepFrame, stride_of
-from iscat_analysis.threads import threads
 
 Redraw = Callable[[int], EventView]
 """Row of the table → its images."""

@@ -19,19 +19,13 @@ from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis._kernels.stepping import add_image
+from iscat_analysis.camera.background import find_defects
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.inference.coupling import Coupling
-from iscat_analysis.inference.exposures import Exposures
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.inference.repeats import repeats_of, series_of
-from iscat_analysis.inference.rows import Ground, Rows
-from iscat_analysis.movie.background import find_defects
-from iscat_analysis.movie.camera import Camera
+from iscat_analysis.landing.sidelobes import Sieve
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.pipeline.sidelobes import Sieve
-from iscat_analysis.search.moving import link
 from iscat_analysis.search.sliding import (
     STRIDES,
     find_steps,
@@ -42,6 +36,12 @@ from iscat_analysis.search.sliding import (
 )
 from iscat_analysis.species.motion import confinement_test
 from iscat_analysis.threads import threads
+from iscat_analysis.tracking.frame_search import link
+from iscat_analysis.tracking.joint.exposures import Exposures
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.newton import Response
+from iscat_analysis.tracking.joint.track_coupling import Coupling
 
 _REACH_NM = 2000.0
 _SIDE, _SQUARE, _FRAMES = 8, 4, 4

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import pandas as pd
 
+from iscat_analysis.fitting.results import Found
 from iscat_analysis.inference.achieved import Achieved
-from iscat_analysis.pipeline.achieved import measure_spread, measured_scale, repeat_columns
-from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.systematic import systematic
-from iscat_analysis.pipeline.tracked_optics import mass_error
 from iscat_analysis.records import FloatArray
+from iscat_analysis.tracking.tracked_optics import mass_error
+from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
+from iscat_analysis.trust.systematic import systematic
 
 
 def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:

@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import holevo_over_quantum
+from iscat_analysis.fitting.results import Compared
+from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.achieved import Achieved
-from iscat_analysis.pipeline.results import Compared
-from iscat_analysis.pipeline.scene import Scene
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.species import LEAST_EVENTS, describe

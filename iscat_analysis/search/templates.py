@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter
 
+from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import FloodError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.random_field import LOWEST, Excursions, extent
-from iscat_analysis.movie.spectrum import NoiseSpectrum
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.peaks import SAMPLED, summits, vertices

@@ -16,11 +16,11 @@ import numpy as np
 from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.regions import Region, region_likelihood
+from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.regions import Region, region_likelihood
-from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
 
 CLEARANCE = 8.0

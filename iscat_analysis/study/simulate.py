@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
+from iscat_analysis.camera.counts import camera_from_config, read_map
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.movie.camera import camera_from_config, read_map
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import FloatArray, Progress, silent

@@ -34,8 +34,8 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
 from sketches import PAGES, sketch
 
-from iscat_analysis.pipeline import chunks
 from iscat_analysis.report.style import publish
+from iscat_analysis.search.sliding import chunks
 from iscat_cli import main
 
 _SKETCH = partial(sketch, pause_s=0.01)  # a moment to be killed in, at each figure

@@ -33,9 +33,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from hardening.samples import samples
 
+from iscat_analysis.camera.counts import read_map
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import read_map
 from iscat_analysis.movie.event_tables import read_events
 
 MEMORY_MB = 512

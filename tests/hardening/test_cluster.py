@@ -24,8 +24,8 @@ from distributed import Client
 import iscat_analysis as ia
 from iscat_analysis import places
 from iscat_analysis.errors import SchedulerError
+from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.pipeline.resume import partial_folder
 from iscat_cli import main_fit
 
 pytestmark = [
@@ -232,7 +232,7 @@ def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
 def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, monkeypatch) -> None:
     """How many are sampled in a chunk follows from those before it."""
     cluster.add(2)
-    monkeypatch.setattr("iscat_analysis.pipeline.landing.POSTERIORS", 2)
+    monkeypatch.setattr("iscat_analysis.landing.find.POSTERIORS", 2)
     monkeypatch.chdir(landing.parent)  # workers run elsewhere
     more = {"posterior.enabled": True, "posterior.steps": 100, "posterior.walkers": 10}
     alone, apart = (

@@ -17,13 +17,15 @@ import pandas as pd
 import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.landing import companion
+from iscat_analysis.landing import find as landing
+from iscat_analysis.landing.chunk_work import ChunkSetting
+from iscat_analysis.landing.companion import Pair, paired
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline import analyse, companion, landing
-from iscat_analysis.pipeline.chunk_work import ChunkSetting
-from iscat_analysis.pipeline.companion import Pair, paired
+from iscat_analysis.pipeline import analyse
 from iscat_analysis.places import Here
 from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.threads import allotted, is_allotted, threads
@@ -249,7 +251,7 @@ def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
         "from pathlib import Path\n"
         "sys.path.insert(0, sys.argv[2])\n"
         "from test_companion import _say\n"
-        "from iscat_analysis.pipeline.companion import Pair\n"
+        "from iscat_analysis.landing.companion import Pair\n"
         "both = Pair(2)\n"
         "def work(item):\n"
         "    if both.distant: _say(Path(sys.argv[1]))\n"

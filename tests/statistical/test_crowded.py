@@ -10,12 +10,12 @@ import pytest
 from instruments import PEAK_PER_KDA, Instrument, InstrumentMovie, Landings, draw_landings
 
 import iscat_analysis as ia
+from iscat_analysis.camera.background import measure_windows
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import load_config
-from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline import field
-from iscat_analysis.pipeline.events import Event
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.fitting import field
+from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.scene import make_scene
 
 SIGMAS = 4.0
 

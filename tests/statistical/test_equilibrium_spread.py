@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.stats import kstest
 
 import iscat_analysis as ia
-from iscat_analysis.pipeline.binding import Binding
+from iscat_analysis.answers.binding import Binding
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.mass_action import LANDING_POWER
 

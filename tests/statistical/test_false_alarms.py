@@ -10,8 +10,8 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.config import load_config
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import Windows
 from iscat_analysis.study.simulate import Movie
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
 
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.learning import learn_optics
-from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.pipeline.systematic import systematic
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.instrument.learning import learn_optics
+from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.trust.systematic import systematic
 
 SHAPE = (1400, 176, 160)
 LANDINGS = draw_landings(SHAPE, 36, seed=21, masses=(480.0, 480.0, 146.0), apart_px=20.0)

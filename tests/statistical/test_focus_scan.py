@@ -8,12 +8,12 @@ from calibrations import configuration, make_sights
 from instruments import Instrument, focus_scan, strength_of_sphere
 
 import iscat_analysis as ia
-from iscat_analysis.calibration.optics import OpticsCalibration, settings_of
-from iscat_analysis.calibration.optics.estimate import optics_limits
-from iscat_analysis.calibration.optics.measure import measure_microscope
-from iscat_analysis.calibration.optics.starts import _strengths
-from iscat_analysis.pipeline.learning import calibrate_movie
-from iscat_analysis.pipeline.microscope import goodness
+from iscat_analysis.instrument.learner import OpticsCalibration, settings_of
+from iscat_analysis.instrument.learner.estimate import optics_limits
+from iscat_analysis.instrument.learner.measure import measure_microscope
+from iscat_analysis.instrument.learner.starts import _strengths
+from iscat_analysis.instrument.learning import calibrate_movie
+from iscat_analysis.instrument.microscope import goodness
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0

@@ -11,13 +11,13 @@ import pytest
 from scipy.ndimage import convolve1d
 from scipy.stats import poisson
 
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.movie.camera import Camera
+from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.records import FRAME_COLUMN, Candidate
 from iscat_analysis.study.simulate import Movie
 
@@ -168,7 +168,7 @@ def test_a_search_that_does_not_measure_the_noise_has_more(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control: of the noise, and of the test above."""
-    monkeypatch.setattr("iscat_analysis.pipeline.noise.measure_spectrum", lambda *_, **__: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.noise.measure_spectrum", lambda *_, **__: None)
     with pytest.raises(AssertionError):
         _assert_expected(_alarms_in(kind, 6), 6)
 

@@ -11,11 +11,11 @@ import pytest
 from scipy.stats import poisson
 
 import iscat_analysis as ia
+from iscat_analysis.camera.lines import Lines
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.diagnosis.light import judge_lines
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.lines import Lines
-from iscat_analysis.pipeline.light import judge_lines
 from iscat_analysis.study.simulate import Movie
 
 pytestmark = pytest.mark.large
@@ -128,7 +128,7 @@ def test_pulls_are_standard_and_masses_unbiased(kind: str, lines: str) -> None:
 @pytest.mark.parametrize("kind", ["landing", "fixed"])
 def test_without_the_correction_they_are_not(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Control: the movies above; across the rows and in the mass, and not along them."""
-    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.judge_lines", lambda *_: None)
     table = _fitted(kind, "rows", 8)
     _assert_standard(table["x"])
     for name in ("y", "mass"):
@@ -143,7 +143,7 @@ def test_masses_are_too_low_where_what_is_left_is_not_foreseen(
     """Control: rows and columns take 2 × 2.8 pixels of 88 off a particle, 6 % of its mass."""
     for method in ("left", "taken"):
         monkeypatch.setattr(
-            f"iscat_analysis.movie.lines.Lines.{method}",
+            f"iscat_analysis.camera.lines.Lines.{method}",
             lambda _, signal, method=method: signal if method == "left" else np.ones_like(signal),
         )
     table = _fitted(kind, "both", 6)
@@ -170,7 +170,7 @@ def test_lines_that_are_divided_out_of_a_moving_pattern_make_particles(
         background = config.background.model_copy(update={"drift_correction": False})
         return judge_lines(movie, config.model_copy(update={"background": background}), *others)
 
-    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", divided)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.judge_lines", divided)
     config = _config("drifting", "simulation.count=0", "detection.false_alarms_per_movie=1e-3")
     with pytest.raises(DataError, match="places in frames 0:140 pass the detection threshold"):
         ia.fit_movie(_recorded(config, 0, "both", FLICKER), config=config)
@@ -194,6 +194,6 @@ def test_clean_movies_are_not_touched(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = [_recorded(config, seed, "rows", 0.0) for seed in range(6)]
     found = [ia.fit_movie(c, config=config) for c in counts]
     assert not any("lines" in result.summary for result in found)
-    monkeypatch.setattr("iscat_analysis.pipeline.light.judge_lines", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.judge_lines", lambda *_: None)
     for c, result in zip(counts, found, strict=True):
         pd.testing.assert_frame_equal(ia.fit_movie(c, config=config).table, result.table)

@@ -16,9 +16,9 @@ from scenes import Light, make_config
 from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.config import Config
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.results import table_of
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.results import table_of
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.study.simulate import Movie
 

@@ -11,10 +11,10 @@ import pytest
 import tifffile
 from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
+from iscat_analysis.answers.calibrations import template_calibration
 from iscat_analysis.config import configure
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse
-from iscat_analysis.pipeline.calibrations import template_calibration
 from iscat_analysis.records import Analysis
 
 pytestmark = pytest.mark.large

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
 
+from iscat_analysis.camera.background import measure_windows
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.results import Found
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
 
 SHAPE = (500, 128, 128)
@@ -126,7 +126,7 @@ def test_noise_that_passes_the_threshold_everywhere_stops_the_search(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The same where the noise between neighbouring frames does not tell it."""
-    monkeypatch.setattr("iscat_analysis.pipeline.noise.measure_spectrum", lambda *_, **__: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.noise.measure_spectrum", lambda *_, **__: None)
     with pytest.raises(DataError, match=r"set camera\.gain_e_per_adu = [34]\."):
         _analysed(Instrument(), gain=28.0)
 

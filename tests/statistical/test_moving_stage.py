@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
+from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera.drift import follow_pattern
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.movie.drift import follow_pattern
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.learning import learn_optics
+from iscat_analysis.instrument.learning import learn_optics
+from iscat_analysis.landing.find import analyse_landings
 
 SHAPE = (900, 144, 136)
 LANDINGS = draw_landings(SHAPE, 30, seed=31, masses=(480.0,), apart_px=16.0, margin_px=20.0)

@@ -10,11 +10,11 @@ import pytest
 from instruments import PEAK_PER_KDA, Instrument, Pictures
 from scenes import Stack
 
-from iscat_analysis.calibration.optics import OpticsCalibration
+from iscat_analysis.camera.background import measure_windows
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import load_config
-from iscat_analysis.movie.background import measure_windows
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline import crowded
+from iscat_analysis.instrument import crowded
+from iscat_analysis.instrument.learner import OpticsCalibration
 
 SIGMAS = 4.0
 PIXEL_NM, LEVEL_E, FRAMES, SIDE = 84.0, 2e7, 2, 140

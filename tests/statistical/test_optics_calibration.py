@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 
-from iscat_analysis.calibration.optics import Measured, build_microscope, maximise, settings_of
-from iscat_analysis.calibration.optics.estimate import optics_limits
-from iscat_analysis.calibration.optics.measure import HELD_OUT_P, _Search, measure_microscope
-from iscat_analysis.calibration.optics.starts import average_sights
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.instrument.learner import Measured, build_microscope, maximise, settings_of
+from iscat_analysis.instrument.learner.estimate import optics_limits
+from iscat_analysis.instrument.learner.measure import HELD_OUT_P, _Search, measure_microscope
+from iscat_analysis.instrument.learner.starts import average_sights
+from iscat_analysis.instrument.microscope import calibrate_sights, goodness
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline.microscope import calibrate_sights, goodness
 
 SIGMAS = 4.0
 """A parameter farther from the truth than this many standard errors is wrong: 6e-5 by chance."""
@@ -161,7 +161,7 @@ def test_a_parameter_at_its_limit_is_refused() -> None:
 
 def test_a_wrong_pixel_size_is_suspected() -> None:
     """Pixels that are said to be 6 % larger than they are look like a smaller aperture."""
-    from iscat_analysis.calibration.optics import OpticsCalibration
+    from iscat_analysis.instrument.learner import OpticsCalibration
 
     said, factor = configuration(), 1.06
     pixel = said.camera.pixel_size_nm

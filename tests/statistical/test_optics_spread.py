@@ -8,9 +8,9 @@ from calibrations import configuration
 from instruments import Instrument, Pictures
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
-from iscat_analysis.calibration.optics import Sight, build_microscope, maximise, settings_of
-from iscat_analysis.calibration.optics.starts import with_masses
 from iscat_analysis.inference.noise import conditional
+from iscat_analysis.instrument.learner import Sight, build_microscope, maximise, settings_of
+from iscat_analysis.instrument.learner.starts import with_masses
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray
 

@@ -7,8 +7,7 @@ import pytest
 from scenes import Stack
 from scipy.ndimage import median_filter
 
-from iscat_analysis.errors import DataError
-from iscat_analysis.movie.background import (
+from iscat_analysis.camera.background import (
     DEAD,
     DEFECT_SIGMAS,
     HOT,
@@ -17,7 +16,8 @@ from iscat_analysis.movie.background import (
     refine_power,
     smooth_background,
 )
-from iscat_analysis.movie.camera import Camera
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.errors import DataError
 
 SHAPE = (48, 56)
 SIGMAS = 4.0

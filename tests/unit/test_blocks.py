@@ -16,18 +16,19 @@ from scenes import Stack, make_config
 from scipy.ndimage import gaussian_filter
 from wanderers import Wanderers, wander
 
-import iscat_analysis.pipeline.blocks as blocks_module
 import iscat_analysis.pipeline.finish as finish_module
-import iscat_analysis.pipeline.tracking as tracking_module
+import iscat_analysis.tracking.blocks as blocks_module
+import iscat_analysis.tracking.find as tracking_module
 from iscat_analysis import pipeline
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.rows import Rows
+from iscat_analysis.fitting.checkpoint import GOES_ON, partial_folder
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import Camera
 from iscat_analysis.pipeline import analyse, fit_stack
-from iscat_analysis.pipeline.block_store import Block
-from iscat_analysis.pipeline.blocks import (
+from iscat_analysis.threads import threads
+from iscat_analysis.tracking.block_store import Block
+from iscat_analysis.tracking.blocks import (
     SHORTEST,
     WORTH_COUNTING,
     Plan,
@@ -35,13 +36,12 @@ from iscat_analysis.pipeline.blocks import (
     follow_light,
     plan_blocks,
 )
-from iscat_analysis.pipeline.joining import combine_masses, join_tracks
-from iscat_analysis.pipeline.linking import unlike
-from iscat_analysis.pipeline.moving import follow
-from iscat_analysis.pipeline.moving_field import load_field, track_scene
-from iscat_analysis.pipeline.moving_table import common_masses, moving_table, table_of_tracks
-from iscat_analysis.pipeline.resume import GOES_ON, partial_folder
-from iscat_analysis.threads import threads
+from iscat_analysis.tracking.joining import combine_masses, join_tracks
+from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.linking import unlike
+from iscat_analysis.tracking.moving import follow
+from iscat_analysis.tracking.moving_field import load_field, track_scene
+from iscat_analysis.tracking.moving_table import common_masses, moving_table, table_of_tracks
 
 pytestmark = pytest.mark.usefixtures("sketched")
 

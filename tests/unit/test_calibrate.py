@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import tifffile
 
+from iscat_analysis.camera.counts import Camera, camera_from_config, check_counts, refuse_ratio
+from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain, resolve_metadata
 from iscat_analysis.config import CameraConfig, parse_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.camera import Camera, camera_from_config, check_counts, refuse_ratio
-from iscat_analysis.movie.metadata import GainDiagnosis, diagnose_gain, resolve_metadata
 from iscat_analysis.records import StackMetadata
 
 SHAPE = (6, 8)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis.inference import common
-from iscat_analysis.inference.common import common_amplitudes, shared_errors, variances_left
-from iscat_analysis.inference.coupling import Coupling
-from iscat_analysis.inference.exposures import Exposures
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Judged, Rows
-from iscat_analysis.inference.settling import settle
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.pipeline.extension import extended
+from iscat_analysis.tracking.extension import extended
+from iscat_analysis.tracking.joint import common
+from iscat_analysis.tracking.joint.common import common_amplitudes, shared_errors, variances_left
+from iscat_analysis.tracking.joint.exposures import Exposures
+from iscat_analysis.tracking.joint.joint_fit import settle
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.track_coupling import Coupling
 
 SHAPE, FRAMES, LEVEL_E, ROI, MASS = (30, 30), 40, 4e5, 20, 400.0
 TRIALS, SIGMAS = 40, 4.0

@@ -17,11 +17,11 @@ from numba.core import event
 import iscat_analysis
 from iscat_analysis import _kernels
 from iscat_analysis.config import load_config
+from iscat_analysis.fitting import compilation as module
+from iscat_analysis.fitting.compilation import Compilation, compiling, needs_of
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import compile_kernels
 from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.pipeline import compilation as module
-from iscat_analysis.pipeline.compilation import Compilation, compiling, needs_of
 
 ROOM = "iscat_analysis._kernels"
 
@@ -130,7 +130,7 @@ from iscat_analysis._kernels import (
     canvas, curvature, diffusion, following, goodness, hessian, judging, moving, scan, scoring,
     sharing, sliding, stepping, well,
 )
-from iscat_analysis.pipeline.compilation import needs_of
+from iscat_analysis.fitting.compilation import needs_of
 from iscat_analysis.pipeline.rehearsal import rehearse
 from iscat_cli import main
 
@@ -251,7 +251,7 @@ def test_a_kept_kernel_is_loaded_without_what_compiling_needs(tmp_path):
 SUPPORT = """
 import numpy as np
 from iscat_analysis._kernels.support import supported
-from iscat_analysis.pipeline.compilation import compiling
+from iscat_analysis.fitting.compilation import compiling
 
 with compiling(print, 1):
     edge = np.array([-100.0, 100.0])

@@ -24,9 +24,9 @@ from iscat_analysis.config import (
     read_optics_file,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.pipeline.regions import photons_scale
-from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.pipeline.ways import way_of
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.regions import photons_scale
+from iscat_analysis.fitting.scene import make_scene
 
 SETTINGS: list[tuple[str, Any]] = [
     ("optics.na", 1.3),

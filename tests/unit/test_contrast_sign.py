@@ -10,7 +10,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.pipeline.contrast_sign import wrong_sign
+from iscat_analysis.instrument.contrast_sign import wrong_sign
 
 MASSES = (800.0, 1000.0, 1500.0, 600.0, 1200.0, 2000.0, 900.0, 700.0, 1100.0)
 HEIGHTS = (12.0, 65.0, 120.0, 175.0, 230.0, 285.0, 340.0, 395.0, 50.0)

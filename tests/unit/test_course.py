@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from iscat_analysis.pipeline.diagnosis import course_warning
+from iscat_analysis.diagnosis.causes import course_warning
 
 
 def _table(ok: int, changing: int, undescribed: int) -> pd.DataFrame:

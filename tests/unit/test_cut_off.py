@@ -9,8 +9,8 @@ from scenes import make_config
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.movie.camera import Camera
 from iscat_analysis.search.sliding import cut_off
 from iscat_analysis.study.simulate import Movie
 

@@ -13,14 +13,10 @@ from scenes import Light, blank, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import FloodError
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.regions import field_likelihood, noise_cumulants, search_likelihood
+from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.regions import (
-    field_likelihood,
-    noise_cumulants,
-    search_likelihood,
-)
-from iscat_analysis.pipeline.scene import Scene, make_scene
 from iscat_analysis.records import Candidate, Windows
 from iscat_analysis.search.templates import (
     FLOOD,

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.config import Config, load_config
-from iscat_analysis.movie.background import find_defects
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.drift import (
+from iscat_analysis.camera.background import find_defects
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import (
     Mover,
     Trajectory,
     derivatives,
@@ -17,8 +16,9 @@ from iscat_analysis.movie.drift import (
     measure_drift,
     trusted,
 )
-from iscat_analysis.pipeline.pattern import MovingPattern, follow
-from iscat_analysis.pipeline.regions import Region
+from iscat_analysis.config import Config, load_config
+from iscat_analysis.fitting.pattern import MovingPattern, follow
+from iscat_analysis.fitting.regions import Region
 from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
 from iscat_analysis.study.simulate import Movie
 

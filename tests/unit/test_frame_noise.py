@@ -14,11 +14,11 @@ from iscat_analysis.inference.repeats import LENGTHS
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse
-from iscat_analysis.pipeline.achieved import likely_noise
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report import render_report
 from iscat_analysis.report.headline import headline
 from iscat_analysis.search.empty import EmptyField
+from iscat_analysis.trust.empirical_spread import likely_noise
 
 SIGMAS = 4.0
 LEVEL_E = 1e5

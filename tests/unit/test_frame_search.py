@@ -8,8 +8,8 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.moving_field import track_scene
-from iscat_analysis.search.moving import FrameFilter, Sightings
+from iscat_analysis.tracking.frame_search import FrameFilter, Sightings
+from iscat_analysis.tracking.moving_field import track_scene
 
 SIDE, ROI, LEVEL_E = 96, 32, 4e5
 

@@ -11,10 +11,10 @@ from instruments import Instrument, InstrumentMovie, Pictures, draw_landings
 
 import iscat_analysis as ia
 from iscat_analysis.config import configure
+from iscat_analysis.diagnosis.causes import bend_warning
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.pipeline.diagnosis import bend_warning
-from iscat_analysis.pipeline.systematic import systematic
+from iscat_analysis.trust.systematic import systematic
 
 GRADIENT = -3.1e-5
 INSTRUMENT = Instrument(emission="reciprocal")

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from iscat_analysis._kernels.scoring import POISSON
-from iscat_analysis.calibration.optics.estimate import Estimate
-from iscat_analysis.calibration.optics.measure import _Search
-from iscat_analysis.calibration.optics.sights import Settings, Sight
+from iscat_analysis.instrument.learner.estimate import Estimate
+from iscat_analysis.instrument.learner.measure import _Search
+from iscat_analysis.instrument.learner.particle_images import Settings, Sight
 from iscat_analysis.optics.grid import PixelGrid
 
 HEIGHTS_NM = (0.0, 1000.0)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.inference.rows import Rows
-from iscat_analysis.pipeline.identity import identified
-from iscat_analysis.pipeline.linking import bridge, meeting
+from iscat_analysis.tracking.identity import identified
+from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.linking import bridge, meeting
 
 FRAMES, MEET, AROUND = 200, 100, 25
 NEAR_NM, ERROR = 370.0, 1.0

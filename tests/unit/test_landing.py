@@ -16,24 +16,25 @@ import pytest
 import tifffile
 
 from iscat_analysis import pipeline as pipeline_module
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting import events as events_module
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.checkpoint import partial_folder
+from iscat_analysis.landing import chunk_work, merging
+from iscat_analysis.landing import find as landing_module
+from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.landing.merging import Done, Merged
+from iscat_analysis.landing.odd_frames import frame_warnings
+from iscat_analysis.landing.steps import ChunkFitter
+from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline import analyse, chunk_work, fit_stack, merging
-from iscat_analysis.pipeline import chunks as chunks_module
-from iscat_analysis.pipeline import events as events_module
-from iscat_analysis.pipeline import landing as landing_module
+from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline.injection import inject_and_recover
-from iscat_analysis.pipeline.landing import analyse_landings
-from iscat_analysis.pipeline.merging import Done, Merged
-from iscat_analysis.pipeline.odd_frames import frame_warnings
-from iscat_analysis.pipeline.resume import partial_folder
-from iscat_analysis.pipeline.steps import ChunkFitter
 from iscat_analysis.pipeline.summary import summary_of
-from iscat_analysis.pipeline.tasks import TaskBuilder
-from iscat_analysis.pipeline.ways import way_of
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
+from iscat_analysis.search.sliding import chunks as chunks_module
 from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
@@ -625,7 +626,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 
 
 def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
-    from iscat_analysis.pipeline.resume import Store
+    from iscat_analysis.landing.chunk_store import Store
 
     one, two = _config(), _config("optics.focus_nm=-250")
     keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera())._key for c in (one, two)}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from iscat_analysis.inference.rows import Rows
-from iscat_analysis.pipeline.leaps import brought_back
+from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.outlier_positions import brought_back
 
 FRAMES = 200
 

@@ -16,14 +16,14 @@ from scipy.ndimage import gaussian_filter, shift
 
 import iscat_analysis as ia
 from iscat_analysis._kernels.scoring import CONDITIONAL
-from iscat_analysis.calibration.optics import Sight
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.movie.camera import camera_from_config
+from iscat_analysis.instrument import learning
+from iscat_analysis.instrument.learner import Sight
+from iscat_analysis.instrument.learning import LEAST_TESTED, learn_optics
+from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline import learning
-from iscat_analysis.pipeline.learning import LEAST_TESTED, learn_optics
-from iscat_analysis.pipeline.tested_optics import REJECTED_P, median_p
 
 MOVIE: Any = SimpleNamespace(name="movie.tif", shape=(1000, 64, 64))
 

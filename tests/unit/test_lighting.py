@@ -10,11 +10,11 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.lighting import Surface, find_surface
-from iscat_analysis.movie.lines import Lines
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.lighting import Surface, find_surface
+from iscat_analysis.camera.lines import Lines
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline.scene import make_scene
 from iscat_analysis.study.simulate import Movie
 
 Array = NDArray[np.float64]
@@ -228,7 +228,7 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     assert (abs(table["mass_kda"] - 500.0) < 4 * table["sigma_mass_kda"]).all()
     assert result.summary["lines"]["smooth_degree"] >= 1
     assert any("changes slowly over the field" in text for text in result.warnings)
-    monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_surface", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert (without.table["status"] == "ok").sum() < 2
 
@@ -255,7 +255,7 @@ def test_fringes_that_change_between_a_background_and_what_follows(
     row = result.table.iloc[0]
     assert abs(row["mass_kda"] - 500) < 4 * row["sigma_mass_kda"]
     assert result.summary["lines"]["fringe_periods_px"] == pytest.approx([16.0], rel=0.01)
-    monkeypatch.setattr("iscat_analysis.pipeline.light.find_surface", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_surface", lambda *_: None)
     without = ia.fit_movie(counts, config=config)
     assert list(without.table["status"]) != ["ok"]
 

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scenes import PIXEL_NM, Stack, make_config
 
 import iscat_analysis as ia
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.lines import Lines, SteadyFrames, find_lines
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.pipeline.scene import make_scene
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def test_lines_are_found_as_often_by_chance_as_the_normal_law_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """At 2 standard errors, where it can be counted; 4.5 of them are used."""
-    monkeypatch.setattr("iscat_analysis.movie.spectrum._SIGNIFICANT", 2.0)
+    monkeypatch.setattr("iscat_analysis.camera.spectrum._SIGNIFICANT", 2.0)
     trials, found = 800, 0
     rng = np.random.default_rng(6)
     for _ in range(trials):

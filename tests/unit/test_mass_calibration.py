@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.calibration.mass import (
     calibrate_mass,
     find_contrast_peaks,
@@ -24,10 +25,9 @@ from iscat_analysis.calibration.mass import (
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration
-from iscat_analysis.pipeline.calibrations import read_contrasts
-from iscat_analysis.pipeline.systematic import systematic
 from iscat_analysis.species import describe
 from iscat_analysis.species.tables import event_table
+from iscat_analysis.trust.systematic import systematic
 
 STANDARDS = (66.0, 146.0, 480.0)
 GRADIENT, OFFSET = -3.1e-5, 2e-4

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from iscat_analysis.bounds import event_bounds
-from iscat_analysis.calibration.optics import Sight
-from iscat_analysis.calibration.optics.measured_picture import fit_own, fit_picture, place_sights
 from iscat_analysis.config import Config, config_to_toml, configure, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
+from iscat_analysis.instrument.learner import Sight
+from iscat_analysis.instrument.learner.measured_picture import fit_own, fit_picture, place_sights
+from iscat_analysis.instrument.microscope import goodness
 from iscat_analysis.optics.forward import (
     ForwardModel,
     PixelGrid,
@@ -23,7 +24,6 @@ from iscat_analysis.optics.forward import (
     with_template,
 )
 from iscat_analysis.optics.measured import Template, lattice_step_nm, sha256_of
-from iscat_analysis.pipeline.microscope import goodness
 
 PIXEL, ROI = 100.0, 1500.0
 LIGHT = 2e7

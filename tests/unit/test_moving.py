@@ -22,22 +22,23 @@ from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference import frame_fits, settling
-from iscat_analysis.inference.climbing import climb, log_likelihood
-from iscat_analysis.inference.exposures import Exposures
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.newton import Response
 from iscat_analysis.inference.noise import poisson
-from iscat_analysis.inference.rows import Ground, Rows
-from iscat_analysis.inference.settling import first_ground, settle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.stamp import BAND, RINGS, sample_picture
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.pipeline.extension import extended
-from iscat_analysis.pipeline.moving import diffusion_of
-from iscat_analysis.search.moving import gaps, link
 from iscat_analysis.species import fit_diffusion
+from iscat_analysis.tracking.extension import extended
+from iscat_analysis.tracking.frame_search import gaps, link
+from iscat_analysis.tracking.joint import frame_fits
+from iscat_analysis.tracking.joint import joint_fit as settling
+from iscat_analysis.tracking.joint.climbing import climb, log_likelihood
+from iscat_analysis.tracking.joint.exposures import Exposures
+from iscat_analysis.tracking.joint.joint_fit import first_ground, settle
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.newton import Response
+from iscat_analysis.tracking.moving import diffusion_of
 
 SHAPE, FRAMES, LEVEL_E, ROI = (40, 44), 60, 4e5, 24
 MASSES = (200.0, 400.0)

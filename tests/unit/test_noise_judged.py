@@ -12,16 +12,17 @@ from numpy.typing import NDArray
 from scenes import PIXEL_NM, make_config
 from wanderers import wander
 
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import Noise, judge_beside
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.regions import SATURATION_NM
-from iscat_analysis.pipeline import analyse, block_store, bound
-from iscat_analysis.pipeline.noise import Noise, judge_beside
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.pipeline import analyse, bound
 from iscat_analysis.records import Analysis
 from iscat_analysis.search.templates import ExcessNoise
+from iscat_analysis.tracking import block_store
 
 GAIN, TOO_LARGE = 20.0, 1.6
 SHAPE, FRAMES, LEVEL_E = (40, 44), 26, 2e5

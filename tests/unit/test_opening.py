@@ -10,13 +10,13 @@ import tifffile
 from scenes import make_config
 from scipy.ndimage import gaussian_filter, shift
 
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.metadata import diagnose_gain
+from iscat_analysis.camera.pattern_jitter import measure_shaking
+from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.metadata import diagnose_gain
-from iscat_analysis.movie.shaking import measure_shaking
 from iscat_analysis.pipeline import analyse
-from iscat_analysis.pipeline.diagnosis import axes_warning
 
 SHAPE = (48, 56)
 LEVEL_E = 1e5

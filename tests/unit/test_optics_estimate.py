@@ -9,7 +9,11 @@ import pytest
 from calibrations import GRID, configuration, make_sights, microscope
 
 from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
-from iscat_analysis.calibration.optics import (
+from iscat_analysis.config import config_to_toml, parse_config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.instrument.learner import (
     PRIVATE,
     Sight,
     free_groups,
@@ -18,12 +22,8 @@ from iscat_analysis.calibration.optics import (
     settings_of,
     with_settings,
 )
-from iscat_analysis.calibration.optics.estimate import _Point, _walls
-from iscat_analysis.calibration.optics.starts import average_sights, search_starts
-from iscat_analysis.config import config_to_toml, parse_config
-from iscat_analysis.errors import ConfigError
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.instrument.learner.estimate import _Point, _walls
+from iscat_analysis.instrument.learner.starts import average_sights, search_starts
 from iscat_analysis.optics.grid import PixelGrid
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")

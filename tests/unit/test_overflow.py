@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
+from iscat_analysis.camera.counts import refuse_overflow
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.camera import refuse_overflow
 
 LANDING = {"fit.mode": "mass", "background.method": "sliding"}
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, gaussian_filter
 
-from iscat_analysis.calibration.camera import (
+from iscat_analysis.camera.calibration import (
     CameraCalibration,
     Estimate,
     measure_camera,
@@ -201,7 +201,7 @@ def test_control_taking_pixels_for_independent_spoils_it(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "iscat_analysis.calibration.camera.measure.measure_spectrum", lambda *_, **__: None
+        "iscat_analysis.camera.calibration.measure.measure_spectrum", lambda *_, **__: None
     )
     found = measure_camera([with_noise(np.random.default_rng(1), kind)], offset_adu=OFFSET)
     assert abs(pull(found.gain_e_per_adu, GAIN)) > 20
@@ -225,7 +225,7 @@ def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
 
     check_pulls(pulls())
     nothing = np.zeros(SHAPE, dtype=bool)
-    monkeypatch.setattr("iscat_analysis.calibration.camera.measure.clipped", lambda _: nothing)
+    monkeypatch.setattr("iscat_analysis.camera.calibration.measure.clipped", lambda _: nothing)
     with pytest.raises(AssertionError):
         check_pulls(pulls())
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline.chunks import Reader
 from iscat_analysis.places import Here, open_place
+from iscat_analysis.search.sliding.chunks import Reader
 from iscat_analysis.threads import allotted, threads
 from iscat_cli import main, main_fit
 

@@ -16,12 +16,12 @@ import pytest
 from scenes import Stack, make_config
 
 import iscat_analysis as ia
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.pipeline.diagnosis import plane_warning
-from iscat_analysis.pipeline.held_height import held_height_warning
-from iscat_analysis.pipeline.ranges import checked
+from iscat_analysis.diagnosis.causes import plane_warning
+from iscat_analysis.fitting.ranges import checked
 from iscat_analysis.study.simulate import Movie
+from iscat_analysis.tracking.held_height import held_height_warning
 
 STEP_NM, SIGMA_NM = 30.0, 5.0
 

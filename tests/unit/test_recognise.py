@@ -16,12 +16,10 @@ from scipy.ndimage import shift
 from wanderers import wander
 
 from iscat_analysis import fit_movie, open_stack
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.copies import LostError, aside
-from iscat_analysis.errors import DataError, FloodError
-from iscat_analysis.movie.camera import camera_from_config
-from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.pipeline.recognise import (
+from iscat_analysis.diagnosis.changes import Changes, find_changes, spot_of
+from iscat_analysis.diagnosis.recognise import (
     BLOCK,
     DOUBT,
     LEAST_MOVING,
@@ -31,7 +29,9 @@ from iscat_analysis.pipeline.recognise import (
     as_moving,
     look_at_changes,
 )
-from iscat_analysis.search.changes import Changes, find_changes, spot_of
+from iscat_analysis.errors import DataError, FloodError
+from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.study.simulate import write_stack
 from iscat_analysis.threads import processors
 

@@ -24,9 +24,8 @@ from iscat_analysis.inference.repeats import (
     response_of,
     series_of,
 )
+from iscat_analysis.landing.split_frame_estimates import _most_windows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.achieved import likely_noise, measured_scale, spread_verdict
-from iscat_analysis.pipeline.repeats import _most_windows
 from iscat_analysis.pipeline.summary import _across
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
@@ -34,6 +33,7 @@ from iscat_analysis.report.headline import headline
 from iscat_analysis.report.spread import rejection, species_widths
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
+from iscat_analysis.trust.empirical_spread import likely_noise, measured_scale, spread_verdict
 
 SIGMAS = 4.0
 GRID = PixelGrid.region((0, 32), (0, 32), PIXEL_NM)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from iscat_analysis._kernels.sliding import strongest_maps
-from iscat_analysis.movie.background import find_defects
-from iscat_analysis.movie.camera import Camera
+from iscat_analysis.camera.background import find_defects
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.search.sliding import (
     Chunk,
     NoiseCurve,

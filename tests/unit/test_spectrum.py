@@ -13,10 +13,10 @@ from scenes import make_config
 from scipy.ndimage import convolve1d
 
 import iscat_analysis as ia
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.spectrum import NoiseSpectrum, measure_spectrum
-from iscat_analysis.pipeline.regions import search_likelihood
-from iscat_analysis.pipeline.scene import make_scene
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.fitting.regions import search_likelihood
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import Windows
 from iscat_analysis.search.templates import find_particles, signal_to_noise
 

@@ -10,13 +10,13 @@ import pandas as pd
 import pytest
 
 from iscat_analysis.bounds import joint_information
-from iscat_analysis.calibration.optics import settings_of
 from iscat_analysis.config import Calibration, Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.instrument.learner import settings_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.systematic import systematic
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
+from iscat_analysis.trust.systematic import systematic
 
 NAMES = ("focus_nm", "na", "z8", "z11")
 SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
@@ -164,7 +164,7 @@ def test_many_events_share_what_is_computed(monkeypatch: pytest.MonkeyPatch) -> 
         computed.append(theta[2])
         return joint_information(likelihood, theta, names)
 
-    monkeypatch.setattr("iscat_analysis.pipeline.systematic.joint_information", counted)
+    monkeypatch.setattr("iscat_analysis.trust.systematic.joint_information", counted)
     found = systematic(config, table)
     fringes = 1000.0 / forward_model(config, 2000.0).fringe_nm
     assert len(set(computed)) <= 10 * fringes + 2

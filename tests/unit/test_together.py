@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from wanderers import FRAME_RATE_HZ, SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline.kept_frames import keep_frames
-from iscat_analysis.pipeline.together import warnings_of
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.tracking.common_motion import warnings_of
+from iscat_analysis.tracking.frame_subset import keep_frames
 
 FRAMES, TRACKS = 300, 8
 STEP_NM = np.where(np.arange(TRACKS) % 2, 30.0, 70.0)
@@ -167,5 +167,5 @@ def test_particles_keep_what_is_divided_out_with_rows_that_flicker(
 
     wanted, error = mass(steady)
     assert abs(mass(flickering)[0] - wanted) < 0.5 * error  # of the same noise
-    monkeypatch.setattr("iscat_analysis.pipeline.moving.give_back", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.tracking.moving.give_back", lambda *_: None)
     assert wanted - mass(flickering)[0] > 4 * error  # control

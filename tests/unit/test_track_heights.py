@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis.inference.exposures import Exposures
-from iscat_analysis.inference.moving import MovingField
-from iscat_analysis.inference.rows import Ground, Rows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.heights import decide_heights
-from iscat_analysis.pipeline.moving_table import _areas, _quantum
+from iscat_analysis.tracking.heights import decide_heights
+from iscat_analysis.tracking.joint.exposures import Exposures
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.moving_table import _areas, _quantum
 
 SHAPE, FRAMES, LEVEL_E, ROI = (28, 28), 40, 4e5, 24
 

@@ -14,13 +14,13 @@ from instruments import Instrument
 from wanderers import SETTINGS, Wanderers, wander
 
 import iscat_analysis as ia
-from iscat_analysis.calibration.optics.estimate import _excess
-from iscat_analysis.calibration.optics.settings import settings_of, with_settings
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.pipeline import tracked_optics
-from iscat_analysis.pipeline.settling_optics import Round, Rounds
-from iscat_analysis.pipeline.tracked_optics import (
+from iscat_analysis.instrument.learner.estimate import _excess
+from iscat_analysis.instrument.learner.settings import settings_of, with_settings
+from iscat_analysis.tracking import tracked_optics
+from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.tracking.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,
     LeftOver,

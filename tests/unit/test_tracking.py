@@ -19,12 +19,12 @@ from wanderers import SETTINGS, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
-from iscat_analysis.pipeline.scene import make_scene
-from iscat_analysis.pipeline.tracks import mass_correlation
 from iscat_analysis.records import TRACK_COLUMNS, Analysis
+from iscat_analysis.tracking.tracks import mass_correlation
 
 pytestmark = pytest.mark.usefixtures("sketched")
 

@@ -14,9 +14,9 @@ from scenes import make_config
 from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.movie.unsteady import find_unsteady, unsteady_said
-from iscat_analysis.search.changes import least_beside
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.unsteady import find_unsteady, unsteady_said
+from iscat_analysis.diagnosis.changes import least_beside
 from iscat_analysis.study.simulate import Movie
 
 Counts = NDArray[np.float64]
@@ -176,7 +176,7 @@ def test_a_landing_movie_with_pixels_that_blink(monkeypatch: pytest.MonkeyPatch)
     assert row["status"] == "ok"
     assert abs(row["mass_kda"] - 800.0) < 4 * row["sigma_mass_kda"]
     assert any("noise that is not the light's" in text for text in found.warnings)
-    monkeypatch.setattr("iscat_analysis.pipeline.light.find_unsteady", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.diagnosis.light.find_unsteady", lambda *_: None)
     assert len(ia.fit_movie(counts, config=config).table) > 3
 
 

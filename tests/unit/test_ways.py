@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, Stack
 
+from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.background_mode import Way, way_of, way_said
+from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.camera import camera_from_config
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import FIND, analyse
-from iscat_analysis.pipeline.events import Event, remarks, standing_out
-from iscat_analysis.pipeline.field import fit_field
-from iscat_analysis.pipeline.moving_field import load_field, opening_ground, track_scene
 from iscat_analysis.pipeline.preview import Preview
-from iscat_analysis.pipeline.scene import Scene, make_scene
-from iscat_analysis.pipeline.ways import Way, way_of, way_said
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study.simulate import Movie
+from iscat_analysis.tracking.moving_field import load_field, opening_ground, track_scene
 
 SIDE = 48
 PLACES = ((14.3, 15.7), (33.2, 31.6))

@@ -10,9 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.calibration.camera import LightZero, find_zero
-from iscat_analysis.movie.camera import Camera
-from iscat_analysis.pipeline.noise import judge_counts
+from iscat_analysis.camera.calibration import LightZero, find_zero
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.diagnosis.noise import judge_counts
 
 SHAPE, FRAMES, LEVEL_E, GAIN = (64, 64), 128, 1e5, 4.0
 SEEDS = 20

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.region import copy_region
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
-from iscat_analysis.movie.camera import Camera
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 HALF = 0.5

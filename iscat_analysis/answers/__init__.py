@@ -1,0 +1,1 @@
+"""What do tables of events say?  Species, binding, kinetics, calibrations."""

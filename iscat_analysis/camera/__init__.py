@@ -1,0 +1,1 @@
+"""How many photoelectrons?  Counts, light, noise and the beam."""

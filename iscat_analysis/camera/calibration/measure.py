@@ -1,0 +1,321 @@
+"""From recordings to a camera: what is read, left out, fitted and said."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.calibration.averaging import NOISE_COLUMNS, noise_curve, verdict_of
+from iscat_analysis.camera.calibration.moments import (
+    Moments,
+    brightness_bins,
+    moments_of,
+    robust_sigma,
+)
+from iscat_analysis.camera.calibration.pixels import (
+    KINDS,
+    clipped,
+    mask_notes,
+    saturated,
+    stand_out,
+    unlike_neighbours,
+    unsteady,
+)
+from iscat_analysis.camera.calibration.regression import Solution, dark_numbers, solve
+from iscat_analysis.camera.calibration.repeated_exposures import without_repeats
+from iscat_analysis.camera.calibration.result import CameraCalibration, Estimate
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
+
+LEAST_FRAMES = 8
+"""Fewer say too little about the variance of a pixel."""
+
+LEAST_FRAMES_FOR_MAPS = 100
+"""Fewer leave the gain of one pixel uncertain by more than 17 %."""
+
+_LEAST_PIXELS = 64
+_SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
+_CLIPPED = 0.01  # of a dark's pixels at zero that are worth a line
+_CURVED = 3.0  # reduced χ² of the photon-transfer curve
+_CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
+
+
+def measure_camera(
+    light: Sequence[FrameSource],
+    *,
+    dark: FrameSource | None = None,
+    offset_adu: float | None = None,
+    maps: bool = False,
+    progress: Progress = silent,
+) -> CameraCalibration:
+    """Measure gain, offset and read noise, and how far averaging lowers the noise.
+
+    Every stack is read twice at most, a block at a time.
+    """
+    _checked(light, dark, maps)
+    notes: list[str] = []
+    light = [without_repeats(stack, LEAST_FRAMES, notes) for stack in light]
+    stacks = [*light, *([dark] if dark is not None else [])]
+    shape, total, done = stacks[0].shape[1:], sum(stack.shape[0] for stack in stacks), 0
+
+    def advance(frames: int) -> None:
+        nonlocal done
+        done += frames
+        progress("photon transfer", done, total)
+
+    masked = {name: np.zeros(shape, dtype=np.bool_) for name in KINDS}
+    dark_found = None
+    if dark is not None:
+        dark_found = moments_of(dark, None, advance)
+        masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
+        masked["dead"] |= dark_found.variance <= 0
+        low = float(np.mean(clipped(dark_found.lowest)))
+        if low > _CLIPPED:
+            notes.append(
+                f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
+                "off: its offset is too high and its read noise too small; raise the camera's "
+                "offset"
+            )
+        if masked["dead"].all():
+            raise DataError(
+                f"{dark.name}: every frame is the same: this is not raw camera data; record a dark"
+            )
+        if not light:
+            return _from_dark(dark_found, masked, maps)
+
+    floor = float(np.median(dark_found.mean)) if dark_found is not None else offset_adu or 0.0
+    found = []
+    for stack in light:
+        first = _glance(stack)
+        odd = masked["hot"] | masked["dead"] | saturated(first.max(axis=0), stack.name)
+        lit = ~(odd | unlike_neighbours(first.mean(axis=0) - floor))
+        measured = moments_of(stack, lit, advance)
+        if dark is None and floor > 0 and np.median(measured.mean) <= floor:
+            raise DataError(
+                f"{stack.name}: has {np.median(measured.mean):.5g} counts, no more than "
+                f"`offset_adu` = {floor:g}: give the counts that the camera has in the dark"
+            )
+        full = saturated(measured.highest, stack.name)
+        masked["saturated"] |= full
+        masked["clipped"] |= clipped(measured.lowest) & (measured.variance > 0)
+        masked["dead"] |= (measured.variance <= 0) & ~full
+        masked["dead"] |= unlike_neighbours(measured.mean - floor, high=math.inf) & ~full
+        masked["hot"] |= unlike_neighbours(measured.mean - floor, low=-math.inf) & ~full
+        found.append(measured)
+    used = ~np.logical_or.reduce(list(masked.values()))
+    if np.count_nonzero(used) < _LEAST_PIXELS:
+        raise DataError(
+            f"{light[0].name}: only {np.count_nonzero(used)} pixels are lit, above zero counts, "
+            f"unsaturated and alive throughout, fewer than {_LEAST_PIXELS}; change the exposure or "
+            "the camera's offset, or record a flat"
+        )
+    used &= ~unsteady(found, used)
+    masked["hot"] |= ~(used | masked["saturated"] | masked["dead"] | masked["clipped"])
+
+    said: list[str] = []
+    result = solve(found, used, dark_found, offset_adu, said)
+    longest = int(np.argmax([item.n_frames for item in found]))
+    spectrum = _spectrum(light[longest], ~used, result)
+    if spectrum is not None and any(spectrum.shared):
+        lines = "rows" if spectrum.shared[0] >= spectrum.shared[1] else "columns"
+        found = [
+            replace(item, variance=moments_of(stack, used, _nothing, flickering=lines).variance)
+            for stack, item in zip(light, found, strict=True)
+        ]
+        said = [
+            f"whole {lines} flicker ({100 * max(spectrum.shared):.2g} % of the noise variance); "
+            f"the flicker of each of the {lines} was taken out"
+        ]
+        result = solve(found, used, dark_found, offset_adu, said)
+        spectrum = _spectrum(light[longest], ~used, result)
+    notes += [*said, *mask_notes(masked)]
+    noise = noise_curve(light[longest], found[longest], used, result, progress)
+    if spectrum is not None and spectrum.correlated:
+        result = _with_neighbours(result, spectrum, notes)
+    limit, verdict = verdict_of(noise)
+    return CameraCalibration(
+        gain_e_per_adu=result.gain,
+        offset_adu=result.offset,
+        offset_from=result.offset_from,
+        read_noise_adu=result.read_adu,
+        read_noise_e=result.read_e,
+        read_noise_below_e=result.read_below_e,
+        curve=_curve(found, used, result, notes),
+        noise=noise,
+        shot_limited_frames=limit,
+        verdict=verdict,
+        masked=masked,
+        maps=_maps(found, used, dark_found, result, notes) if maps else {},
+        frames=sum(item.n_frames for item in found),
+        notes=tuple(notes),
+    )
+
+
+def _nothing(frames: int) -> None:
+    """Tell nobody of frames that are read once more."""
+
+
+def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseSpectrum | None:
+    """Measure the noise of a stack as that of the camera that was found."""
+    camera = Camera(
+        gain_e_per_adu=result.gain.value,
+        offset_adu=result.offset.value,
+        read_noise_e=result.read_e.value if result.read_e else 0.0,
+    )
+    counts = stack.read(0, min(stack.shape[0], _SPECTRUM_FRAMES))
+    return measure_spectrum(counts, camera, masked=masked)
+
+
+def _with_neighbours(result: Solution, spectrum: NoiseSpectrum, notes: list[str]) -> Solution:
+    """Judge the gain by the noise that neighbouring pixels have together."""
+    summed, error = (value / spectrum.variance for value in spectrum.summed)
+    gain, scatter = result.gain.value / summed, math.sqrt(spectrum.alike) * result.gain.se
+    x, y = spectrum.neighbours
+    notes.append(
+        f"the noise of neighbouring pixels is correlated ({x:+.2f} in x, {y:+.2f} in y): pixels "
+        f"share charge or are filtered, and one alone has {1 / summed:.3g} of the variance of its "
+        "light; the gain is from the noise that neighbours have together"
+    )
+    read = result.read_e
+    return replace(
+        result,
+        gain=Estimate(gain, math.hypot(scatter / summed, gain * error / summed)),
+        read_e=Estimate(read.value / summed, read.se / summed) if read else None,
+        read_below_e=result.read_below_e / summed if result.read_below_e else None,
+    )
+
+
+def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool) -> None:
+    """Refuse stacks that are not usable together."""
+    stacks = [*light, *([dark] if dark is not None else [])]
+    if not stacks:
+        raise DataError("no recording was given; give a flat, the movie, or a dark")
+    for stack in stacks:
+        if stack.shape[0] < LEAST_FRAMES:
+            raise DataError(
+                f"{stack.name}: has {stack.shape[0]} frames; photon transfer needs {LEAST_FRAMES} "
+                "or more of the same scene"
+            )
+        if stack.shape[1:] != stacks[0].shape[1:]:
+            ours, theirs = (" x ".join(map(str, s.shape[1:])) for s in (stacks[0], stack))
+            raise DataError(
+                f"{stack.name}: is {theirs} pixels but {stacks[0].name} is {ours}; "
+                "record both with the same region of the sensor"
+            )
+    frames = sum(stack.shape[0] for stack in light)
+    if maps and light and frames < LEAST_FRAMES_FOR_MAPS:
+        raise DataError(
+            f"`maps` needs {LEAST_FRAMES_FOR_MAPS} frames or more, not {frames}: with fewer the "
+            "gain of one pixel is all noise"
+        )
+
+
+def _glance(stack: FrameSource) -> NDArray[Any]:
+    """Return a few frames from all over the stack."""
+    frames = stack.shape[0]
+    places = np.unique(np.linspace(0, frames - 1, 16).astype(int))
+    return np.concatenate([stack.read(int(k), int(k) + 1) for k in places])
+
+
+def _curve(
+    found: Sequence[Moments], used: BoolArray, result: Solution, notes: list[str]
+) -> pd.DataFrame:
+    """Variance against mean in bins of equally many pixels, each stack by itself."""
+    rows = []
+    for item in found:
+        mean, variance = item.mean[used], item.variance[used]
+        for part in brightness_bins(mean):
+            rows.append(
+                (
+                    float(mean[part].mean()),
+                    float(variance[part].mean()),
+                    float(variance[part].std(ddof=1)) / math.sqrt(part.size),
+                    result.intercept + result.slope * float(mean[part].mean()),
+                    int(part.size),
+                )
+            )
+    curve = pd.DataFrame(rows, columns=_CURVE_COLUMNS).sort_values("mean_adu", ignore_index=True)
+    chi2 = float(
+        (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
+    )
+    if chi2 > _CURVED:
+        notes.append(
+            f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
+            "not linear, the frames were processed, or the light itself is noisy"
+        )
+    return curve
+
+
+def _maps(
+    found: Sequence[Moments],
+    used: BoolArray,
+    dark: Moments | None,
+    result: Solution,
+    notes: list[str],
+) -> dict[str, FloatArray]:
+    """One number per pixel; what is masked keeps the number of the whole sensor."""
+    gain = result.gain.value
+    offset = dark.mean if dark is not None else np.full(used.shape, result.offset.value)
+    read = dark.variance if dark is not None else np.full(
+        used.shape, max(0.0, result.intercept + result.slope * result.offset.value)
+    )  # fmt: skip
+    light = sum(
+        ((item.n_frames - 1) * (item.mean - offset) for item in found), np.zeros(used.shape)
+    )
+    shot = sum(
+        ((item.n_frames - 1) * (item.variance - read) for item in found), np.zeros(used.shape)
+    )
+    frames = sum(item.n_frames - 1 for item in found)
+    good = used & (shot > 0) & (light > 0)
+    found_gain = np.full(used.shape, gain)
+    found_gain[good] = light[good] / shot[good]
+    expected = math.sqrt(3 / frames)
+    seen = robust_sigma(found_gain[good] / gain - 1)
+    own = math.sqrt(max(0.0, seen**2 - expected**2))
+    notes.append(
+        f"the gain map spreads by {100 * seen:.2g} %, of which {100 * expected:.2g} % is its own "
+        + (
+            f"noise: the pixels differ by about {100 * own:.2g} %"
+            if seen > 1.1 * expected
+            else "noise: the pixels do not differ noticeably, so use the number and not the map"
+        )
+    )
+    maps = {"gain_e_per_adu": found_gain}
+    if dark is None:
+        notes.append("maps of offset and read noise need a dark")
+        return maps
+    maps["offset_adu"] = np.where(used, dark.mean, result.offset.value)
+    typical = result.read_e.value if result.read_e is not None else 0.0
+    maps["read_noise_e"] = np.where(used, np.sqrt(np.maximum(dark.variance, 0)) * gain, typical)
+    return maps
+
+
+def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> CameraCalibration:
+    """Without light there is an offset and a read noise in counts, and no gain."""
+    used = ~(masked["hot"] | masked["dead"])
+    offset, read = dark_numbers(dark, used)
+    note = "a dark alone gives no gain, so the read noise is in counts; add a flat or the movie"
+    return CameraCalibration(
+        gain_e_per_adu=None,
+        offset_adu=offset,
+        offset_from="dark",
+        read_noise_adu=read,
+        read_noise_e=None,
+        read_noise_below_e=None,
+        curve=pd.DataFrame(columns=_CURVE_COLUMNS),
+        noise=pd.DataFrame(columns=list(NOISE_COLUMNS)),
+        shot_limited_frames=None,
+        verdict="a dark says nothing of shot noise",
+        masked=masked,
+        maps={"offset_adu": np.where(used, dark.mean, offset.value)} if maps else {},
+        frames=0,
+        notes=(note, *mask_notes(masked)),
+    )

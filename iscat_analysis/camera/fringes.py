@@ -1,0 +1,196 @@
+"""Fringes that pass over the field: plane waves of light, and how long and how steep they are.
+
+Where fringes are curved, or stronger in the middle of the field than at its border, the height of a
+wave is a complex polynomial.  Two reflections of a coherent source make one wave, whose phase
+drifts as they warm up.  In the spectrum of the changes of the light it is one point, where
+particles, a pattern that moves and noise are spread over many: it is a wave where it stands far out
+of the others at its distance from the middle, and out of those of its own row and column, in which
+lines that flicker lie.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import chdtri
+
+from iscat_analysis.camera.light_changes import Changes
+from iscat_analysis.records import BoolArray, FloatArray
+
+_MOST = 6  # waves: a source with two interfering reflections has one, with three three
+_SIDE = 160  # squares along an axis, at most, of which a spectrum is made
+_ABOVE = 100.0  # times what is around it, beyond noise, that a wave has in the spectrum: of a
+# pattern that moves, the largest of 1e4 points has half of that
+_BY_CHANCE = 1e-10  # that a point is as far above noise: a field has some 1e4
+_CLIP = 5.0  # robust standard deviations of the changes of a pixel
+_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_ZOOMS = 4  # each to half the step, from half a wave over the field
+_TURNS = 4  # of the fit of wave vectors that follows
+_DEGREES_PER_WAVE = 4  # of a polynomial that follows waves of the field
+_SLOWEST = 2.5  # waves over the field that are left to polynomials
+_BESIDE = 8  # degree of the polynomial beside which waves are looked for: it follows fewer of them
+_STEEPEST = 4  # degree of the heights of waves
+_PIXELS_PER_TERM = 150  # as of the polynomial
+_LEAST_SQUARES = 24  # along an axis
+
+
+@dataclass(frozen=True, eq=False)
+class Fringes:
+    """Plane waves whose heights and phases change."""
+
+    waves: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    degree: int = 0
+    rms: float = 0.0
+
+    @property
+    def periods_px(self) -> FloatArray:
+        """Periods, shape (n,) [pixels]."""
+        return np.asarray(2 * np.pi / np.hypot(*self.waves.T))
+
+    def axes(self, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Give what waves are made of, wherever their crests are.
+
+        Shapes: `rows, columns` (y, k) and (x, k), `products` (k, k).
+        """
+        count, degrees = len(self.waves), np.arange(self.degree + 1)
+
+        def functions(axis: int) -> FloatArray:
+            n = shape[axis]
+            phase = np.outer(np.arange(n) - (n - 1) / 2, self.waves[:, axis])
+            turns = np.hstack([np.cos(phase), np.sin(phase)])
+            heights = legvander(np.linspace(-1, 1, n), self.degree)
+            return np.asarray((turns[:, :, None] * heights[:, None]).reshape(n, -1))
+
+        envelope = np.add.outer(degrees, degrees) <= self.degree
+        products = np.kron(np.tile(np.eye(count), (2, 2)), envelope) > 0
+        return functions(0), functions(1), products
+
+
+NO_FRINGES = Fringes()
+
+
+def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
+    """Look for plane waves among changes of the light."""
+    side = max(1, -(-max(changes.light_e.shape) // _SIDE))
+    change, light = changes.binned(side)
+    if min(light.shape) < _LEAST_SQUARES:
+        return NO_FRINGES
+    beside = min(highest, _BESIDE)
+    spread = _NORMAL * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
+    change = _without_smooth(np.clip(change, -_CLIP * spread, _CLIP * spread), beside)
+    slowest = min(highest / _DEGREES_PER_WAVE, _SLOWEST)
+    least = changes.least(window) / changes.error
+    waves, square, rest = np.empty((0, 2)), 0.0, change
+    while len(waves) < _MOST:
+        peak = _peak(rest, slowest)
+        if peak is None:
+            break
+        found = _refined(change, light, np.vstack([waves, peak]), beside)
+        beyond, left = _explained(change, light, Fringes(found), beside)
+        if beyond - square < least:
+            break
+        waves, square, rest = found, beyond, left
+    waves = waves[np.hypot(*(waves * light.shape).T) > 2 * np.pi * slowest]
+    if not len(waves):  # the others are the foot of what the polynomial follows
+        return NO_FRINGES
+    room = changes.used.sum() / _PIXELS_PER_TERM
+    most = max(k for k in range(_STEEPEST + 1) if not k or len(waves) * (k + 1) * (k + 2) <= room)
+    squares = np.array([
+        _explained(change, light, Fringes(waves, k), beside)[0] for k in range(most + 1)
+    ])  # fmt: skip
+    degree = int(np.flatnonzero(squares > squares.max() - least).min())
+    return Fringes(waves / side, degree, math.sqrt(max(squares[degree], 0.0) * changes.error))
+
+
+def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: int) -> FloatArray:
+    """Give waves the vectors with which they leave least, beside a polynomial.
+
+    A wave whose vector is off by d leaves i d·r of itself (Gauss-Newton).
+    """
+    y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
+    flat, root = change.reshape(len(change), -1), np.sqrt(light)
+    for _ in range(_TURNS):
+        phase = waves[:, :1, None] * y[:, None] + waves[:, 1:, None] * x
+        both = root * np.stack([np.cos(phase), np.sin(phase)])
+        parts = np.concatenate([both, both * y[:, None], both * x])
+        terms = _without_smooth(parts.reshape(-1, *light.shape), beside)
+        found, *_ = np.linalg.lstsq(terms.reshape(len(terms), -1).T, flat.T, rcond=None)
+        ahead, behind = np.moveaxis(found.reshape(3, 2, len(waves), -1), 1, 0)
+        height, slope = ahead[0] - 1j * behind[0], ahead[1:] - 1j * behind[1:]
+        off = (slope * np.conj(1j * height)).real.sum(axis=-1)
+        waves = waves + (off / np.square(np.abs(height)).sum(axis=-1)).T
+    return waves
+
+
+def _explained(
+    change: FloatArray, light: FloatArray, fringes: Fringes, beside: int
+) -> tuple[float, FloatArray]:
+    """Fit fringes beside a polynomial, which is no part of the changes any more.
+
+    Gives their mean square beyond that of noise, in its variances, and what they leave.
+    """
+    rows, columns, products = fringes.axes(light.shape)
+    down, along = np.nonzero(products)
+    terms = np.sqrt(light) * rows.T[down][:, :, None] * columns.T[along][:, None]
+    basis, _ = np.linalg.qr(_without_smooth(terms, beside).reshape(len(terms), -1).T)
+    seen = change.reshape(len(change), -1) @ basis
+    rest = change - (seen @ basis.T).reshape(change.shape)
+    return float((np.square(seen) - 1).sum()) / len(change), rest
+
+
+def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
+    """Take the polynomial of a degree off changes (pairs, y, x)."""
+    rows, columns = (
+        np.linalg.qr(legvander(np.linspace(-1, 1, n), degree))[0] for n in change.shape[1:]
+    )
+    degrees = np.arange(degree + 1)
+    kept = np.add.outer(degrees, degrees) <= degree
+    return np.asarray(change - rows @ (kept * (rows.T @ change @ columns)) @ columns.T)
+
+
+def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
+    """Give the wave vector of the point that stands out of the mean spectrum; None without one."""
+    pairs, high, wide = change.shape
+    windows = np.hanning(high)[:, None] * np.hanning(wide)
+    seen = change * (windows / math.sqrt(float(np.square(windows).mean())))
+    power = np.square(np.abs(fft.rfft2(seen))).mean(axis=0) / (high * wide)
+    around = np.maximum(_around(power, wide), 1.0)
+    waves = np.hypot(np.fft.fftfreq(high)[:, None] * high, np.fft.rfftfreq(wide) * wide)
+    noise = float(chdtri(2 * pairs, _BY_CHANCE)) / (2 * pairs)
+    most = np.maximum(noise, around + _ABOVE * (around - 1))
+    above = np.where(waves > slowest, power / most, 0.0)
+    at = np.unravel_index(int(above.argmax()), above.shape)
+    if above[at] <= 1:
+        return None
+    sampled = (np.fft.fftfreq(high)[at[0]], np.fft.rfftfreq(wide)[at[1]])
+    wave = 2 * np.pi * np.array(sampled)
+    step = np.pi / np.array([high, wide])
+    for _ in range(_ZOOMS):
+        ways = wave[:, None] + step[:, None] * np.arange(-2, 3)
+        down, along = (
+            np.exp(-1j * np.outer(way, np.arange(n)))
+            for way, n in zip(ways, (high, wide), strict=True)
+        )
+        near = np.square(np.abs(down @ seen @ along.T)).sum(axis=0)
+        best = np.unravel_index(int(near.argmax()), near.shape)
+        wave = np.array([ways[0, best[0]], ways[1, best[1]]])
+        step = step / 2
+    return wave
+
+
+def _around(power: FloatArray, wide: int) -> FloatArray:
+    """Give the median of a half spectrum (y, k) at the distance of each point, and of its lines."""
+    high, _ = power.shape
+    side = max(high, wide)
+    ring = np.rint(side * np.hypot(np.fft.fftfreq(high)[:, None], np.fft.rfftfreq(wide)))
+    order = np.argsort(ring, axis=None, kind="stable")
+    cuts = np.flatnonzero(np.diff(ring.ravel()[order])) + 1
+    middle = np.array([np.median(part) for part in np.split(power.ravel()[order], cuts)])
+    at_distance: NDArray[np.float64] = middle[np.searchsorted(np.unique(ring), ring)]
+    lines = np.maximum(np.median(power, axis=1, keepdims=True), np.median(power, axis=0))
+    return np.maximum(at_distance, lines)

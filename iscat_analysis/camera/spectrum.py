@@ -1,0 +1,264 @@
+"""The noise of ratio images at every spatial frequency, measured, and the filter that whitens it.
+
+Shot noise is alike at all frequencies, and of known size.  Charge that leaks between pixels,
+filters in the read-out, rows that flicker and read noise that nobody declared are not: a matched
+filter that takes such noise for white has more false alarms than it was asked for, or fewer.
+Neighbouring frames tell: in their difference nothing is left but noise.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.records import BoolArray, FloatArray, Mapper
+
+REACH_PX = 6
+"""Distance of pixels up to which their noise may be correlated, beyond what rows share."""
+
+MARGIN_PX = REACH_PX + 2
+"""Width over which images are continued by reflection before they are whitened."""
+
+_PAIRS = 64  # of frames that are compared
+_LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
+_OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_LANDED = 4  # such pixels more than in most pairs of frames, where something has landed
+_GLANCES = 9  # pairs whose median number of such pixels is that of a pair in which nothing lands
+_SOME = 8  # of as many pixels, whose median tells how large the noise is
+_SIGNIFICANT = 4.5  # standard errors beyond which a correlation is one
+_NEGLIGIBLE = 0.01  # of the expected variance, below which nothing is corrected
+_LEAST = 0.05  # of the variance, that every frequency is taken to have
+_NORMAL_QUARTILE = 0.6744897501960817
+
+
+@dataclass(frozen=True)
+class NoiseSpectrum:
+    """Variance of the noise over the expected one, at every spatial frequency.
+
+    Images are continued by reflection over `MARGIN_PX`, so that at an edge as well a pixel has
+    neighbours like those that it is correlated with.
+    """
+
+    shape: tuple[int, int]
+    power: FloatArray
+    information: FloatArray
+    variance: float
+    neighbours: tuple[float, float]
+    shared: tuple[float, float]
+    summed: tuple[float, float]
+
+    @property
+    def alike(self) -> float:
+        """How many times fewer pixels would tell as much of the variance, were they independent."""
+        covariance = fft.irfft2(self.power, s=self.shape)
+        return float(np.sum(np.square(covariance / covariance[0, 0])))
+
+    @property
+    def correlated(self) -> bool:
+        """Whether neighbouring pixels are."""
+        return max(map(abs, self.neighbours)) > _NEGLIGIBLE
+
+    def whitened(self, weighted: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
+        """Turn a signal, times its information, into what a template's overlap is taken with.
+
+        Shapes: `weighted` (y, x), `weight` (y, x).
+        """
+        root = np.sqrt(weight)
+        in_noise = np.divide(weighted, root, out=np.zeros_like(root), where=root > 0)
+        spectrum = fft.rfft2(np.pad(in_noise, MARGIN_PX, mode="symmetric"))
+        spectrum /= self.power.astype(weighted.dtype)
+        whitened = fft.irfft2(spectrum, s=self.shape)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        out: NDArray[Any] = root * whitened
+        return out
+
+    def dual(self, template: FloatArray) -> FloatArray:
+        """Give what an image's product with a template is, to the noise, as a product of numbers.
+
+        Shapes: `template` (…, k, k), result (…, k, k).
+        """
+        side = template.shape[-1]
+        high, wide = (min(side, there) for there in self.shape)
+        top, left = (side - high) // 2, (side - wide) // 2
+        rows, columns = slice(top, top + high), slice(left, left + wide)
+        field = np.zeros((*template.shape[:-2], *self.shape))
+        field[..., :high, :wide] = template[..., rows, columns]
+        seen = fft.irfft2(fft.rfft2(field) * self.information, s=self.shape)
+        out = np.zeros_like(template)
+        out[..., rows, columns] = seen[..., :high, :wide]
+        return out
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What ``summary.json`` says of the noise."""
+        return {
+            "variance_over_shot": self.variance,
+            "neighbour_correlation": list(self.neighbours),
+            "row_share": self.shared[0],
+            "column_share": self.shared[1],
+        }
+
+    @property
+    def message(self) -> str:
+        """One line about what is not as expected; empty where nothing but the variance is."""
+        parts = []
+        x, y = self.neighbours
+        if self.correlated:
+            parts.append(
+                f"the noise of neighbouring pixels is correlated ({x:+.2f} in x, {y:+.2f} in y)"
+            )
+        for part, lines in zip(self.shared, ("rows", "columns"), strict=True):
+            if part:
+                parts.append(f"whole {lines} flicker ({100 * part:.2g} % of the noise variance)")
+        if not parts:
+            return ""
+        return (
+            " and ".join(parts)
+            + ": the search allows for it, and its false alarms are as many as configured; the "
+            "fits take pixels for independent, so their σ are not right"
+        )
+
+
+def measure_spectrum(
+    counts: NDArray[Any],
+    camera: Camera,
+    *,
+    masked: BoolArray | None = None,
+    mapper: Mapper = map,
+) -> NoiseSpectrum | None:
+    """Measure the noise between neighbouring frames.
+
+    Notes
+    -----
+    Covariances at distances up to `REACH_PX`, and those that a whole row or column shares, from the
+    mean periodogram (R. B. Blackman and J. W. Tukey, The Measurement of Power Spectra, 1959).
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
+    """
+    rows, columns = counts.shape[1:]
+    pairs = min(len(counts) // 2, _PAIRS)
+    if pairs < 4 or min(rows, columns) < 4 * REACH_PX:
+        return None
+    starts = 2 * np.linspace(0, len(counts) // 2 - 1, pairs).astype(int)
+    frames = np.concatenate([starts, starts + 1])
+    gain, offset = camera.gain_e_per_adu, camera.offset_adu
+    mean = gain * (counts[frames].mean(axis=0) - offset)
+    read = camera.read_variance_e2((rows, columns))
+    used = (mean > 0) & ~camera.saturated(counts[frames].max(axis=0))
+    if masked is not None:
+        used &= ~masked
+    if used.mean() < 0.5:
+        return None
+    light = float(mean[used].mean())
+    if light < _LIGHT_E:
+        return None
+
+    # rounded to single precision, which is a millionth of the noise and takes half of the time
+    expected, read_noise, scale, zero = (
+        np.asarray(value, dtype=np.float32)
+        for value in (np.where(used, mean, 1.0), read, gain, offset)
+    )
+
+    def change(start: int) -> tuple[NDArray[np.float32], float] | None:
+        # in its expected errors, with the size beyond which it is no noise
+        before, after = (
+            scale * np.subtract(counts[k], zero, dtype=np.float32) for k in (start, start + 1)
+        )
+        powers = [float(frame.mean(where=used)) / light for frame in (before, after)]
+        if min(powers) <= 0:
+            return None
+        by_light, by_frame = (sum(q**-n for q in powers) for n in (1, 2))
+        z = after / powers[1] - before / powers[0]
+        z /= np.sqrt(by_light * expected + by_frame * read_noise)
+        z[~used] = 0.0
+        middle = float(np.median(np.abs(z[used][::_SOME])))
+        return z, _OUTLIER * middle / _NORMAL_QUARTILE
+
+    def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
+        return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
+
+    # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
+    few = starts[:: max(1, pairs // _GLANCES)].tolist()
+    most = float(np.median([outliers(change(start)) for start in few])) + _LANDED
+
+    def periodogram(start: int) -> FloatArray | None:
+        found = change(start)
+        if found is None:
+            return np.zeros((rows, columns // 2 + 1))
+        if outliers(found) > most:
+            return None
+        z, limit = found
+        waves = fft.rfft2(np.clip(z, -limit, limit, out=z))
+        return np.asarray(np.square(waves.real) + np.square(waves.imag))
+
+    total, pairs = np.zeros((rows, columns // 2 + 1)), 0
+    for spectrum in mapper(periodogram, starts.tolist()):
+        if spectrum is not None:
+            total += spectrum
+            pairs += 1
+    # in how many pairs of frames and of used pixels each distance occurs
+    alike = fft.irfft2(np.abs(fft.rfft2(used.astype(np.float64))) ** 2, s=(rows, columns))
+    covariance = fft.irfft2(total, s=(rows, columns)) / (pairs * np.maximum(np.rint(alike), 1.0))
+    light = np.sqrt(np.where(used, mean, np.mean(mean, where=used)))
+    return _spectrum_of(covariance, 1 / math.sqrt(pairs * np.count_nonzero(used)), light)
+
+
+def _spectrum_of(
+    covariance: FloatArray, error: float, root_light: FloatArray
+) -> NoiseSpectrum | None:
+    """Keep of a covariance (rows, columns) what is near, and what rows and columns share."""
+    here, lags = REACH_PX, np.arange(-REACH_PX, REACH_PX + 1)
+    far_y, far_x = (slice(REACH_PX + 1, n - REACH_PX) for n in covariance.shape)
+    # a frame's mean was taken for its power, which takes the same from every covariance
+    covariance = covariance - covariance[far_y, far_x].mean()
+    variance = float(covariance[0, 0])
+    error *= variance
+
+    def shared(lines: FloatArray) -> FloatArray:
+        """Mean of lines (n, lags), where it is significant at lag 0.
+
+        It is negative where each line was divided by its own light.
+        """
+        mean: FloatArray = lines.mean(axis=0)
+        # a distance and its opposite have the same covariance: half as many are independent
+        limit = _SIGNIFICANT * error * math.sqrt(2 / len(lines))
+        return mean if abs(mean[here]) > limit else 0 * mean
+
+    by_row, by_column = shared(covariance[lags, far_x].T), shared(covariance[far_y, lags])
+    common = by_row[:, None] + by_column[None, :]
+    local = covariance[np.ix_(lags, lags)] - common
+    # no signal is left either of what was divided out, so that nothing is to be whitened there
+    by_row, by_column = (
+        line if line[here] > 0 else np.zeros_like(line) for line in (by_row, by_column)
+    )
+    common = by_row[:, None] + by_column[None, :]
+    beside = np.abs(local)
+    beside[here, here] = 0.0
+    if beside.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):
+        if abs(variance - 1) < _NEGLIGIBLE and not common.any():
+            return None
+        local = np.zeros_like(local)
+        local[here, here] = variance - common[here, here]
+    light = np.pad(root_light, MARGIN_PX, mode="symmetric")
+    whole = np.zeros(light.shape)
+    whole[lags, :] += by_row[:, None]
+    whole[:, lags] += by_column[None, :]
+    whole[np.ix_(lags, lags)] += local
+    power = np.maximum(fft.rfft2(whole).real, _LEAST * variance)
+    # signals are multiplied by the root of the light before they meet the whitening filter
+    alike = fft.irfft2(np.abs(fft.rfft2(light)) ** 2, s=light.shape)
+    kernel = fft.irfft2(1 / power, s=light.shape) * alike / alike[0, 0]
+    return NoiseSpectrum(
+        shape=(light.shape[0], light.shape[1]),
+        power=power,
+        information=fft.rfft2(kernel).real,
+        variance=variance,
+        neighbours=(local[here, here + 1] / variance, local[here + 1, here] / variance),
+        shared=(by_row[here] / variance, by_column[here] / variance),
+        summed=(float(local.sum()), error * math.sqrt(local.size)),
+    )

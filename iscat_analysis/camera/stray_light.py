@@ -1,0 +1,84 @@
+"""Light, or counts of the dark camera, that are added to all pixels alike and change.
+
+Where a room's light or the camera's offset drifts, dim pixels change by more of themselves than
+bright ones: by one over their light.  In every part of the field that is the same number, whatever
+smooth light does there; what a pattern that moves makes of it differs from part to part.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from iscat_analysis.camera.light_changes import Changes
+from iscat_analysis.records import FloatArray
+
+_PARTS = 8  # along each axis
+_SIGNIFICANT = 30.0  # squared standard errors, which follow from the differences of the parts
+_DOUBT = 4.0  # standard errors of what is left over in a part
+_PATTERN = 10.0  # times what the noise of the mean frame tells, that its pattern must
+_ALIKE = 4.0  # times what the median part tells, more than which none should
+_MOST = 0.25  # of the mean light, more than which is not added between windows
+_LEAST_PARTS = 16
+_LEAST_TOLD = 1e-3  # by a part, of what others tell
+
+
+def lift(light_e: FloatArray) -> FloatArray:
+    """Give the relative change of pixels to which the same is added.
+
+    Shapes: `light_e` (y, x), result (y, x).
+    """
+    used = light_e > 0
+    return np.where(used, light_e[used].mean() / np.where(used, light_e, 1.0), 0.0)
+
+
+def find_haze(changes: Changes, window: int) -> float:
+    """Look for something that is added to all pixels alike, and changes."""
+    light, more = changes.light_e, lift(changes.light_e)
+    rows, columns = (
+        np.equal.outer(np.arange(_PARTS), np.arange(n) * _PARTS // n).astype(np.float64)
+        for n in light.shape
+    )
+
+    def summed(values: FloatArray) -> FloatArray:
+        parts: FloatArray = rows @ values @ columns.T
+        return parts.reshape(*values.shape[:-2], -1)
+
+    sums = changes.sums_e
+    each = sums * (light.sum() / sums.sum(axis=(2, 3), keepdims=True)) - light
+    change = each[:, 1] - each[:, 0]
+    held, once, twice = summed(light), summed(light * more), summed(light * more**2)
+    told = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
+    if not (told > 0).any():
+        return 0.0
+    lit = (told > 0) & (told < _ALIKE * np.median(told[told > 0]))  # without dust and particles
+    if lit.sum() < _LEAST_PARTS:
+        return 0.0
+    mean, told = once[lit] / held[lit], told[lit]
+    pixels = summed((light > 0).astype(np.float64))[lit]
+    if told.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
+        return 0.0
+    even = summed(change)[:, lit]
+    seen = summed(change * more)[:, lit] - even * mean
+    added = seen.sum(axis=1, keepdims=True) / told.sum()
+    rest = seen - added * told
+    spread = np.square(rest) / np.maximum(told, told.mean() * _LEAST_TOLD)
+    error = spread.sum(axis=1) / (lit.sum() - 1) / told.sum()
+    square = float(np.median(np.square(added)))
+    if square > _MOST**2:
+        return 0.0
+    if square * told.sum() / light.sum() < changes.least(window) + changes.error:
+        return 0.0
+    if np.median(np.square(added[:, 0]) / error) < _SIGNIFICANT:
+        return 0.0
+    # in variances of noise, of the pixels of a part
+    noises = changes.noises[:, None]
+    squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
+    gain = np.square(added) * told / noises
+    left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)
+    doubt = _DOUBT * math.sqrt(2 * float(pixels.mean()) / left.size)
+    if np.median(left) > np.median(gain) + doubt:
+        return 0.0
+    here = summed(each * more)[..., lit] - summed(each)[..., lit] * mean
+    return float(np.ptp(here.sum(axis=-1))) / float(told.sum())

@@ -1,0 +1,108 @@
+"""Which number of the camera is wrong: what the noise and the zero of the light say of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from iscat_analysis.camera.calibration import LightZero
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.metadata import GainDiagnosis
+from iscat_analysis.camera.spectrum import NoiseSpectrum
+
+_SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
+_MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
+_SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
+
+
+def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
+    """Tell whether it is the offset that is wrong, where the noise is not the only one to say so.
+
+    Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
+    meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
+    """
+    if not zero.off or gain.shakes:
+        return False
+    if zero.flickers:
+        return True
+    left = gain.noise_ratio / (1 - zero.share)
+    return left < _MOST_LEFT and not (zero.share > 0 and gain.noise_ratio > 1)
+
+
+def _offset_of(camera: Camera) -> str:
+    offset = camera.offset_adu
+    if np.ndim(offset):
+        return f"the map camera.offset_adu, {np.mean(offset):.4g} on average,"
+    return f"camera.offset_adu = {offset:.4g}"
+
+
+def _effect(share: float) -> str:
+    """Say what a part of the light that is none does to masses."""
+    percent = float(f"{100 * abs(share):.2g}")  # in full where it is hundreds
+    return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
+
+
+def offset_said(zero: LightZero, camera: Camera) -> str:
+    """Say where the light is zero, and what a wrong offset does."""
+    per_count = float(np.mean(camera.gain_e_per_adu))
+    counts = zero.electrons / per_count
+    se = zero.se * counts / zero.share
+    found = float(np.mean(camera.offset_adu)) + counts
+    how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
+    read = zero.electrons < 0 and not zero.flickers
+    said = (
+        f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
+        f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
+    )
+    if np.ndim(camera.offset_adu):
+        said += "record a dark for `iscat calibrate camera --maps`"
+    elif found < -_SUBTRACTED * se:
+        said += "see whether counts were subtracted from the movie; record raw counts"
+    else:
+        said += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
+    if read:
+        missing = math.sqrt(-zero.electrons)
+        said += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
+    return said
+
+
+def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
+    """Say that an offset may be as wrong as a gain, where the noise fits both.
+
+    An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
+    """
+    share = 1 - gain.noise_ratio
+    if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
+        return ""
+    if zero is not None and not zero.may_be(share):
+        return ""
+    noisy = "by light that is noisy by itself, " if gain.noise_ratio > 1 else ""
+    return (
+        f"the noise variance is {gain.noise_ratio:.3g} ± {gain.noise_ratio_se:.1g} times what the "
+        "camera's numbers predict, and this movie does not tell whether by the gain (then set "
+        f"camera.gain_e_per_adu = {gain.gain_e_per_adu:.4g}), {noisy}or by {_offset_of(camera)}, "
+        f"which would make {_effect(share)}: record a dark, and measure both with "
+        "`iscat calibrate camera`"
+    )
+
+
+def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
+    """Judge the gain by the noise that neighbouring pixels have together.
+
+    Notes
+    -----
+    Light is Poisson before charge leaks to neighbours; leaking moves variance into covariances
+    (M. Downing et al., Proc. SPIE 6276, 627609, 2006).
+    """
+    if spectrum is None or not spectrum.correlated:
+        return gain
+    ratio, error = spectrum.summed
+    return replace(
+        gain,
+        noise_ratio=ratio,
+        noise_ratio_se=error,
+        gain_e_per_adu=gain.configured_gain / ratio,
+        gain_se=gain.configured_gain / ratio**2 * error,
+    )

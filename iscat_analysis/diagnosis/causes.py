@@ -1,0 +1,309 @@
+"""What a movie reveals of lines, pixels, stage and model, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.metadata import diagnose_gain
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
+from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.events import Event
+from iscat_analysis.inference.cause import likely_cause
+from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
+from iscat_analysis.movie import Stack
+from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.records import FloatArray, Status, Windows
+from iscat_analysis.search.sliding import DARK, well_lit
+from iscat_analysis.trust.systematic import is_bent
+from iscat_analysis.units import count, listed
+
+FLAT = 0.05
+"""Variance of the steps along z over that in the plane, below which particles move in a plane:
+near the coverslip those that do not have less along z too, but not so much less."""
+
+_RINGS = 0.01  # of the light, which rings of many bright particles make uneven
+_LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
+_GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
+_BRIGHTEST = 8  # isolated particles on which the model is judged
+_DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
+_SWAPPED = 10.0  # times less change along the axis of time than along both of space
+_LOOKED_AT = 96  # frames, rows and columns in which axes are judged
+_ENOUGH_STEPS = 30
+_MOSTLY = 0.5  # of fits that are poor
+_SMEARED_NM = 20.0  # from where most fits of bright particles are,
+_DESCRIBED_NM = 15.0  # and where hardly any is
+_NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
+_FEWEST_TURNED = 5  # particles of the other sign that make it worth a line,
+_NEARLY_ALL = 0.9  # and their share
+_FEWEST_SLOW = 5  # steps that are none that make it worth a line,
+_MANY_SLOW = 0.1  # and their share of all events
+
+
+def axes_warning(name: str, counts: NDArray[Any]) -> str:
+    """Say that time seems to run along the rows or columns of the frames.
+
+    What changes least from one to the next, in proportion to their means, are frames: light on a
+    pixel repeats but for its noise, and neighbouring pixels have different light.
+
+    Shapes: `counts` (t, y, x).
+    """
+    middle = tuple(slice(max(n - _LOOKED_AT, 0) // 2, (n + _LOOKED_AT) // 2) for n in counts.shape)
+    part = counts[middle].astype(np.float64)
+    part = part[np.isfinite(part).all(axis=(1, 2))]
+    if len(part) < 2:
+        return ""
+    changes = []
+    for axis in range(3):
+        lines = np.moveaxis(part, axis, 0)
+        mean = lines.mean(axis=(1, 2))
+        lit = mean > 0
+        steps = np.diff(lines[lit] / mean[lit, None, None], axis=0)
+        changes.append(float(np.mean(steps**2)) if lit.sum() > 1 else math.nan)
+    for axis, lines_of in ((1, "rows"), (2, "columns")):
+        others = min(changes[0], changes[3 - axis])
+        if _SWAPPED * changes[axis] < others:
+            return (
+                f"{name}: frames differ more from each other than neighbouring {lines_of} of one "
+                f"frame do ({math.sqrt(others / changes[axis]):.0f} times), as if time ran along "
+                f"its {lines_of}: the axes must be (t, y, x); export it again in this order"
+            )
+    return ""
+
+
+def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
+    """Say how many pixels are left out, and why."""
+    if defects:
+        yield f"{count(defects, 'dead, hot or noisy pixel')} {_be(defects)} left out"
+    if saturated:
+        yield (
+            f"{count(saturated, 'pixel')} {_be(saturated)} saturated in some frame and left out; "
+            "lower the exposure or the laser power"
+        )
+
+
+def _be(number: int) -> str:
+    return "is" if number == 1 else "are"
+
+
+def repeats_warning(movie: Stack, windows: Windows) -> str:
+    """Say which frames repeat the one before them, which the sums count as frames of their own."""
+    numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
+    same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
+    same &= well_lit(windows.power, DARK)[1:]  # of dark ones something else is said
+    found = [n for n in numbers[1:][same].tolist() if _repeats(movie, n)]
+    if not found:
+        return ""
+    return (
+        f"{movie.name}: {'frames' if len(found) > 1 else 'frame'} {listed(found, 4)} of "
+        f"{numbers.size} {'repeat' if len(found) > 1 else 'repeats'} the frame before "
+        "(stuck in the camera), so that there is less light than it seems and σ is too small: "
+        "record or export the movie without them"
+    )
+
+
+def _repeats(movie: Stack, number: int) -> bool:
+    pair = movie.read(number - 1, number + 1)
+    return np.array_equal(pair[0], pair[1])
+
+
+def uneven_warning(
+    config: Config, name: str, windows: Windows, explained: FloatArray | None = None
+) -> str:
+    """Say that the light is uneven where one level is taken for the background of all pixels.
+
+    Shapes: `explained` (y, x).
+    """
+    level = windows.power_ratio * windows.before_e
+    used = ~windows.masked & (level > 0)
+    if windows.n_before or not used.any():
+        return ""
+    signal = np.zeros(level.shape) if explained is None else explained
+    expected = level + signal if config.optics.scheme == "darkfield" else level * (1 + signal)
+    used &= np.isfinite(expected) & (expected > 0)
+    if used.sum() < _LEAST_PIXELS:
+        return ""
+    expected, after = expected[used], windows.after_e[used]
+    light = after / expected
+    noise = after + windows.read_variance_after_e2[used]
+    shot = math.sqrt(max(float(np.median(noise / expected**2)), 0.0))
+    middle = float(np.median(light))
+    spread = _GAUSS * float(np.median(np.abs(light - middle)))
+    uneven = math.sqrt(max(spread**2 - shot**2, 0.0))
+    if uneven <= max(shot, 0.0 if explained is not None else _RINGS * middle):
+        return ""
+    times = float(f"{uneven / shot:.2g}")
+    advice = "give frames without particles as background.frames"
+    if config.fit.mode == "track":
+        advice += ', or learn the background with background.method = "tracks"'
+    elif config.optics.scheme != "darkfield":
+        advice += ', or follow landings with background.method = "sliding"'
+    return (
+        f"{name}: the light differs by {100 * uneven / middle:.2g} % of its mean from pixel to "
+        f'pixel, {times:g} times its noise, where background.method = "known" has '
+        f"{config.background.level_e:g} in all of them: what differs is taken for particles, or "
+        f"makes their masses and places wrong; {advice}"
+    )
+
+
+def misfit_warning(config: Config, events: Sequence[Event]) -> str:
+    """Say what is probably wrong with the model, where it misses the brightest particles."""
+    if config.optics.psf == "measured":
+        return ""
+    alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
+    brightest = sorted(alone, key=lambda e: -e.snr)[:_BRIGHTEST]
+    missed = [e for e in brightest if Status.POOR_FIT in e.flags]
+    if 2 * len(missed) <= len(brightest):
+        return ""
+    cause = likely_cause(config, [(e.likelihood, e.fit.theta, e.fit.box.free) for e in missed])
+    return cause.message if cause else ""
+
+
+def line_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say which contrasts the line of the calibration turns into no single mass."""
+    line = config.calibration
+    if line is None or not line.offset:
+        return ""
+    crossing = -line.offset / line.gradient_per_kda
+    mass, sigma = table["mass_kda"], table["sigma_mass_kda"]
+    if crossing > 0:
+        near = mass.abs() - OUTWARD * sigma < 2 * crossing
+        why = (
+            f"its line is at zero at {crossing:.3g} kDa, so that below {2 * crossing:.3g} kDa two "
+            "masses of opposite sign have one contrast, of which the one with its sign is given"
+        )
+    else:
+        near = mass * table["contrast"] * line.gradient_per_kda < 0
+        why = f"its line has the contrast {line.offset:.3g} without a particle, and they have less"
+    near &= sigma.notna() & table["flags"].fillna("").str.contains(Status.AT_BOUND.value)
+    number = int(near.sum())
+    if not number:
+        return ""
+    return (
+        f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
+        "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
+    )
+
+
+def bend_warning(scale: MassScale, table: pd.DataFrame) -> str:
+    """Say which particles are too heavy for a line that faint standards gave."""
+    bent = is_bent(scale, table)
+    if not bent.any():
+        return ""
+    masses = table["mass_kda"].abs().to_numpy(float)[bent]
+    most = float(masses.max())
+    share = float(scale.bend(np.array([most]))[0])
+    verb = "is" if len(masses) == 1 else "are"
+    return (
+        f"{count(len(masses), 'particle')}, of up to {most:.4g} kDa, {verb} so heavy that contrast "
+        "is not in proportion to the mass: it has the square of the scattered light, and the line "
+        "of [calibration], where its standards are light, makes the heaviest "
+        f"{100 * abs(share):.2g} % too {'light' if share > 0 else 'heavy'}; systematic_mass_kda "
+        "has that; calibrate with standards as heavy as these"
+    )
+
+
+def sign_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say that nearly all particles change the light the other way than the model has it."""
+    mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
+    turned = int((mass < 0).sum())
+    if turned < _FEWEST_TURNED or turned < _NEARLY_ALL * len(mass):
+        return ""
+    brightens = float(table.loc[mass.index, "contrast"].median()) > 0
+    seen, other = ("brighten", "darken") if brightens else ("darken", "brighten")
+    by = "the configured optics" if config.calibration is None else "calibration.gradient_per_kda"
+    return (
+        f"{turned} of {count(len(mass), 'particle')} have a negative mass, which is that of "
+        f"particles that leave: they {seen} the image, and by {by} those that land {other} it; if "
+        "they land, correct that sign, or optics.focus_nm"
+    )
+
+
+def course_warning(table: pd.DataFrame) -> str:
+    """Say that the light of many steps does not change from one frame to the next.
+
+    Their pictures agree with the model, and the goodness of fit is theirs; `Status.POOR_FIT` is
+    then of the course of the light before and after.
+    """
+    poor = table["status"] == Status.POOR_FIT.value
+    slow = int((poor & (table["p_value"] >= POOR_FIT_P)).sum())
+    if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
+        return ""
+    return (
+        f"{slow} of {int(poor.sum())} events that are poor_fit are described by the model, but "
+        "their light goes on changing before or after the step, not from one frame to the next: "
+        "particles that settle slowly, move on, bleach or blink; their masses are those of the "
+        "mean change (sum frames before the analysis if they settle within a few, or lower "
+        "background.window_frames if they change later)"
+    )
+
+
+def plane_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say that particles whose height was fitted in every frame do not move along z."""
+    if config.track.free != "joint":
+        return ""
+    good = table[table["status"] == Status.OK.value].sort_values(["track", "frame"])
+    step = good[["track", "frame", "x_nm", "y_nm", "z_nm"]].diff()
+    next_ones = (step["track"] == 0) & (step["frame"] == 1)
+    if next_ones.sum() < _ENOUGH_STEPS:
+        return ""
+    noise = float((good["sigma_x_nm"] ** 2 + good["sigma_y_nm"] ** 2).median())
+    step = step[next_ones]
+    along = float((step["z_nm"] ** 2).median()) / _NORMAL[0]  # outliers change fringes
+    across = float((step["x_nm"] ** 2 + step["y_nm"] ** 2).median()) / _NORMAL[1] - noise
+    if along >= FLAT * across:
+        return ""
+    return (
+        f"the particles move by {math.sqrt(across):.2g} nm from frame to frame along x and y but "
+        f'by {math.sqrt(along):.2g} nm along z, as on a membrane: set track.free = "mass" and '
+        f'particle.height_nm = {good["z_nm"].median():.3g}; with track.free = "joint" pictures '
+        "are blurred along z as well, and masses come out too large"
+    )
+
+
+def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> str:
+    """Say that particles go too far within an exposure for their heights to be fitted.
+
+    A picture is that of a normal distribution about the mean of the path, along z in phase too; of
+    a long path no two are alike.
+
+    Shapes: `smear_nm` (n,).
+    """
+    if config.fit.mode != "joint" or len(table) < _ENOUGH_STEPS:
+        return ""
+    poor = table["flags"].fillna("").str.contains(Status.POOR_FIT.value)
+    smear = float(np.median(smear_nm))
+    if poor.mean() < _MOSTLY or smear < _SMEARED_NM:
+        return ""
+    rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
+    if exposure is None and rate is not None:
+        exposure = 1e3 / rate
+    advice = ""
+    if exposure is not None:
+        advice = f" than {exposure:.3g} ms, about {exposure * (_DESCRIBED_NM / smear) ** 2:.1g} ms"
+    return (
+        f"the particles go {smear:.0f} nm (standard deviation) about their mean within an "
+        f"exposure, and {poor.mean():.0%} of the fits are poor: along z that turns the phase by "
+        "too much for one picture, and optics, gain and noise cannot be judged; expose for less"
+        f"{advice}"
+    )
+
+
+def shaking_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
+    """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
+
+    Particles that move add noise too, but not along the gradient of the mean of all frames.
+    """
+    counts = movie.read(frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES))
+    try:
+        found = diagnose_gain(counts, camera)
+    except DataError:  # too dark to tell
+        return ""
+    return (found.message or "") if found.shakes else ""

@@ -1,0 +1,105 @@
+"""Noise of the background frames, and how far the fixed pattern of the light moved."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import follow_pattern
+from iscat_analysis.diagnosis.noise import first_counts, is_lit
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import FloatArray, Windows
+from iscat_analysis.search.sliding import measure_noise, well_lit
+
+DRIFT_PX = 0.02
+"""Shift of the fixed pattern below which it is not worth a line."""
+
+_NOISE_BYTES = 64_000_000  # of counts on which the noise is measured
+_LONGEST = 100  # average of the noise curve
+_SMALLEST_PX = 32  # side of a field in which a pattern is followed, and of its parts
+_FEWEST_PARTS = 4  # whose differences tell an error
+_NORMAL_QUARTILE = 0.6745
+_SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
+
+
+def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
+    """Measure noise against averaging, and how far the fixed pattern moved."""
+    curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
+    limit = drift = error = None
+    if windows.n_before >= 2 and is_lit(windows):
+        frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
+        some = first_counts(movie, windows, max(2, _NOISE_BYTES // frame_bytes))
+        lit = well_lit(windows.power[: len(some)])
+        some = some if lit.all() or lit.sum() < 2 else some[lit]
+        noise = measure_noise(some, camera, min(_LONGEST, len(some) // 2))
+        curve, limit = (noise.frames, noise.variance_over_shot), noise.shot_limited
+        moved = _pattern_moved(windows)
+        if moved is not None:
+            drift, error = moved[0].tolist(), moved[1].tolist()
+    return {
+        "noise_frames": list(curve[0]),
+        "noise_variance_over_shot": list(curve[1]),
+        "shot_noise_limited_frames": limit,
+        "drift_px": drift,
+        "drift_error_px": error,
+    }
+
+
+def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
+    """Give how far the pattern moved along y and x, and the errors; None where there is none.
+
+    A particle changes the light at its place as an edge that moved does, but in every part of the
+    field another way: the errors are at least what the parts differ by.
+    """
+    rows, columns = windows.before_e.shape
+    whole = _part_moved(windows, np.s_[:rows, :columns])
+    if whole is None:
+        return None
+    side = _SMALLEST_PX
+    parts = [
+        _part_moved(windows, np.s_[top : top + side, left : left + side])
+        for top in range(0, rows - side + 1, side)
+        for left in range(0, columns - side + 1, side)
+    ]
+    shifts = np.array([part[0] for part in parts if part is not None])
+    if len(shifts) < _FEWEST_PARTS:
+        return whole
+    apart = np.median(np.abs(shifts - np.median(shifts, axis=0)), axis=0) / _NORMAL_QUARTILE
+    return whole[0], np.maximum(whole[1], apart * math.sqrt(math.pi / 2 / len(shifts)))
+
+
+def _part_moved(
+    windows: Windows, part: tuple[slice, slice]
+) -> tuple[FloatArray, FloatArray] | None:
+    """Give how far the pattern of a part of the field moved; None where it is too small."""
+    used = ~windows.masked[part]
+    if min(used.shape) < _SMALLEST_PX:
+        return None
+    way = follow_pattern(
+        np.stack([windows.before_e[part], windows.after_e[part]]),
+        np.array([1.0, windows.power_ratio]),
+        np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
+        np.ascontiguousarray(used),
+        np.ascontiguousarray(windows.read_variance_before_e2[part]),
+    )
+    if way is None or not np.isfinite(way.error_px).all():
+        return None
+    return way.shift_px[1], way.error_px[1]
+
+
+def drift_warning(name: str, background: dict[str, Any]) -> str | None:
+    """Say that the fixed pattern moved, where that can be taken for particles."""
+    if background["drift_px"] is None:
+        return None
+    (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]
+    pull = math.hypot(y / y_error, x / x_error)
+    if math.hypot(y, x) <= DRIFT_PX or pull <= _SIGNIFICANT:
+        return None
+    return (
+        f"{name}: the fixed pattern moved by {x:+.2f} pixels in x and {y:+.2f} in y between the "
+        "background and the frames after it; its edges look like particles: take background frames "
+        "nearer to them (background.frames), or fewer frames (fit.frames)"
+    )

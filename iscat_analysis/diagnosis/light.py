@@ -1,0 +1,171 @@
+"""The light before anything is searched: pixels, lines and a smooth part that are unsteady."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.lighting import find_surface
+from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
+from iscat_analysis.camera.unsteady import find_unsteady, unsteady_said
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.changes import least_beside, spot_of
+from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.movie import Stack
+from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
+from iscat_analysis.threads import over_frames, threads
+
+PAIRS = 12
+"""Places in a movie at which the light of some frames is compared with that of later ones."""
+
+_LEAST_PAIRS = 3  # of a range of frames
+_TOGETHER = 8  # frames that are summed there
+_SINGLE_PAIRS = 24  # places where particles are followed
+_NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
+_EVERY = 2  # of the places in a background whose frames are compared with those after it as well
+_SAMPLE_BYTES = 96_000_000  # of counts that are read for it
+
+
+class Pair(NamedTuple):
+    """Frames next to each other, and others a window later."""
+
+    first: int
+    before: NDArray[Any]
+    later: int
+    after: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class JudgedLight:
+    """A movie whose light and pixels were looked at."""
+
+    movie: Stack
+    lines: Lines | None
+    messages: tuple[str, ...]
+    steady: Stack
+
+
+def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
+    """Look for pixels and for parts of the light that are unsteady."""
+    if config.optics.scheme == "darkfield":
+        return JudgedLight(movie, None, (), movie)
+    pairs, window = _pairs(movie, config, camera)
+    said = []
+    optics, pixel_nm = config.optics, config.camera.pixel_size_nm
+    spot = spot_of(optics.wavelength_nm, optics.na, pixel_nm or optics.wavelength_nm / optics.na)
+    odd = find_unsteady(_apart(pairs), camera, least_beside(spot))
+    if odd is not None:
+        dark = np.broadcast_to(np.floor(camera.offset_adu), odd.shape)[odd].astype(movie.dtype)
+        for part in (part for pair in pairs for part in (pair.before, pair.after)):
+            part[:, odd] = dark
+        movie = movie.without(odd, dark)
+        said.append(unsteady_said(odd))
+    lines = judge_lines(movie, config, camera, pairs, window)
+    if lines is None:
+        return JudgedLight(movie, None, tuple(said), movie)
+    steady = movie.seen_as(SteadyFrames(movie, lines, camera))
+    return JudgedLight(movie, lines, (*said, *lines.messages), steady)
+
+
+def judge_lines(
+    movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
+) -> Lines | None:
+    """Look for rows, columns and a smooth part of the light that may be divided out."""
+    background = config.background
+    way = way_of(config)
+    if (
+        not background.power_normalization
+        or background.method == "known"
+        or (background.method == "sliding" and background.follows_pattern)
+        or (way == "tracks" and config.track.free == "joint")
+    ):
+        return None
+    first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
+    counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
+    counts = counts[good_frames(counts, camera)]
+    if not len(counts):
+        return None
+    with threads(config.compute.workers) as pool:
+        surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
+        return find_lines(counts, camera, surface, mapper=over_frames(pool, counts.shape[1:]))
+
+
+def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
+    """Give the frames of pairs that have none in common."""
+    parts = sorted(
+        (part for p in pairs for part in ((p.first, p.before), (p.later, p.after))),
+        key=lambda part: part[0],
+    )
+    kept: list[NDArray[Any]] = []
+    end = 0
+    for first, counts in parts:
+        if first >= end:
+            kept.append(counts)
+            end = first + len(counts)
+    return kept
+
+
+def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], int]:
+    """Read frames that are as far apart as windows that are compared, and how many those have.
+
+    Where the background has frames of its own, particles are in the others alone: both are looked
+    at by themselves, and then some of one with some of the other.  Frames in which particles move
+    are compared one by one, half the movie apart: what they have in common is their background.
+    """
+    total, way, places = movie.shape[0], way_of(config), PAIRS
+    given = config.background.recorded, config.fit.frames
+    together = _TOGETHER
+    if way != "fixed":
+        first, last = given[1] or (0, total)
+        spans = [(first, min(last, total))]
+        window = config.background.window_frames or longest_window(last - first)
+        if way == "tracks":
+            window, together, places = (spans[0][1] - first) // 2, 1, _SINGLE_PAIRS
+    else:
+        before = given[0] or (0, 0)
+        first, last = given[1] or (before[1], total)
+        spans = [(before[0], min(before[1], total)), (first, min(last, total))]
+        window = max(stop - start for start, stop in spans)
+    frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
+    most = min(together, _SAMPLE_BYTES // (2 * places * frame_bytes) or 1)
+    places_read: list[tuple[int, int]] = []
+    parts: list[NDArray[Any]] = []
+    for start, stop in spans:
+        gap = min(window, (stop - start) // 2)
+        together = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
+        if together < 1:
+            continue
+        room = stop - gap - together - start
+        number = min(places // len(spans), room // together + 1)  # none has another's frames
+        gaps = (gap, math.ceil(_NEARER * gap)) if way == "tracks" else (gap,)
+        for k, place in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
+            places_read.append((place, place + gaps[k % len(gaps)]))
+            parts += [movie.read(k, k + together) for k in places_read[-1]]
+    if not parts:
+        return [], window
+    measured = [measure_frames(part, camera) for part in parts]
+    lit = well_lit(np.concatenate([light for light, _ in measured]))  # a shutter may hide a part
+    cuts = np.cumsum([len(part) for part in parts])[:-1]
+    good = [
+        part[seen & ~repeats]
+        for part, seen, (_, repeats) in zip(parts, np.split(lit, cuts), measured, strict=True)
+    ]
+    read = [
+        Pair(place, before, later, after)
+        for (place, later), before, after in zip(places_read, good[::2], good[1::2], strict=True)
+    ]
+    if len(spans) == 2:
+        apart = [p for p in read if p.first >= spans[1][0]]
+        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_EVERY]
+        read += [
+            Pair(one.first, one.before, other.later, other.after)
+            for one, other in zip(firsts, apart[::_EVERY], strict=False)
+        ]
+    return [p for p in read if len(p.before) and len(p.after)], window

@@ -1,0 +1,272 @@
+"""The noise before anything is searched: camera, correlation of pixels, length of the windows."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.calibration import find_zero
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.metadata import diagnose_gain, with_shaking
+from iscat_analysis.camera.pattern_jitter import without_shaking
+from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.camera.successive import shared_light
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.camera_numbers import (
+    allow_for_correlation,
+    either_said,
+    offset_is_wrong,
+    offset_said,
+)
+from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
+from iscat_analysis.search.sliding import (
+    SHORTEST_MOVIE,
+    NoiseCurve,
+    choose_window,
+    longest_window,
+    measure_frames,
+    measure_noise,
+    well_lit,
+)
+from iscat_analysis.search.sliding.chunks import NOISE_FRAMES, Reader
+from iscat_analysis.search.templates import ExcessNoise
+from iscat_analysis.threads import over_frames, threads
+
+SPECTRUM_FRAMES = 128
+"""Background frames on which the spectrum of the noise is measured."""
+
+_GAIN_FRAMES = 64  # on which the gain is judged
+_FEWEST_FRAMES = 8  # on which it is judged beside particles that move
+_FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
+_AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
+_ENOUGH_FITS = 10  # of which the best
+_BEST_FITS = 0.1  # leave over the noise and no more; this quantile is theirs
+_LESS = 0.75  # of the noise, which small pictures leave over by chance at least
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What some frames without particles, or nearly so, say of the noise."""
+
+    messages: tuple[str, ...] = ()
+    differs: bool = False
+    excess: ExcessNoise | None = None
+    spectrum: NoiseSpectrum | None = None
+    shakes: bool = False
+
+    def said(self, name: str) -> Iterator[str]:
+        """Give what the user should know."""
+        if self.spectrum is not None and self.spectrum.message:
+            yield f"{name}: {self.spectrum.message}"
+        yield from self.messages
+
+    def beside(self, chi2: FloatArray) -> Noise:
+        """Hold what noise around particles is said to be against what fits of them leave over.
+
+        Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
+        what a wrong model leaves over of rings, or the blur of motion.
+
+        Shapes: `chi2` (n,).
+        """
+        known = chi2[np.isfinite(chi2)]
+        if self.excess is None or len(known) < _ENOUGH_FITS:
+            return self
+        least = float(np.quantile(known, _BEST_FITS))
+        return Noise() if least < _LESS * self.excess.ratio else self
+
+    @property
+    def summary(self) -> dict[str, Any] | None:
+        """What ``summary.json`` says of the spectrum."""
+        return None if self.spectrum is None else self.spectrum.summary
+
+
+def judge_counts(
+    counts: NDArray[Any],
+    camera: Camera,
+    *,
+    masked: BoolArray | None = None,
+    additive: bool = False,
+    follows: bool | None = None,
+    mapper: Mapper = map,
+) -> Noise:
+    """Compare the noise between neighbouring frames with the camera's.
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
+    """
+    spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
+    try:
+        gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
+    except DataError:  # too dark to tell
+        return Noise(spectrum=spectrum)
+    gain = allow_for_correlation(gain, spectrum)
+    gain = with_shaking(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
+    if follows and gain.shakes:
+        still = without_shaking(counts, camera, masked=masked)
+        return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
+    shared = shared_light(counts, camera, masked=masked)
+    if shared is not None:
+        return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
+    zero = None if additive else find_zero(counts, camera, masked=masked)
+    leaks = spectrum is not None and spectrum.correlated
+    if zero is not None and leaks and not zero.flickers:
+        zero = None  # the variance of a pixel is then of its neighbours' light as well
+    wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
+    if wrong is not None:
+        said = offset_said(wrong, camera)
+    else:
+        said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+    if gain.shakes and follows is False:
+        said += ", or set background.drift_correction = true, with which it is followed"
+    excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
+    if wrong is None:
+        return Noise((said,) if said else (), gain.off, excess, spectrum, gain.shakes)
+    messages = [said]
+    moved = replace(camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu)
+    with contextlib.suppress(DataError):  # too dark to tell
+        rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
+        rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))
+        messages += [f"with that offset, {rest.message}"] if rest.message else []
+    return Noise(tuple(messages), True, excess, spectrum)
+
+
+def _filtered(shared: float) -> str:
+    """Say that frames are no independent measurements."""
+    return (
+        f"frames next to each other differ by {shared:.2g} times the variance of those farther "
+        "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
+        "tell the gain, landings are blurred and σ may be too small: record or export raw frames"
+    )
+
+
+def judge_background(
+    movie: Stack, camera: Camera, windows: Windows, *, still: bool, additive: bool
+) -> Noise:
+    """Judge the noise of the background frames; where it is known, of those with the particles."""
+    frames = windows.n_before or (windows.n_after if still else 0)
+    if frames < 2 or not is_lit(windows):
+        return Noise()
+    counts = first_counts(movie, windows, SPECTRUM_FRAMES)
+    light, repeats = measure_frames(counts, camera)
+    good = ~repeats if additive else ~repeats & well_lit(light)
+    return judge_counts(counts[good], camera, masked=windows.masked, additive=additive)
+
+
+def judge_beside(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    span: tuple[int, int],
+    seen: tuple[NDArray[np.int64], FloatArray],
+    used: BoolArray,
+    without: Callable[[int], FloatArray],
+) -> Noise:
+    """Judge the camera by frames in which particles move, from pixels that none comes near.
+
+    Particles that move add to the variance between frames.  Where they are near, pixels are left
+    out; farther away their rings are taken off as they were fitted, and where a fit went astray
+    that adds as well: a number is called wrong only where one seems so with the rings and without.
+
+    Shapes: `seen` (n,), `used` (y, x).
+    """
+    optics = scene.config.optics
+    away = _AWAY * optics.wavelength_nm / optics.na
+    y, x = np.indices(used.shape) * scene.pixel_nm
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    frame, places_nm = seen
+    count = min(_GAIN_FRAMES, span[1] - span[0])
+    while count >= _FEWEST_FRAMES:
+        near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
+        free = used & (near.query(pixels)[0] > away).reshape(used.shape)
+        if free.any() and free.sum() >= _FREE * used.sum():
+            counts = movie.read(span[0], span[0] + count)
+            additive = scene.additive
+            if judge_counts(counts, camera, masked=~free, additive=additive).messages:
+                counts = camera.to_counts(without(count))
+                return judge_counts(counts, camera, masked=~free, additive=additive)
+            return Noise()
+        count //= 2
+    return Noise()
+
+
+@dataclass(frozen=True)
+class Opening:
+    """What the first frames of a landing movie say, and the frames themselves."""
+
+    reader: Reader
+    noise: Noise
+    curve: NoiseCurve
+    window: int
+
+
+def judge_opening(reader: Reader, config: Config) -> Opening:
+    """Judge the noise of a landing movie, and choose how many frames around a step are summed."""
+    additive = config.optics.scheme == "darkfield"
+    with threads(config.compute.workers) as pool:
+        mapper = over_frames(pool, reader.shape)
+        opening, curve, window = judge_window(reader, config, mapper)
+        noise = judge_counts(
+            opening, reader.camera, additive=additive,
+            follows=config.background.follows_pattern, mapper=mapper,
+        )  # fmt: skip
+    if noise.excess is None:
+        ratio = curve.at(window)
+        message = (
+            f"averages of {window} frames differ by {ratio:.2g} times the variance of the light: "
+            "by drift or the laser (set background.drift_correction = true), or by the rings of "
+            "many bright particles; lower background.window_frames, which helps against all"
+        )
+        noise = replace(noise, excess=ExcessNoise(ratio, message))
+    return Opening(reader, noise, curve, window)
+
+
+def judge_window(
+    reader: Reader, config: Config, mapper: Mapper = map
+) -> tuple[NDArray[Any], NoiseCurve, int]:
+    """Choose how many frames around a step are summed.
+
+    Shapes: `opening` (t, y, x).
+    """
+    frames = reader.last - reader.first
+    given = config.background.window_frames
+    needed = 2 * given if given else SHORTEST_MOVIE
+    if frames < needed:
+        windows = (
+            f"two windows of background.window_frames = {given}" if given else "sliding windows"
+        )
+        raise DataError(
+            f"{reader.name}: has {frames} frames, but {windows} before and after each landing take "
+            f"{needed}: record longer"
+            + (", or lower background.window_frames" if given else "")
+            + "; or give the frames before the particles bind as background.frames = [0, N]"
+        )
+    opening = reader.opening(mapper)
+    longest = min(given or longest_window(frames), NOISE_FRAMES // 4)
+    follows = config.background.follows_pattern
+    curve = measure_noise(opening, reader.camera, longest, follows=follows, mapper=mapper)
+    window = given or choose_window(curve, frames)
+    return opening, curve, window
+
+
+def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
+    """Read the first background frames, or those after it where it is known.
+
+    Shapes: result (t, y, x).
+    """
+    start, stop = windows.frames_before if windows.n_before else windows.frames_after
+    return movie.read(start, min(stop, start + most))
+
+
+def is_lit(windows: Windows) -> bool:
+    """Tell whether there is light in the background, beyond the read noise."""
+    used = ~windows.masked
+    light, read = windows.before_e[used], windows.read_variance_before_e2[used]
+    return bool(light.sum() > read.sum())

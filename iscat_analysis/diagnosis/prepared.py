@@ -1,0 +1,36 @@
+"""A movie whose camera, optics and kind are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from typing import Any
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.lines import Lines
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import Opening
+from iscat_analysis.fitting.background_mode import Way
+from iscat_analysis.movie import Stack
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A movie that can be searched."""
+
+    movie: Stack
+    steady: Stack
+    config: Config
+    camera: Camera
+    way: Way
+    lines: Lines | None
+    opening: Opening | None
+    other_kind: str
+    digest: Future[str]
+    summary: Mapping[str, Any]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.movie.shape[1], self.movie.shape[2]

@@ -1,0 +1,36 @@
+"""Whether the stage moves, before anything is searched: what the fixed pattern tells of it."""
+
+from __future__ import annotations
+
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import Opening
+from iscat_analysis.records import FrameSource
+from iscat_analysis.search.sliding import good_frames, measure_motion
+
+_MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-3
+
+
+def followed(config: Config, *, moves: bool) -> Config:
+    """Settle whether the motion of the fixed pattern is divided out."""
+    background = config.background.model_copy(update={"drift_correction": moves})
+    return config.model_copy(update={"background": background})
+
+
+def motion_said(movie: FrameSource, opening: Opening) -> str:
+    """Say that the fixed pattern of a landing movie moves."""
+    if opening.noise.shakes:
+        return "the fixed pattern shakes"
+    reader, length = opening.reader, opening.curve.frames[-1]
+    last = movie.read(max(reader.first, reader.last - 2 * length), reader.last)
+    last = last[good_frames(last, reader.camera)]
+    share = max(
+        measure_motion(counts, reader.camera, min(length, len(counts) // 2))
+        for counts in (reader.opening(), last)
+        if len(counts) >= 2
+    )
+    if not share > _MATTERS:
+        return ""
+    return (
+        f"the fixed pattern moves: averages of {length} frames differ by {1 + share:.3g} times "
+        "what they would otherwise"
+    )

@@ -1,0 +1,1 @@
+"""What does one event say?  From a candidate to its row, with errors and bounds."""

@@ -1,0 +1,184 @@
+"""Finished parts of a movie on disk, so that an interrupted run can go on where it stopped."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.files import whole_file
+from iscat_analysis.records import Clip, EventView, FloatArray, Trace
+
+GOES_ON = "what was finished is kept, and the same command goes on from there"
+"""What an interrupt says where it is so."""
+
+_NO_TRACE = (0.0,) * 9
+_NO_CLIP = (0,) * 4
+
+
+class Shelf:
+    """Tables and arrays of finished parts on disk."""
+
+    def __init__(
+        self,
+        folder: Path | None,
+        config: Config,
+        identity: str,
+        shape: tuple[int, int],
+        span: tuple[int, int],
+        camera: Camera,
+    ) -> None:
+        self._folder = folder if identity else None
+        self.kept = 0
+        settings = config.model_copy(
+            update={"compute": config.compute.model_copy(update={"workers": 1})}
+        )
+        text = json.dumps(
+            [version("iscat-analysis"), identity, shape, span, config_to_toml(settings)]
+        )
+        digest = hashlib.sha256(text.encode())
+        for value in (camera.gain_e_per_adu, camera.offset_adu, camera.read_noise_e):
+            digest.update(np.asarray(value, dtype=np.float64).tobytes())
+        self._key = digest.hexdigest()[:32]
+
+    def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
+        """Give the table and the arrays of a finished part, or None."""
+        if self._folder is None:
+            return None
+        table_path, path = self._paths(number)
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                found = pd.read_parquet(table_path), dict(data)
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+            return None
+        self.kept += 1
+        return found
+
+    def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
+        """Keep a finished part; a full disk costs the resumption, not the run."""
+        if self._folder is None:
+            return
+        table_path, path = self._paths(number)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            table.to_parquet(table_path, index=False)
+            with whole_file(path) as partial, partial.open("wb") as file:
+                np.savez(file, **arrays)
+            self.kept += 1
+        except OSError:
+            self._folder = None
+
+    def _paths(self, number: int) -> tuple[Path, Path]:
+        folder = self._folder or Path()
+        stem = f"{self._key}-{number:05d}"
+        return folder / f"{stem}.parquet", folder / f"{stem}.npz"
+
+
+def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
+    """Put images into arrays that a file holds."""
+    flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
+    traces = [v.trace for v in views]
+    clips = [v.clip for v in views]
+    return {
+        "traces": np.concatenate([np.empty(0), *(t.contrast for t in traces if t)]),
+        "trace_marks": np.array([_NO_TRACE if t is None else _marks(t) for t in traces]),
+        "clips": np.concatenate(
+            [np.empty(0, dtype=np.float32), *(c.contrast.ravel() for c in clips if c)]
+        ),
+        "clip_frames": np.array([n for c in clips if c for n in c.frames], dtype=np.int64),
+        "clip_marks": np.array(
+            [_NO_CLIP if c is None else (*c.contrast.shape, c.window_frames) for c in clips]
+        ),
+        "images": np.concatenate(flat or [np.empty((3, 0))], axis=1),
+        "corners": np.array([(v.row_px, v.column_px) for v in views]).reshape(-1, 2),
+        "sizes": np.array([v.contrast.shape for v in views]).reshape(-1, 2),
+    }
+
+
+def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
+    """Take images out of such arrays."""
+    views, at = [], 0
+    traces, clips = _traces(data), _clips(data)
+    for i, (row, column) in enumerate(data["corners"]):
+        rows, columns = (int(n) for n in data["sizes"][i])
+        stack = data["images"][:, at : at + rows * columns].reshape(3, rows, columns)
+        at += rows * columns
+        views.append(
+            EventView(
+                i, int(row), int(column), stack[0], stack[1], stack[2],
+                trace=next(traces), clip=next(clips),
+            )
+        )  # fmt: skip
+    return tuple(views)
+
+
+def _marks(trace: Trace) -> tuple[float, ...]:
+    """Give the numbers of a trace beside its contrasts."""
+    return (
+        trace.contrast.size, trace.first, trace.sigma, trace.frame, trace.half_width,
+        *trace.used, trace.before, trace.after,
+    )  # fmt: skip
+
+
+def _traces(data: Mapping[str, Any]) -> Iterator[Trace | None]:
+    at = 0
+    for size, first, sigma, frame, half_width, start, stop, before, after in data["trace_marks"]:
+        end = at + int(size)
+        yield None if end == at else Trace(
+            int(first), data["traces"][at:end], float(sigma), int(frame), int(half_width),
+            (int(start), int(stop)), float(before), float(after),
+        )  # fmt: skip
+        at = end
+
+
+def _clips(data: Mapping[str, Any]) -> Iterator[Clip | None]:
+    at, frame = 0, 0
+    for images, rows, columns, window in data["clip_marks"].tolist():
+        end, stop = at + images * rows * columns, frame + images
+        yield None if not images else Clip(
+            tuple(data["clip_frames"][frame:stop].tolist()), window,
+            data["clips"][at:end].reshape(images, rows, columns),
+        )  # fmt: skip
+        at, frame = end, stop
+
+
+def partial_folder(folder: Path) -> Path:
+    """Name the folder of an output folder's finished chunks: hidden, beside it."""
+    return folder.with_name(f".{folder.name}.partial")
+
+
+def saying(stop: KeyboardInterrupt, what: str) -> KeyboardInterrupt:
+    """Add to what an interrupt says."""
+    return KeyboardInterrupt("; ".join(filter(None, [str(stop), what])))
+
+
+@contextmanager
+def parts_kept(folder: Path | None) -> Iterator[None]:
+    """Say in an interrupt that finished parts are kept, when all of them are."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if folder is None or not any(folder.glob("*.npz")):
+            raise
+        raise saying(stop, GOES_ON) from None
+
+
+def is_resumable(folder: Path) -> bool:
+    """Whether a folder holds what an interrupted run left, and its chunks, if it finished any."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        goes_on = partial_folder(folder).is_dir() or not summary["events"]
+        return bool(summary["interrupted"]) and goes_on
+    except (OSError, ValueError, KeyError, TypeError):
+        return False

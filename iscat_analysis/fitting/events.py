@@ -1,0 +1,109 @@
+"""The records of an event, and the verdict on it, however its frames were told apart.
+
+A candidate (`Candidate`, or the `Peak` and `Step` of a landing movie) is `Fitted` while its
+neighbours are still being found.  Once they are known it is judged, and is an `Event`: all that its
+row in ``fits.csv`` and its images are made of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from iscat_analysis.fitting.regions import Region
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.posterior import sample_posterior
+from iscat_analysis.inference.prior import Prior
+from iscat_analysis.pieces.regions import saturated_near
+from iscat_analysis.records import Candidate, FitResult, PosteriorResult, Status, Windows, verdict
+from iscat_analysis.search.residue import Described
+
+PlaceAndMass = tuple[float, float, float, float]
+"""x, y, z [nm] and mass [kDa]."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One fitted particle: where it was searched, what was fitted, and the likelihood used."""
+
+    region: Region
+    fit: FitResult
+    likelihood: Likelihood
+
+    @property
+    def candidate(self) -> Candidate:
+        """The estimate, as the start of another fit."""
+        pixel = self.likelihood.grid.pixel_nm
+        return Candidate(
+            self.fit.x_nm / pixel, self.fit.y_nm / pixel, self.fit.z_nm, self.fit.mass_kda, self.snr
+        )
+
+    @property
+    def place(self) -> PlaceAndMass:
+        """Where it is, and its mass."""
+        return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
+
+    @property
+    def snr(self) -> float:
+        """√(2 Δℓ) against no particle."""
+        return self.fit.snr
+
+    @property
+    def described(self) -> Described:
+        """What the fit explains, and what it leaves over."""
+        return Described.of(self.snr, self.fit.chi2_reduced, self.likelihood.n_pixels)
+
+
+@dataclass(frozen=True)
+class Event(Fitted):
+    """One particle, fitted and judged."""
+
+    windows: Windows
+    flags: tuple[Status, ...]
+    frame: int
+    n_before: int
+    n_after: int
+    sign: int = 1
+    half_width: int | None = None
+
+
+def remarks(
+    scene: Scene,
+    fitted: Fitted,
+    windows: Windows,
+    *,
+    sidelobe: bool,
+    too_close: bool,
+    poor_fit: bool = False,
+) -> tuple[Status, ...]:
+    """Add what the surroundings of a particle say of its fit."""
+    fit, region = fitted.fit, fitted.region
+    corner = region.rows[0], region.columns[0]
+    saturated = saturated_near(windows.saturated, fit.x_nm, fit.y_nm, scene.pixel_nm, corner=corner)
+    said = (
+        (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
+        (too_close, Status.TOO_CLOSE), (poor_fit, Status.POOR_FIT),
+    )  # fmt: skip
+    return verdict([*fit.flags, *(flag for true, flag in said if true)])[1]
+
+
+def standing_out(events: Sequence[Event]) -> Sequence[Event]:
+    """Keep the events on which nothing is to be remarked."""
+    return [event for event in events if not event.flags] or events
+
+
+def posterior_of(
+    scene: Scene, event: Event, number: int, *, stopped: Callable[[], bool] = lambda: False
+) -> PosteriorResult:
+    """Sample the posterior of an event."""
+    settings = scene.config.posterior
+    return sample_posterior(
+        event.likelihood,
+        event.fit,
+        walkers=settings.walkers,
+        steps=settings.steps,
+        seed=scene.config.compute.seed + number,
+        prior=Prior(settings.priors),
+        stopped=stopped,
+    )

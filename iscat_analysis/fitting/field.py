@@ -1,0 +1,389 @@
+"""Detection and fitting over a whole field, in turns.
+
+What the fits explain is taken off the image before it is searched again, so a side lobe never
+counts as a particle and a faint neighbour is not lost.  What a poor fit leaves over conceals its
+neighbours; where it is they that it lacks, they are tried together.  Every fit sees its neighbours'
+signal as part of its background, and the laser power is estimated again with all particles
+accounted for.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from iscat_analysis.camera.background import refine_power
+from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, remarks
+from iscat_analysis.fitting.regions import (
+    Region,
+    noise_cumulants,
+    photons_scale,
+    region_around,
+    region_likelihood,
+    search_likelihood,
+)
+from iscat_analysis.fitting.scene import SPREAD_NM, Scene, search_both
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    Candidate,
+    FloatArray,
+    Progress,
+    Status,
+    Windows,
+    silent,
+)
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden
+from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_particles
+
+MAX_ROUNDS = 8
+"""Rounds of search; each takes the particles found so far off the image."""
+
+_SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
+_MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
+_TRIED = 0.1  # share of the χ² in excess that a particle explains which is tried among others
+_SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
+_AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
+_DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
+
+
+def fit_field(
+    scene: Scene,
+    windows: Windows,
+    *,
+    starts: Sequence[Candidate] = (),
+    excess_noise: ExcessNoise | None = None,
+    pool: ThreadPoolExecutor,
+    progress: Progress = silent,
+) -> tuple[tuple[Event, ...], Windows]:
+    """Find and fit every particle in a field."""
+    events: list[Fitted] = []
+    fresh, doubtful = list(starts), list[Candidate]()
+    for number in range(MAX_ROUNDS):
+        progress("detect", number, MAX_ROUNDS)
+        if number or not fresh:
+            fresh, doubtful = search_field(scene, windows, events, excess_noise)
+        if not fresh and (number or not starts):
+            break
+        events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
+        windows = _refined(scene, windows, events)
+    events, windows = _settled(scene, windows, events, pool)
+    trial = None if starts else _with_concealed(scene, windows, events, excess_noise, pool)
+    if trial is not None:
+        events, windows = trial
+        fresh, doubtful = search_field(scene, windows, events, excess_noise)
+        if fresh:  # what was too faint to be told while its neighbours were not described
+            events = _fit_all(
+                scene, windows, [*(e.candidate for e in events), *fresh], events, pool
+            )
+            events, windows = _settled(scene, windows, events, pool)
+            _, doubtful = search_field(scene, windows, events, excess_noise)
+    least = _AS_FOUND * scene.templates.threshold
+    kept = [e for e in events if e.snr > least and _wanted(scene, e)]
+    while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
+        events = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
+        kept = [e for e in events if e.snr > least and _wanted(scene, e)]
+    lobes: list[Fitted] = []
+    if doubtful and not starts:
+        lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
+        lobes = [e for e in lobes if e.snr > least and _wanted(scene, e)]
+    judged = _judged(scene, windows, kept, lobes)
+    progress("detect", MAX_ROUNDS, MAX_ROUNDS)
+    return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
+
+
+def _settled(
+    scene: Scene, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
+) -> tuple[list[Fitted], Windows]:
+    """Fit everything with everything else in place, until fits near each other hardly change."""
+    for sweep in range(_MOST_SWEEPS if events else 0):
+        last = _without_doubles(events, scene)
+        events = _fit_all(scene, windows, [e.candidate for e in last], last, pool)
+        windows = _refined(scene, windows, events)
+        if sweep + 1 >= _SWEEPS and _is_settled(last, events, scene.roi_px / 2):
+            break
+    return events, windows
+
+
+def _with_concealed(
+    scene: Scene,
+    windows: Windows,
+    known: list[Fitted],
+    excess_noise: ExcessNoise | None,
+    pool: ThreadPoolExecutor,
+) -> tuple[list[Fitted], Windows] | None:
+    """Add the particles that poor fits conceal, where it is their absence that makes these poor.
+
+    Of several particles that are missing around a known one, each explains but a part of what its
+    fit leaves over, and none is told from a misfit.  So candidates that explain some of it are
+    tried together.  Those stay that explain most of what is left with all the others in place.
+    """
+    trial, power = known, windows
+    for _ in range(MAX_ROUNDS):
+        if not any(Status.POOR_FIT in event.fit.flags for event in trial):
+            break
+        fresh, _ = search_field(scene, power, trial, excess_noise, explains=_TRIED)
+        if not fresh:
+            break
+        both = _fit_all(scene, power, [*(e.candidate for e in trial), *fresh], trial, pool)
+        trial = _fit_all(scene, power, [e.candidate for e in both], both, pool)
+        power = _refined(scene, power, trial)
+    while len(trial) > len(known):
+        trial, power = _settled(scene, power, trial, pool)
+        kept = _tenable(scene, trial, known)
+        if len(kept) == len(trial):
+            return (trial, power) if len(trial) > len(known) else None
+        trial = kept
+    return None
+
+
+def _tenable(scene: Scene, trial: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
+    """Leave out the added ones that explain less than what is left, the worst of each place."""
+    places, earlier = (
+        np.array([(e.candidate.x_px, e.candidate.y_px) for e in events])
+        for events in (trial, known)
+    )
+    apart = np.hypot(*(places[:, None] - places).T)
+    near = apart <= _reach_px(scene)
+    added = np.ones(len(trial), dtype=bool)
+    added[np.hypot(*(earlier[:, None] - places).T).argmin(axis=0)] = False
+    left = np.array([_chi2_left(event) for event in trial])
+    snr2 = np.array([event.snr**2 for event in trial])
+    # without this one as much more would be left
+    most = np.where(near, left, 0.0).max(axis=1)
+    share = np.where(added, snr2 / np.maximum(snr2 + most, 1e-300), 1.0)
+    worst = np.where(near, share, 1.0).min(axis=1)
+    leave = (share < EXPLAINS) & (share <= worst)
+    return [event for event, out in zip(trial, leave, strict=True) if not out]
+
+
+def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted]) -> FloatArray:
+    """Signal of all fitted particles over the field.
+
+    Shapes: result (y, x).
+    """
+    total = np.zeros(shape)
+    for event in events:
+        add_signal(scene, event.place, Region((0, shape[0]), (0, shape[1])), total)
+    return total
+
+
+def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatArray) -> None:
+    """Add a particle's signal to the pixels of a region that it reaches.
+
+    Shapes: `total` (y, x).
+    """
+    x_nm, y_nm, _, _ = place
+    spans = []
+    for centre, (low, high) in ((y_nm, region.rows), (x_nm, region.columns)):
+        first = max(low, math.ceil((centre - SPREAD_NM) / scene.pixel_nm))
+        spans.append((first, min(high, math.floor((centre + SPREAD_NM) / scene.pixel_nm) + 1)))
+    rows, columns = spans
+    if rows[0] >= rows[1] or columns[0] >= columns[1]:
+        return
+    grid = PixelGrid.region(rows, columns, scene.pixel_nm)
+    inside = (
+        slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
+        slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
+    )
+    total[inside] += scene.wide.image(grid, *place)
+
+
+def search_field(
+    scene: Scene,
+    windows: Windows,
+    events: Sequence[Fitted] = (),
+    excess_noise: ExcessNoise | None = None,
+    *,
+    explains: float = EXPLAINS,
+) -> tuple[list[Candidate], list[Candidate]]:
+    """Find new particles, and what may be but the side lobe of a known one."""
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+    explained = scene.left(total_signal(scene, shape, events))
+    likelihood = search_likelihood(scene, windows, explained)
+    found = find_particles(
+        likelihood,
+        scene.templates,
+        search_both(scene.config.detection),
+        roi_px=scene.roi_px,
+        explained=explained,
+        excess_noise=excess_noise,
+        known=[(e.candidate.x_px, e.candidate.y_px) for e in events],
+        cumulants=noise_cumulants(scene, windows, likelihood),
+    )
+    near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
+    fresh: list[Candidate] = []
+    doubtful: list[Candidate] = []
+    for candidate in found:
+        size = max(
+            (_misfit(candidate, event, scene, near, explains) for event in events),
+            default=0.0,
+        )
+        size = max(size, EXCEEDS * candidate.beside)
+        if abs(candidate.snr) > size:
+            fresh.append(candidate)
+        elif not is_hidden(candidate.snr, size):
+            doubtful.append(candidate)
+    return fresh, doubtful
+
+
+def _misfit(
+    candidate: Candidate, event: Fitted, scene: Scene, near_px: float, explains: float
+) -> float:
+    """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
+    here = event.candidate
+    distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
+    if distance <= near_px:
+        return math.inf
+    return math.sqrt(explains * _excess(event)) if distance <= _reach_px(scene) else 0.0
+
+
+def _reach_px(scene: Scene) -> float:
+    """How far from a particle a poor fit leaves something over [pixels]."""
+    # In dark field a wrong background level leaves residuals beyond the fitted region.
+    return (2 if scene.additive else 0.75) * scene.roi_px
+
+
+def _excess(event: Fitted) -> float:
+    """Give the χ² that a poor fit leaves over."""
+    return _chi2_left(event) if Status.POOR_FIT in event.fit.flags else 0.0
+
+
+def _chi2_left(event: Fitted) -> float:
+    """Give the χ² of a fit above its expectation, which may be noise."""
+    return max(0.0, event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
+
+
+def _fit_all(
+    scene: Scene,
+    windows: Windows,
+    candidates: Sequence[Candidate],
+    events: Sequence[Fitted],
+    pool: ThreadPoolExecutor,
+    *,
+    first: int = 0,
+) -> list[Fitted]:
+    """Fit candidates with the current `events` but itself in its background.
+
+    Candidate i is event ``first + i``, where there is one of that number.
+    """
+    height = scene.config.particle.height_nm
+    nominal = scene.model.material.mass_kda
+    free = FREE_PARAMETERS[scene.mode]
+    taken: FloatArray | None = None
+    if scene.lines is not None:
+        shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+        taken = scene.lines.taken(total_signal(scene, shape, events))
+
+    starts = [
+        replace(
+            start,
+            mass_kda=start.mass_kda if "mass_kda" in free else nominal,
+            z_nm=start.z_nm if "z_nm" in free else height,
+        )
+        for start in candidates
+    ]
+    regions = [region_around(scene.roi_px, windows.after_e.shape, start) for start in starts]
+    beside = [np.zeros(region.shape) for region in regions]
+
+    def drawn(number: int) -> list[tuple[int, FloatArray]]:
+        """Draw an event in the regions that it reaches; its field at its height is made once."""
+        images = []
+        for index, region in enumerate(regions):
+            image = np.zeros(region.shape)
+            if number != first + index:
+                add_signal(scene, events[number].place, region, image)
+            if image.any():
+                images.append((index, image))
+        return images
+
+    for images in pool.map(drawn, range(len(events))):
+        for index, image in images:
+            beside[index] += image
+
+    def one(index: int) -> Fitted | None:
+        start, region, others = starts[index], regions[index], beside[index]
+        if taken is not None:
+            others = (1 + others) / taken[region.slices] - 1
+        likelihood = region_likelihood(scene, windows, region, others)
+        if likelihood.n_pixels < 0.5 * others.size:
+            return None
+        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)
+        return Fitted(region, fit, likelihood)
+
+    return [event for event in pool.map(one, range(len(candidates))) if event is not None]
+
+
+def _refined(scene: Scene, windows: Windows, events: Sequence[Fitted]) -> Windows:
+    if not scene.config.background.power_normalization:
+        return windows
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+    signal = scene.left(total_signal(scene, shape, events))
+    if scene.additive:
+        signal = signal * photons_scale(scene, windows)
+    return refine_power(windows, signal, additive=scene.additive)
+
+
+def _wanted(scene: Scene, event: Fitted) -> bool:
+    """Whether the fitted contrast has the polarity that is reported."""
+    sign = scene.config.detection.sign
+    return sign == 0 or scene.additive or sign * event.fit.contrast > 0
+
+
+def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: float) -> bool:
+    """Whether another sweep would change little of fits that are near each other."""
+    if len(before) != len(after) or not after:
+        return not after
+    places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in after])
+    apart = np.hypot(*(places[:, None] - places).T) + 2 * near_px * np.eye(len(places))
+    moved = np.array([a.snr - b.snr for a, b in zip(before, after, strict=True)])
+    return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
+
+
+def _without_doubles(events: Sequence[Fitted], scene: Scene) -> list[Fitted]:
+    """Keep the better of two fits that fell onto one particle."""
+    kept: list[Fitted] = []
+    for event in sorted(events, key=lambda e: -e.snr):
+        here = event.candidate
+        if all(
+            math.hypot(here.x_px - k.candidate.x_px, here.y_px - k.candidate.y_px)
+            * scene.pixel_nm > min(_DUPLICATE_PX * scene.pixel_nm, 150.0)
+            for k in kept
+        ):  # fmt: skip
+            kept.append(event)
+    return kept
+
+
+def _judged(
+    scene: Scene, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
+) -> list[Event]:
+    """Add the verdicts that need the neighbourhood: saturation, crowding, side lobes."""
+    judged = []
+    limit = scene.config.detection.min_separation_nm
+    for number, one in enumerate((*fitted, *lobes)):
+        x, y = one.fit.x_nm, one.fit.y_nm
+        crowded = any(
+            other is not one and math.hypot(other.fit.x_nm - x, other.fit.y_nm - y) < limit
+            for other in fitted
+        )
+        near = (
+            other.described
+            for other in fitted
+            if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
+            < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
+        )
+        lobe = number >= len(fitted) or one.described.is_dwarfed(near)
+        own = windows.cut(one.region.slices)
+        flags = remarks(scene, one, own, sidelobe=lobe, too_close=crowded)
+        judged.append(
+            Event(
+                one.region, one.fit, one.likelihood, own, flags,
+                windows.frames_after[0], windows.n_before, windows.n_after,
+            )
+        )  # fmt: skip
+    return judged

@@ -1,0 +1,105 @@
+"""Which frames are background and which are fitted, and their sums."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.background import Check, measure_windows
+from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import FrameSource, Progress, Windows, silent
+from iscat_analysis.search.sliding import cut_off
+from iscat_analysis.units import count
+
+
+def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
+    """Which frames are background and which are fitted."""
+    before = config.background.recorded
+    if config.background.method == "known":
+        before = None
+    elif before is None:
+        raise ConfigError(
+            "which frames come before the particles? give them as "
+            'background.frames = [0, 200], or a known level with background.method = "known"'
+            f"{_without_frames_before(config)}"
+        )
+    start = before[1] if before else 0
+    after = fitted_frames(movie, config, before)
+    if after[1] <= after[0]:
+        raise DataError(
+            f"{movie.name}: has {count(movie.shape[0], 'frame')} and the background takes "
+            f"{start} of them, so none is left to fit; change background.frames"
+            f"{_without_frames_before(config)}"
+        )
+    return before, after
+
+
+def _without_frames_before(config: Config) -> str:
+    """Name the backgrounds that need no frames before the particles, in the mode of a movie."""
+    if config.optics.scheme == "darkfield":
+        return ""
+    if config.fit.mode == "track":
+        return (
+            '; without such frames background.method = "tracks" learns the background with the '
+            'tracks, and background.frames = "all" takes the median of all frames, or with '
+            'background.method = "fixed" their mean'
+        )
+    return '; without such frames background.method = "sliding" takes those before each landing'
+
+
+def fitted_frames(
+    movie: FrameSource, config: Config, before: tuple[int, int] | None = None
+) -> tuple[int, int]:
+    """Which frames are looked at: ``fit.frames``, or all after the background."""
+    first, last = config.fit.frames or (before[1] if before else 0, movie.shape[0])
+    if last > movie.shape[0]:
+        raise DataError(
+            f"{movie.name}: has {count(movie.shape[0], 'frame')}, but fit.frames asks for "
+            f"{first}:{last}; change fit.frames"
+        )
+    return first, last
+
+
+def tracked_frames(movie: Stack, config: Config) -> int:
+    """Count the frames in which mode ``track`` looks for particles."""
+    first, last = fitted_frames(movie, config, config.background.recorded)
+    return max(last - first, 0)
+
+
+def checked(movie: FrameSource, camera: Camera) -> Check:
+    """Give what refuses the impossible counts of a movie."""
+    return partial(check_counts, name=movie.name, camera=camera)
+
+
+def measured_windows(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    before: tuple[int, int] | None,
+    after: tuple[int, int],
+    *,
+    progress: Progress = silent,
+) -> Windows:
+    """Sum the background and the frames after it, as configured."""
+    background, refuse = config.background, checked(movie, camera)
+
+    def check(counts: NDArray[Any], first: int) -> None:
+        whole = ~cut_off(counts, camera)
+        if whole.all():
+            refuse(counts, first)
+            return
+        for number in np.flatnonzero(whole).tolist():
+            refuse(counts[number : number + 1], first + number)
+
+    return measure_windows(
+        movie, camera, before, after,
+        median=background.method == "median", level_e=background.level_e,
+        power_normalization=background.power_normalization,
+        check=refuse if config.optics.scheme == "darkfield" else check, progress=progress,
+    )  # fmt: skip

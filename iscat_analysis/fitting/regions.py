@@ -1,0 +1,143 @@
+"""Pixels of a field: which ones, and the likelihood of their counts before and after."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis.camera.background import smooth_background
+from iscat_analysis.config import Config
+from iscat_analysis.fitting.scene import Scene, is_counted
+from iscat_analysis.inference.counts import MEAN, counts_likelihood
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.collected import photons_per_intensity
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pieces.setups import darkfield_photons
+from iscat_analysis.records import Candidate, FloatArray, Windows
+
+
+@dataclass(frozen=True)
+class Region:
+    """Half-open ranges of full-frame pixels."""
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the region in a full frame."""
+        return slice(*self.rows), slice(*self.columns)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns it has."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+
+def region_around(side: int, shape: tuple[int, ...], start: Candidate) -> Region:
+    """Place the square that is fitted."""
+    sides = []
+    for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
+        first = round(centre - (side - 1) / 2)
+        sides.append((max(first, 0), min(first + side, size)))
+    return Region(sides[0], sides[1])
+
+
+def field_likelihood(scene: Scene, windows: Windows) -> Likelihood:
+    """Likelihood of the whole field."""
+    rows, columns = windows.after_e.shape
+    return region_likelihood(scene, windows, Region((0, rows), (0, columns)), None)
+
+
+def contrast_image(scene: Scene, windows: Windows) -> FloatArray:
+    """Give what the frames after show and those before do not.
+
+    Shapes: result (y, x).
+    """
+    if scene.additive:
+        return windows.after_e - windows.power_ratio * windows.before_e
+    return field_likelihood(scene, windows).measured_signal()
+
+
+def search_likelihood(scene: Scene, windows: Windows, explained: FloatArray) -> Likelihood:
+    """Likelihood of the whole field with weights that no particle may have made.
+
+    Where the counts are few, weights made of those before alone are large where these are low by
+    chance, and there the particles seem to have landed.  Counts before and after together say as
+    much of the noise and nothing of the change.
+
+    Shapes: `explained` (y, x).
+    """
+    whole = field_likelihood(scene, windows)
+    if not scene.additive or not windows.n_before:
+        return whole
+    counts, level, scale, extra = whole.data
+    ratio = windows.power_ratio
+    read = windows.read_variance_after_e2, windows.read_variance_before_e2
+    both = windows.before_e + (counts - extra) - scale * explained
+    noise = (read[0] + read[1]) / (1 + ratio) ** 2
+    steady = smooth_background(both / (1 + ratio), noise, windows.masked)
+    factor = scene.background_variance
+    variance = steady * ratio * (1 + ratio * factor) + read[0] + ratio**2 * read[1]
+    other = np.where(whole.used, variance - level, 0.0)
+    return replace(whole, data=np.stack([counts - extra + other, level, scale, other]))
+
+
+def region_likelihood(
+    scene: Scene, windows: Windows, region: Region, others: FloatArray | None
+) -> Likelihood:
+    """Likelihood of a region, with the signal of other particles as part of its background.
+
+    Shapes: `others` (rows, columns).
+    """
+    cut = region.slices
+    config = scene.config
+    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+    model = scene.model if grid.diagonal_nm <= scene.model.reach_nm else scene.wide
+    before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
+    return counts_likelihood(
+        model, grid, before, after, windows.power_ratio,
+        background=scene.background_variance,
+        use_conditional=_uses_conditional(config),
+        scale_e=photons_scale(scene, windows) if scene.additive else None,
+        others=others,
+        read_variance_before_e2=windows.read_variance_before_e2[cut],
+        read_variance_after_e2=windows.read_variance_after_e2[cut],
+        masked=masked,
+    )  # fmt: skip
+
+
+def noise_cumulants(
+    scene: Scene, windows: Windows, likelihood: Likelihood
+) -> tuple[FloatArray, FloatArray] | None:
+    """Third and fourth cumulants of the counts against their background.
+
+    Notes
+    -----
+    Of a Poisson count μ every cumulant is μ; of a − ρ b the k-th is μ_a + (−ρ)ᵏ μ_b.  Read noise
+    has none, and a median of frames has hardly any.
+    """
+    if not scene.additive:
+        return None
+    _, level, _, extra = likelihood.data
+    factor = scene.background_variance
+    ratio = windows.power_ratio
+    read = windows.read_variance_after_e2 + ratio**2 * windows.read_variance_before_e2
+    light = np.maximum(level + extra - read, 0.0) / (1 + ratio * factor)
+    counted = ratio if factor == MEAN else 0.0
+    return light * (1 - counted**2), light * (1 + counted**3)
+
+
+def photons_scale(scene: Scene, windows: Windows) -> float:
+    """Scale of the signal in dark field."""
+    photons = darkfield_photons(scene.config.particle)
+    per_frame = photons_per_intensity(scene.model, photons, scene.pixel_nm)
+    return per_frame * windows.power_ratio * max(windows.n_before, 1)
+
+
+def _uses_conditional(config: Config) -> bool:
+    """Whether the fits condition on the sum of counts before and after."""
+    if config.fit.likelihood == "auto":
+        return config.optics.scheme != "darkfield" and is_counted(config)
+    return config.fit.likelihood == "conditional"

@@ -1,0 +1,136 @@
+"""What is found in a movie: from judged events to the table and the views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import pandas as pd
+
+from iscat_analysis.bounds.classical import ComplexArray
+from iscat_analysis.bounds.quantum import quantum_information
+from iscat_analysis.camera.drift import Trajectory
+from iscat_analysis.fitting.events import Event, Fitted
+from iscat_analysis.fitting.regions import photons_scale
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.optics.collected import collected_area_nm2
+from iscat_analysis.pieces.regions import line_of, lines_from, numbered
+from iscat_analysis.records import (
+    FRAME_COLUMN,
+    Clip,
+    EventView,
+    FloatArray,
+    PosteriorResult,
+    Trace,
+    Windows,
+)
+from iscat_analysis.search.empty import EmptySpread
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Which frames of a movie stand against which."""
+
+    frames_before: tuple[int, int]
+    frames_after: tuple[int, int]
+    power_ratio: float
+    power: FloatArray
+    masked_pixels: int
+
+    @classmethod
+    def of(cls, windows: Windows) -> Compared:
+        """Describe the sums of two ranges of frames."""
+        return cls(
+            windows.frames_before, windows.frames_after, windows.power_ratio, windows.power,
+            int(windows.masked.sum()),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What the tracks of a movie are described with, beside their rows."""
+
+    windows: Windows
+    parts: tuple[Windows, ...] = ()
+    masses: pd.DataFrame | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """What was found in a movie, whichever frames stand against which."""
+
+    scene: Scene
+    fits: pd.DataFrame
+    views: tuple[EventView, ...]
+    image: FloatArray
+    compared: Compared
+    heading: str
+    summary: Mapping[str, Any]
+    repeats: tuple[FloatArray, ...] = ()
+    empty: EmptySpread | None = None
+    followed: Followed | None = None
+    trajectory: Trajectory | None = None
+    optics: Mapping[str, Any] = field(default_factory=dict)
+    interrupted: bool = False
+
+
+def collected_photons(scene: Scene, event: Event) -> float:
+    """Scattered photons that the pupil collected from one particle in the frames after."""
+    windows = event.windows
+    area = collected_area_nm2(scene.model, event.fit.z_nm, event.fit.mass_kda)
+    if scene.additive:
+        per_pixel = photons_scale(scene, windows)
+    else:
+        per_pixel = windows.power_ratio * float(windows.before_e[~windows.masked].mean())
+    return per_pixel * area / scene.pixel_nm**2
+
+
+def lines_of(
+    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+) -> list[dict[str, Any]]:
+    """Make the lines of ``fits.csv``."""
+    heights = {event.fit.estimate[2] for event in events}
+    known = {}
+    if len(heights) == 1 and not scene.model.is_measured:  # of heights that are not fitted
+        (height,) = heights
+        known[height] = quantum_information(scene.model, height)
+    return list(mapper(lambda event: _line(scene, event, known), events))
+
+
+def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:
+    line = line_of(
+        event.likelihood, event.fit, collected_photons(scene, event), flags=event.flags,
+        frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
+        quantum=quantum.get(event.fit.estimate[2]),
+    )  # fmt: skip
+    return line if event.half_width is None else line | {FRAME_COLUMN: event.half_width}
+
+
+def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
+    """Make a table of events whose frames are given."""
+    return numbered(lines_from(lines_of(scene, events)), range(len(events)))
+
+
+def view_of(
+    number: int,
+    fitted: Fitted,
+    *,
+    posterior: PosteriorResult | None = None,
+    trace: Trace | None = None,
+    clip: Clip | None = None,
+) -> EventView:
+    """Images of one event for the report."""
+    likelihood, theta = fitted.likelihood, fitted.fit.theta
+    unit = likelihood.data[2] if not likelihood.model.rho else 1.0
+    return EventView(
+        event=number,
+        row_px=fitted.region.rows[0],
+        column_px=fitted.region.columns[0],
+        contrast=likelihood.measured_signal() * unit,
+        model=likelihood.signal(theta) * unit,
+        residual=likelihood.residuals(theta),
+        posterior=posterior,
+        trace=trace,
+        clip=clip,
+    )

@@ -1,0 +1,58 @@
+"""What a run of the main job tells and keeps beside its result: words, progress, times, parts."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from iscat_analysis.fitting.compilation import Compilation
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.places import Place
+from iscat_analysis.records import Analysis, Progress
+
+Notify = Callable[[str], None]
+
+
+def unheard(text: str) -> None:
+    """Tell nobody."""
+
+
+class Clock:
+    """Seconds since the last lap, by name."""
+
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.seconds: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        """Book the time since the last lap under a name."""
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run."""
+
+    notify: Notify
+    progress: Progress
+    compilation: Compilation
+    partial: Path | None
+    place: Place
+    inject: int
+    begin_report: Callable[[Analysis], None]
+    clock: Clock = field(default_factory=Clock)
+    warnings: list[str] = field(default_factory=list)
+
+    def tell(self, text: str) -> None:
+        """Tell the user something that belongs to the result, and keep it."""
+        self.warnings.append(text)
+        self.notify(text)
+
+    def warm_up(self, scene: Scene) -> None:
+        """Load the compiled kernels of fits, or compile them."""
+        compile_kernels(scene.model, self.compilation.needs)

@@ -1,0 +1,186 @@
+"""What a configuration makes of a movie: models, matched filter, threshold."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera.spectrum import NoiseSpectrum
+from iscat_analysis.config import Config, Detection
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.moving_focus import MovingFocus, refuse_moving_focus
+from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
+from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.stamp import margin_nm
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray
+from iscat_analysis.search.sliding import CORRELATION
+from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templates
+
+SPREAD_NM = 10_000.0
+"""Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
+
+
+_VARIANCE_OF_BACKGROUND = {
+    "fixed": MEAN, "sliding": MEAN, "tracks": MEAN, "median": MEDIAN, "known": KNOWN,
+}  # fmt: skip
+"""Variance of a measured background over that of the mean of its frames."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a configuration fixes for every field of a movie: model, templates, scale."""
+
+    config: Config
+    model: ForwardModel
+    wide: ForwardModel
+    templates: Templates
+    mode: str
+    searches: int = 1
+    lines: Lines | None = None
+    moving: tuple[MovingFocus, MovingFocus] | None = None
+
+    def model_at(self, frame: int) -> ForwardModel:
+        """Give the model for fitted regions at a frame of the movie."""
+        return self.model if self.moving is None else self.moving[0].at(frame)
+
+    def wide_at(self, frame: int) -> ForwardModel:
+        """Give the model for signals far away at a frame of the movie."""
+        return self.wide if self.moving is None else self.moving[1].at(frame)
+
+    @property
+    def pixel_nm(self) -> float:
+        """Pixel side [nm]."""
+        return _pixel_nm(self.config)
+
+    @property
+    def roi_px(self) -> int:
+        """Side of the fitted square [pixels]."""
+        return self.config.fit.roi_px(self.pixel_nm)
+
+    def left(self, signal: FloatArray) -> FloatArray:
+        """Give what the frames, as they are corrected, show of a signal over the field.
+
+        Shapes: `signal` (y, x), result (y, x).
+        """
+        return signal if self.lines is None else self.lines.left(signal)
+
+    def contrasts(self, amplitude: FloatArray) -> FloatArray:
+        """Give the peak contrast of particles at the nominal height."""
+        nominal = self.model.material.mass_kda
+        peak = self.model.peak_contrast(self.model.height_nm, nominal)
+        return amplitude * peak / self.model.scale.amplitude(nominal)
+
+    @property
+    def background_variance(self) -> float:
+        """Variance of the background over that of the mean of its frames."""
+        return variance_of_background(self.config)
+
+    @property
+    def additive(self) -> bool:
+        """Whether particles add to the background instead of multiplying it."""
+        return self.model.rho == 0
+
+
+def make_scene(
+    config: Config,
+    field_px: tuple[int, int],
+    *,
+    searches: int = 1,
+    noise: NoiseSpectrum | None = None,
+    lines: Lines | None = None,
+    sliding: bool = False,
+) -> Scene:
+    """Build the models and the matched filter for a field."""
+    pixel, roi_px = square_of(config, field_px)
+    darkfield = config.optics.scheme == "darkfield"
+    if config.fit.likelihood == "conditional" and (darkfield or not is_counted(config)):
+        raise ConfigError(
+            'fit.likelihood = "conditional" needs an interferometric scheme and '
+            'background.method = "fixed" or "sliding": use "auto"'
+        )
+    if not sliding or config.optics.psf == "measured":
+        refuse_moving_focus(config)
+    model = square_model(config, pixel, roi_px)
+    if sliding:
+        reach_nm = math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel
+    else:
+        field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
+        reach_nm = min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))
+    mode = config.fit.mode
+    free_z = "z_nm" in FREE_PARAMETERS[mode] and not sliding
+    wide = forward_model(config, reach_nm)
+    moving = None
+    if config.optics.focus_drift_nm:
+        moving = MovingFocus(config, model), MovingFocus(config, wide)
+    return Scene(
+        config=config,
+        model=model,
+        wide=wide,
+        moving=moving,
+        templates=make_templates(
+            model,
+            search_both(config.detection, searches=searches),
+            pixel_nm=pixel,
+            roi_nm=config.fit.roi_nm,
+            z_range_nm=config.fit.z_range_nm if free_z else None,
+            field_px=field_px,
+            noise=noise,
+            in_turn=not sliding,
+            correlation=CORRELATION if sliding and searches > 1 else 0.0,
+        ),
+        mode=mode,
+        searches=searches,
+        lines=lines,
+    )
+
+
+def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:
+    """Give the side of a pixel and of the square that is fitted."""
+    pixel = _pixel_nm(config)
+    roi_px = config.fit.roi_px(pixel)
+    if roi_px > min(field_px):
+        raise ConfigError(
+            f"fit.roi_nm = {config.fit.roi_nm:g} is {roi_px} pixels, more than the field of "
+            f"{field_px[0]} x {field_px[1]}: lower fit.roi_nm or check camera.pixel_size_nm"
+        )
+    return pixel, roi_px
+
+
+def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
+    """Build the forward model of the square that is fitted."""
+    margin = pixel_nm + margin_nm(config.optics, pixel_nm)
+    return forward_model(
+        config, math.sqrt(2) * (roi_px * pixel_nm / 2 + window_nm(pixel_nm) + margin)
+    )
+
+
+def search_both(detection: Detection, *, searches: int = 1) -> Detection:
+    """Search both polarities, for one that is not wanted has side lobes that are."""
+    sides = 1 if detection.polarity == "both" else 2
+    alarms = sides * detection.false_alarms_per_movie / searches
+    return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
+
+
+def reported_steps(scene: Scene) -> int:
+    """Give which steps of a landing movie have the polarity that is reported."""
+    return scene.config.detection.sign * int(scene.templates.signs[0])
+
+
+def variance_of_background(config: Config) -> float:
+    """Give the variance of the background over that of the mean of its frames."""
+    return _VARIANCE_OF_BACKGROUND[str(config.background.method)]
+
+
+def is_counted(config: Config) -> bool:
+    """Tell whether the background is a sum of counts, as the conditional likelihood assumes."""
+    return config.background.method in ("fixed", "sliding")
+
+
+def _pixel_nm(config: Config) -> float:
+    if config.camera.pixel_size_nm is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed: set it, as in camera.pixel_size_nm = 84.4"
+        )
+    return config.camera.pixel_size_nm

@@ -1,0 +1,1 @@
+"""Which microscope was it?  Its optics, learned from particles."""

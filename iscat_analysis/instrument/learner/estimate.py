@@ -1,0 +1,368 @@
+"""One microscope, many particles: the maximum of their joint likelihood.
+
+Every sight of a particle has unknowns of its own (place, mass, background level) and shares those
+of the microscope with all others.  The information matrix is an arrow; its private blocks are
+eliminated sight by sight (their Schur complement), so that the cost grows linearly with the
+sights.  Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.inference.likelihood import LEVEL
+from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.instrument.learner.particle_images import (
+    FOCUS_DRIFT,
+    FOCUS_STEP,
+    PRIVATE,
+    RISES,
+    ROAM_NM,
+    Build,
+    Microscope,
+    Settings,
+    Sight,
+)
+from iscat_analysis.records import FloatArray, Mapper
+
+PRIOR_RANGE = {
+    "focus_nm": 1000.0,
+    "na": 0.05,
+    "reference_phase_deg": 180.0,
+    "mask_na": 0.3,
+    "attenuation": 0.5,
+    "polarization_deg": 90.0,
+    FOCUS_STEP: 50.0,
+    FOCUS_DRIFT: 1000.0,
+}
+"""How far a parameter may plausibly lie from the configured one; what the data leave wider than
+this, they do not tell."""
+
+TERM_RANGE_NM = 100.0
+"""The same for every aberration [nm]."""
+
+_LARGEST_STEP = {
+    "focus_nm": 120.0,
+    "na": 0.02,
+    "reference_phase_deg": 40.0,
+    "mask_na": 0.1,
+    "attenuation": 0.1,
+    "polarization_deg": 30.0,
+    FOCUS_STEP: 2.0,
+    FOCUS_DRIFT: 100.0,
+}
+_TERM_STEP_NM = 25.0
+_PLACE_STEP_NM = 60.0
+_HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
+_LEVEL_STEP = 0.5
+_Z = 2  # of what is a sight's own
+_DAMPING = (1e-3, 1e8)  # first, and where the search gives up
+_LOWEST_NA = 0.3
+_NA_ROOM = 2e-3  # below the index of the oil
+_TOGETHER = 5  # sights of one task; a millisecond each
+_MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A maximum of the joint likelihood."""
+
+    names: tuple[str, ...]
+    values: Settings
+    sights: tuple[Sight, ...]
+    information: FloatArray
+    scatter: FloatArray
+    log_likelihood: float
+    converged: bool
+    passes: int
+
+    @property
+    def bound(self) -> FloatArray:
+        """Cramér–Rao bound of the covariance: the inverse information, shape (n, n)."""
+        scale = np.array([prior_range(name) for name in self.names])
+        scaled = self.information * np.outer(scale, scale)
+        return np.asarray(np.linalg.pinv(scaled, hermitian=True) * np.outer(scale, scale))
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance of the estimates from the residuals themselves, shape (n, n).
+
+        Notes
+        -----
+        H. White, Econometrica 50, 1 (1982): right where the noise is not quite that of the model.
+        """
+        return np.asarray(self.bound @ self.scatter @ self.bound)
+
+
+def prior_range(name: str) -> float:
+    """Give the plausible distance of a parameter from the configured value."""
+    return PRIOR_RANGE.get(name, TERM_RANGE_NM)
+
+
+def maximise(
+    sights: Sequence[Sight],
+    build: Build,
+    start: Settings,
+    names: Sequence[str],
+    *,
+    limits: Mapping[str, tuple[float, float]] | None = None,
+    tolerance: float = 1e-2,
+    passes: int = 40,
+    mapper: Mapper = map,
+) -> Estimate:
+    """Maximise the joint likelihood over the microscope and all particles."""
+    names = tuple(names)
+    values = dict(start)
+    walls = _walls(sights)
+    private = np.clip([sight.private for sight in sights], *walls)
+    at = _Point.evaluate(sights, build, values, names, private, walls, mapper)
+    damping, used, converged = _DAMPING[0], 1, False
+    while used < passes and damping < _DAMPING[1]:
+        if at.gain(names) < tolerance:
+            converged = True
+            break
+        shared, own = at.step(names, damping)
+        trial_values = _limited(values, names, shared, limits or {})
+        moved = np.clip(private + own, *walls)
+        trial = _Point.evaluate(sights, build, trial_values, names, moved, walls, mapper)
+        used += 1
+        if trial.value > at.value:
+            values, private, at = trial_values, moved, trial
+            damping = max(damping / 8, 1e-9)
+        else:
+            damping = max(8 * damping, 1e-3)
+    return Estimate(
+        names=names,
+        values=values,
+        sights=tuple(s.moved(p) for s, p in zip(sights, private, strict=True)),
+        information=at.reduced(0.0)[0],
+        scatter=at.scatter([sight.owner for sight in sights]),
+        log_likelihood=at.value,
+        converged=converged,
+        passes=used,
+    )
+
+
+def first_step(
+    sights: Sequence[Sight],
+    build: Build,
+    settings: Settings,
+    names: Sequence[str],
+    mapper: Mapper = map,
+) -> tuple[FloatArray, FloatArray]:
+    """Say how far pictures ask to change some parameters, to first order.
+
+    Shapes: `step` (n,), `covariance` (n, n).
+    """
+    private, walls = np.array([sight.private for sight in sights]), _walls(sights)
+    at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
+    information, score, _ = at.reduced(0.0)
+    bound = np.linalg.pinv(information, hermitian=True)
+    return bound @ score, bound @ at.scatter([sight.owner for sight in sights]) @ bound
+
+
+def _walls(sights: Sequence[Sight]) -> FloatArray:
+    """Bounds of what is a sight's own, shape (2, n, 5): a particle stays in its picture."""
+    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
+    walls = np.full((2, len(sights), PRIVATE), np.inf)
+    walls[0] = -np.inf
+    walls[0, :, :2], walls[1, :, :2] = centres - ROAM_NM, centres + ROAM_NM
+    walls[:, :, _Z] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in sights])
+    return walls
+
+
+def _limited(
+    values: Settings,
+    names: Sequence[str],
+    step: FloatArray,
+    limits: Mapping[str, tuple[float, float]],
+) -> dict[str, Any]:
+    """Take a step and stay inside the limits."""
+    out = dict(values)
+    for name, move in zip(names, step, strict=True):
+        low, high = limits.get(name, (-math.inf, math.inf))
+        out[name] = float(min(max(values[name] + move, low), high))
+    if "mask_na" in names:
+        out["mask_na"] = min(out["mask_na"], out["na"] - _MASK_NA)
+    return out
+
+
+def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, float]]:
+    """Bounds of the parameters of a microscope that can exist."""
+    top = min(n_immersion, n_glass) - _NA_ROOM
+    return {
+        "na": (_LOWEST_NA, top),
+        "mask_na": (_MASK_NA, top - _MASK_NA),
+        "attenuation": (0.005, 1.0),
+    }
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Likelihood, score and information of all sights at one set of parameters."""
+
+    value: float
+    score: FloatArray  # (n, k + 5)
+    fisher: FloatArray  # (n, k + 5, k + 5)
+    squares: FloatArray  # the same, with squared residuals in place of their expectation
+
+    @classmethod
+    def evaluate(
+        cls,
+        sights: Sequence[Sight],
+        build: Build,
+        values: Settings,
+        names: tuple[str, ...],
+        private: FloatArray,
+        walls: FloatArray,
+        mapper: Mapper,
+    ) -> _Point:
+        """Evaluate all sights; an unknown that its wall stops counts as known."""
+        models: dict[float, Microscope] = {}
+        for sight in sights:
+            if sight.focus_steps not in models:
+                models[sight.focus_steps] = build(sight.seen_with(values))
+
+        def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+            return [
+                _scores(sight, models[sight.focus_steps], names, own)
+                for sight, own in zip(
+                    sights[first : first + _TOGETHER], private[first:], strict=False
+                )
+            ]
+
+        parts = mapper(some, range(0, len(sights), _TOGETHER))
+        found = [each for part in parts for each in part]
+        value = math.fsum(each[0] for each in found)
+        score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
+        own = score[:, len(names) :]
+        stopped = (private <= walls[0]) & (own < 0) | (private >= walls[1]) & (own > 0)
+        stopped |= walls[0] == walls[1]
+        free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
+        both = free[:, :, None] & free[:, None, :]
+        alone = np.eye(free.shape[1]) * ~free[:, None, :]
+        return cls(
+            value if math.isfinite(value) else -math.inf,
+            np.where(free, score, 0.0),
+            np.where(both, fisher, alone),
+            np.where(both, squares, 0.0),
+        )
+
+    def scatter(self, owners: Sequence[int]) -> FloatArray:
+        """Covariance of the reduced score from the residuals, shape (k, k).
+
+        Its shape is what the pixels say.  What the scores of pictures with owners scatter more, or
+        those of all pictures of an owner together, is a common factor: there are too few for more.
+        """
+        k = self.score.shape[1] - PRIVATE
+        gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
+        reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
+        pixels = np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
+        whole = np.einsum("eia,ea->ei", reduce, self.score)
+        known = np.array(owners)
+        if not (known >= 0).all():
+            return pixels
+        groupings = (np.arange(len(known)), known)
+        return pixels * max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
+
+    def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Information and score of the shared parameters, and the private blocks inverted."""
+        k = self.score.shape[1] - PRIVATE
+        cross, block = self.fisher[:, :k, k:], self.fisher[:, k:, k:]
+        ridge = damping * np.einsum("eii->ei", block)
+        inverse = np.linalg.inv(block + ridge[:, :, None] * np.eye(PRIVATE))
+        gains = np.einsum("eij,ejk->eik", cross, inverse)
+        information = (self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)).sum(axis=0)
+        score = (self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])).sum(axis=0)
+        return information, score, inverse
+
+    def gain(self, names: tuple[str, ...]) -> float:
+        """Gain in log-likelihood that the undamped step promises."""
+        k = len(names)
+        information, score, inverse = self.reduced(0.0)
+        own = self.score[:, k:]
+        total = 0.5 * float(np.einsum("ei,eij,ej->", own, inverse, own))
+        return total + 0.5 * float(score @ _solve(information, score, names, 1e-9))
+
+    def step(self, names: tuple[str, ...], damping: float) -> tuple[FloatArray, FloatArray]:
+        """Damped step of the shared parameters and of every private one."""
+        k = len(names)
+        information, score, inverse = self.reduced(damping)
+        shared = _solve(information, score, names, damping)
+        largest = np.array([_LARGEST_STEP.get(name, _TERM_STEP_NM) for name in names])
+        if k:
+            shared = shared / max(1.0, float(np.max(np.abs(shared) / largest)))
+        rest = self.score[:, k:] - np.einsum("eij,i->ej", self.fisher[:, :k, k:], shared)
+        own = np.einsum("eij,ej->ei", inverse, rest)
+        own[:, :2] = np.clip(own[:, :2], -_PLACE_STEP_NM, _PLACE_STEP_NM)
+        own[:, _Z] = np.clip(own[:, _Z], -_HEIGHT_STEP_NM, _HEIGHT_STEP_NM)
+        own[:, LEVEL] = np.clip(own[:, LEVEL], -_LEVEL_STEP, _LEVEL_STEP)
+        return shared, own
+
+
+def _excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
+    """Say how many times more the scores of owners scatter than expected, over all parameters.
+
+    The scores of all add up to nothing, which takes one of them.
+    """
+    names, index = np.unique(owners, return_inverse=True)
+    k = len(scatter)
+    if not k or len(names) < 2:
+        return 1.0
+    sums = np.zeros((len(names), k))
+    np.add.at(sums, index, scores)
+    unit = 1 / np.sqrt(np.maximum(np.diag(scatter), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(scatter * np.outer(unit, unit), hermitian=True)
+    squares = np.einsum("ei,ij,ej->", sums * unit, inverse, sums * unit)
+    return float(squares) / (k * (1 - 1 / len(names)))
+
+
+def _solve(
+    information: FloatArray, score: FloatArray, names: tuple[str, ...], damping: float
+) -> FloatArray:
+    """Solve the damped normal equations in units of the prior ranges.
+
+    What is added to the diagonal, one part in 10⁴ of what a direction worth knowing has, keeps
+    directions of which the pictures say nothing at rest.
+    """
+    if not names:
+        return np.empty(0)
+    scale = np.array([prior_range(name) for name in names])
+    scaled = information * np.outer(scale, scale)
+    ridge = damping * np.maximum(np.diag(scaled), 0.0) + 1e-4
+    return np.asarray(scale * np.linalg.solve(scaled + np.diag(ridge), scale * score))
+
+
+def _scores(
+    sight: Sight, model: Microscope, names: tuple[str, ...], private: FloatArray
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Log-likelihood, score, expected information and its observed squares, shared ones first."""
+    x, y, z, mass, level = (float(v) for v in private)
+    place = (sight.grid, x, y, z, mass)
+    k = len(names)
+    if names:
+        wanted = tuple(dict.fromkeys("focus_nm" if n in RISES else n for n in names))
+        signal, own, slopes = model.joint_gradient(*place, wanted)
+    else:
+        signal, own = model.gradient(*place)
+    rows = np.empty((k + PRIVATE, signal.size))
+    for row, name in zip(rows, names, strict=False):
+        if name in RISES:
+            row[:] = sight.focus_steps * slopes[wanted.index("focus_nm")].ravel()
+        else:
+            row[:] = slopes[wanted.index(name)].ravel()
+    rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
+    value, residual, weight, of_signal, of_level = pixel_terms(
+        sight.kind, sight.data, signal, level
+    )
+    rows[:-1] *= of_signal.ravel()
+    rows[-1] = of_level.ravel()
+    weighted = rows * weight.ravel()
+    scored = rows * residual.ravel()
+    return value + sight.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T

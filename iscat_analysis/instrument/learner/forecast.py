@@ -1,0 +1,335 @@
+"""How well particles would tell the microscope, before they are recorded.
+
+The information that each expected picture holds about the optics, once the particle's own place,
+mass and level are fitted, adds up over the pictures; its inverse is the covariance that
+`iscat calibrate optics` will report.  What it leaves in the masses and heights of later fits
+follows from `iscat_analysis.bounds.shared`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.bounds.classical import event_bounds
+from iscat_analysis.bounds.experiment import expected_likelihood
+from iscat_analysis.bounds.shared import displacement, eliminated, joint_information, shared_sigma
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.instrument.learner.estimate import prior_range
+from iscat_analysis.instrument.learner.measure import FAINTEST, LEAST_SIGHTS, MOST_SIGHTS
+from iscat_analysis.instrument.learner.null_directions import Hidden, find_hidden
+from iscat_analysis.instrument.learner.settings import FREE, exists, free_groups, settings_of
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray
+from iscat_analysis.threads import one_thread_algebra
+
+EVENTS = 60
+"""Particles where nobody says how many."""
+
+GOALS = (("focus_nm", 5.0), ("mass_rel", 0.01))
+"""Precisions whose price is told: of the focus [nm], and the common relative error of masses."""
+
+FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+"""Masses, over the configured one, for which it is told."""
+
+MODES = ("mass", "localize", "joint")
+"""Modes of fits whose common errors are told."""
+
+_PHASES = 3  # places inside a pixel, per axis, over which particles are spread
+_MANY = 10**6  # events that tell whatever particles of this kind can tell at all
+_Z = 2  # of x, y, z, mass, level: what is given
+_ZERO = 1e-9  # what symmetry makes 0 [nm, kDa]
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsForecast:
+    """What a number of particles would tell of the microscope."""
+
+    config: Config
+    events: int
+    snr: float
+    values: dict[str, float]
+    covariance: FloatArray
+    hidden: tuple[Hidden, ...]
+    moves: dict[str, FloatArray]
+    sigma: dict[str, FloatArray]
+    needed: pd.DataFrame
+
+    @cached_property
+    def parameters(self) -> pd.DataFrame:
+        """One row per free parameter; `sigma` is NaN where it would be held as configured."""
+        errors = dict(zip(self.values, np.sqrt(np.diag(self.covariance)), strict=True))
+        settings = settings_of(self.config)
+        names = [*self.values, *(each.name for each in self.hidden)]
+        rows = [
+            (n, float(settings[n]), float(errors.get(n, math.nan)), prior_range(n), n in errors)
+            for n in names
+        ]
+        columns = ["parameter", "value", "sigma", "prior_range", "determined"]
+        return pd.DataFrame(rows, columns=columns)
+
+    @cached_property
+    def common(self) -> dict[str, dict[str, float]]:
+        """Standard deviation that the microscope's errors put into all fits alike, by mode."""
+        return {
+            mode: dict(
+                zip(
+                    FREE_PARAMETERS[mode],
+                    (float(s) if s > _ZERO else 0.0 for s in shared_sigma(moves, self.covariance)),
+                    strict=True,
+                )
+            )
+            for mode, moves in self.moves.items()
+        }
+
+    @property
+    def unidentifiable(self) -> tuple[str, ...]:
+        """What the pictures would not tell, one sentence each."""
+        found = []
+        for each in self.hidden:
+            moved = ", ".join(f"{n} {v:+.3g}" for n, v in each.direction.items())
+            found.append(
+                f"{each.name} is {each.why}: one standard deviation is ({moved}), beyond the "
+                f"plausible ±{prior_range(each.name):g}, and it would be held as configured"
+            )
+        return tuple(found)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What the user should know, one sentence each."""
+        found = []
+        if self.snr < FAINTEST:
+            found.append(
+                f"one picture has a signal-to-noise ratio of {self.snr:.2g}, and iscat calibrate "
+                f"optics uses those above {FAINTEST:g}: take heavier particles, more frames, or "
+                "more light"
+            )
+        if not LEAST_SIGHTS <= self.events <= MOST_SIGHTS:
+            found.append(
+                f"iscat calibrate optics uses between {LEAST_SIGHTS} and {MOST_SIGHTS} pictures, "
+                f"not {self.events}"
+            )
+        return tuple(found)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``iscat bounds --for optics --json`` prints."""
+        optics, at = self.config.optics, self.config.bounds
+        mass = float(self.needed["mass_kda"][FACTORS.index(1.0)])
+        return {
+            "events": self.events,
+            "at": {
+                "mass_kda": mass,
+                "height_nm": self.config.particle.height_nm,
+                "focus_nm": optics.focus_nm,
+                "na": optics.na,
+                "photons_per_pixel": at.photons_per_pixel,
+                "n_before": at.n_before,
+                "n_after": at.n_after,
+                "roi_nm": self.config.fit.roi_nm,
+                "pixel_size_nm": self.config.camera.pixel_size_nm,
+            },
+            "snr": self.snr,
+            "parameters": self.parameters.to_dict("records"),
+            "names": list(self.values),
+            "covariance": self.covariance,
+            "unidentifiable": list(self.unidentifiable),
+            "hidden": [
+                {"name": h.name, "others": list(h.others), "direction": dict(h.direction)}
+                for h in self.hidden
+            ],
+            "common": self.common,
+            "single": {
+                mode: dict(zip(FREE_PARAMETERS[mode], sigma, strict=True))
+                for mode, sigma in self.sigma.items()
+            },
+            "goals": dict(GOALS),
+            "warnings": list(self.warnings),
+            "needed": self.needed.to_dict("records"),
+        }
+
+
+@one_thread_algebra()
+def forecast_optics(
+    config: Config, *, events: int = EVENTS, free: str | Sequence[str] | None = None
+) -> OpticsForecast:
+    """Foresee what particles would tell of the microscope."""
+    names = _names(config, free)
+    number_in("`events`", events, least=1, whole=True)
+    model, grid = _model(config)
+    pictures = {f: _Picture.expected(config, model, grid, f, names) for f in FACTORS}
+    here = pictures[1.0]
+    kept, covariance, hidden = _identified(here.information * events, names)
+    places = [names.index(name) for name in kept]
+    moves = {mode: here.moves(mode)[:, places] for mode in MODES}
+    settings = settings_of(config)
+    return OpticsForecast(
+        config=config,
+        events=events,
+        snr=here.snr,
+        values={name: float(settings[name]) for name in kept},
+        covariance=covariance,
+        hidden=hidden,
+        moves=moves,
+        sigma={mode: here.sigma(mode) for mode in MODES},
+        needed=pd.DataFrame([_needed(picture, names) for picture in pictures.values()]),
+    )
+
+
+def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
+    """Give the continuous parameters that these groups stand for in this microscope."""
+    optics = config.optics
+    if optics.scheme == "darkfield" or optics.convention == "dong2021":
+        raise ConfigError(
+            f'optics.scheme = "{optics.scheme}", optics.convention = "{optics.convention}": optics '
+            'are learned from interference with a reference, in the convention "exact"'
+        )
+    settings = settings_of(config)
+    names = tuple(
+        name for group in free_groups(free) for name in FREE[group] if exists(name, settings)
+    )
+    if not names:
+        raise ConfigError(f"free = {free!r}: this microscope has no such continuous parameter")
+    return names
+
+
+def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
+    pixel, camera = config.camera.pixel_size_nm, config.camera
+    if pixel is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
+        )
+    if isinstance(camera.read_noise_e, str):
+        raise ConfigError(
+            f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
+            "camera.read_noise_e = 1.5"
+        )
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    reach = grid.diagonal_nm / 2 + pixel
+    return forward_model(config, reach, z_max_nm=config.particle.height_nm), grid
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """One expected particle, averaged over its place in a pixel."""
+
+    likelihoods: tuple[Likelihood, ...]
+    thetas: tuple[FloatArray, ...]
+    names: tuple[str, ...]
+    mass_kda: float
+    level: bool
+    information: FloatArray
+
+    @classmethod
+    def expected(
+        cls,
+        config: Config,
+        model: ForwardModel,
+        grid: PixelGrid,
+        factor: float,
+        names: tuple[str, ...],
+    ) -> _Picture:
+        at, mass = config.bounds, factor * model.material.mass_kda
+        steps = grid.pixel_nm * ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5)
+        thetas = tuple(
+            np.array([x, y, config.particle.height_nm, model.scale.amplitude(mass), 0.0])
+            for y in steps
+            for x in steps
+        )
+        likelihoods = tuple(
+            expected_likelihood(
+                model, grid, theta, at.photons_per_pixel, at.photons_per_pixel,
+                n_before=at.n_before, n_after=at.n_after,
+                read_noise_e=float(config.camera.read_noise_e),
+            )
+            for theta in thetas
+        )  # fmt: skip
+        count = len(names)
+        parts = []
+        for likelihood, theta in zip(likelihoods, thetas, strict=True):
+            whole = joint_information(likelihood, theta, names)
+            fitted = [i for i in range(count + 5) if i != count + _Z]
+            parts.append(eliminated(whole[np.ix_(fitted, fitted)], count))
+        level = config.background.method == "sliding"
+        return cls(likelihoods, thetas, names, mass, level, np.asarray(np.mean(parts, axis=0)))
+
+    @property
+    def snr(self) -> float:
+        """Of the brightest place in a pixel's middle."""
+        middle = len(self.thetas) // 2
+        likelihood, theta = self.likelihoods[middle], self.thetas[middle]
+        signal = likelihood.signal(theta)
+        return math.sqrt(float(np.sum(signal**2 * likelihood.signal_information(signal))))
+
+    def moves(self, mode: str) -> FloatArray:
+        """D of a mode, averaged over the places."""
+        found = [
+            displacement(likelihood, theta, self.names, FREE_PARAMETERS[mode], level=self.level)
+            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+        ]
+        return np.asarray(np.mean(found, axis=0))
+
+    def sigma(self, mode: str) -> FloatArray:
+        """Bounds of a mode, averaged over the places."""
+        free = FREE_PARAMETERS[mode]
+        found = [
+            event_bounds(likelihood, theta, free, 1.0, level=self.level).crb_joint
+            for likelihood, theta in zip(self.likelihoods, self.thetas, strict=True)
+        ]
+        joint = np.sqrt(np.mean(np.square(found), axis=0))
+        return np.asarray(joint[np.isfinite(joint)])
+
+
+def _identified(
+    information: FloatArray, names: Sequence[str]
+) -> tuple[tuple[str, ...], FloatArray, tuple[Hidden, ...]]:
+    """Give what is determined, its covariance, and what is not."""
+    kept, hidden = list(names), []
+    while True:
+        places = [names.index(name) for name in kept]
+        part = information[np.ix_(places, places)]
+        worst = find_hidden(part, kept)
+        if worst is None:
+            break
+        hidden.append(worst)
+        kept.remove(worst.name)
+    scale = np.array([prior_range(name) for name in kept])
+    both = np.outer(scale, scale)
+    covariance = np.linalg.inv(part * both) * both if kept else np.zeros((0, 0))
+    return tuple(kept), np.asarray(covariance), tuple(hidden)
+
+
+def _needed(picture: _Picture, names: Sequence[str]) -> dict[str, float]:
+    """Say how many events the goals take, once everything is identified that can be."""
+    kept, covariance, _ = _identified(picture.information * _MANY, names)
+    one = covariance * _MANY
+    scale = np.array([prior_range(name) for name in kept])
+    widest = float(np.linalg.eigvalsh(one / np.outer(scale, scale))[-1]) if kept else math.nan
+    identified = max(LEAST_SIGHTS, widest)
+    moves = picture.moves("mass")[:, [names.index(name) for name in kept]]
+    mass_row = FREE_PARAMETERS["mass"].index("mass_kda")
+    variances = {
+        "focus_nm": one[kept.index("focus_nm"), kept.index("focus_nm")]
+        if "focus_nm" in kept
+        else math.nan,
+        "mass_rel": shared_sigma(moves, one)[mass_row] ** 2 / picture.mass_kda**2,
+    }
+    counts = {
+        name: max(identified, variance / dict(GOALS)[name] ** 2)
+        for name, variance in variances.items()
+    }
+    return {
+        "mass_kda": picture.mass_kda,
+        "snr": picture.snr,
+        "identified": float(np.ceil(identified)),
+        **{name: float(np.ceil(value)) for name, value in counts.items()},
+    }

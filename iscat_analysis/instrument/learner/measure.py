@@ -1,0 +1,396 @@
+"""From pictures of particles to the microscope that made them, and a verdict on it.
+
+Two thirds of the pictures are fitted and a third decides: how many aberrations are worth having,
+and whether the result describes pictures that it has not seen.  Directions in the space of
+parameters that the pictures do not determine within the plausible range are named and held at the
+configured values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis.instrument.learner.estimate import Estimate, maximise
+from iscat_analysis.instrument.learner.neighbours import Neighbours
+from iscat_analysis.instrument.learner.null_directions import find_hidden
+from iscat_analysis.instrument.learner.particle_images import RISES, Build, Settings, Sight
+from iscat_analysis.instrument.learner.settings import (
+    FREE,
+    HIGHER,
+    PRIMARY,
+    SECONDARY,
+    free_names,
+    is_term,
+)
+from iscat_analysis.instrument.learner.starts import average_sights, with_masses
+from iscat_analysis.instrument.learner.states import StateSearch, same_state
+from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.threads import one_thread_algebra
+
+LEAST_SIGHTS = 12
+"""Pictures without which nothing is calibrated: eight to fit and four to judge."""
+
+MOST_SIGHTS = 60
+"""Pictures that are used at most, two thirds of them to fit."""
+
+FAINTEST = 8.0
+"""Signal-to-noise ratio below which a picture says too little of the microscope."""
+
+HELD_OUT = 3
+"""One picture in so many is not fitted."""
+
+TWIN_GAP = math.log(1000.0)
+"""Log-likelihood by which a twin must be worse to be ruled out: odds of 1000."""
+
+HELD_OUT_P = 1e-3
+"""Below this chance the p-values of pictures that were not fitted are not uniform."""
+
+CONTAMINATED_P = 1e-4
+"""A single picture with a smaller p-value, where most are fine, shows more than one particle."""
+
+_PLACE = ("x_nm", "y_nm")
+_RUNG_PASSES = 12
+_TOO_FEW = 20.0  # log-likelihood that fewer aberrations lose where still fewer cannot be better
+_CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
+_TRIAL_PASSES = 12  # of a second microscope on all pictures
+_TWIN_PASSES = 4  # after which a twin is far nearer than _CLOSE
+_CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
+
+Judge = Callable[[Sight, Settings], tuple[float, float]]
+"""Goodness of fit of a sight in a microscope: reduced χ² and p-value."""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How the pictures that were not fitted agree with the microscope."""
+
+    p_values: FloatArray
+    chi2_reduced: FloatArray
+    uniform_p: float
+
+    @property
+    def good(self) -> bool:
+        """Whether they agree."""
+        return bool(self.uniform_p >= HELD_OUT_P)
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A second microscope that makes the same pictures."""
+
+    settings: Settings
+    gap: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What the pictures say about the microscope."""
+
+    settings: Settings
+    estimate: Estimate
+    held: Mapping[str, str]
+    dropped: tuple[str, ...]
+    undecided: tuple[str, ...]
+    judgement: Judgement
+    configured: Judgement
+    held_out: tuple[Sight, ...]
+    twin: Twin | None
+    contaminated: int
+    refusals: tuple[str, ...]
+
+
+def judge(
+    sights: Sequence[Sight], settings: Settings, judge_one: Judge, mapper: Mapper = map
+) -> Judgement:
+    """Judge fitted pictures one by one and all together."""
+    from scipy.stats import kstest  # a second to load, for those who learn optics
+
+    found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
+    p_values = found[:, 1]
+    return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
+
+
+@one_thread_algebra()
+def measure_microscope(
+    sights: Sequence[Sight],
+    configured: Settings,
+    build: Build,
+    judge_one: Judge,
+    *,
+    free: Sequence[str],
+    limits: Mapping[str, tuple[float, float]],
+    side: int = 0,
+    landing: int = 0,
+    others: Sequence[Sight] = (),
+    build_wide: Build | None = None,
+    known: Settings | None = None,
+    mapper: Mapper = map,
+) -> Measured:
+    """Measure the microscope from pictures of particles."""
+    search = _Search(
+        configured, build, judge_one, tuple(free), limits, side, landing, mapper,
+        tuple(others), build_wide, known,
+    )  # fmt: skip
+    return search.run(sorted(sights, key=lambda sight: -sight.snr))
+
+
+def _fitted(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are fitted."""
+    return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
+
+
+def _held_out(sights: Sequence[Sight]) -> list[Sight]:
+    """Give the pictures that are not."""
+    return list(sights[1::HELD_OUT])
+
+
+@dataclass
+class _Search:
+    """One measurement of the microscope; its steps in order of `run`."""
+
+    configured: Settings
+    build: Build
+    judge_one: Judge
+    free: tuple[str, ...]
+    limits: Mapping[str, tuple[float, float]]
+    side: int
+    landing: int
+    mapper: Mapper = map
+    others: tuple[Sight, ...] = ()
+    build_wide: Build | None = None
+    known: Settings | None = None
+
+    def run(self, sights: Sequence[Sight]) -> Measured:
+        if self.known is None:
+            best, held_out = self._best_state(*average_sights(sights))
+        else:
+            best, held_out = self._of_known_kind(sights, self.known)
+        best, held_out = self._cleared(best, held_out)
+        best, held = self._identified(best)
+        before = len(best.sights) + len(held_out)
+        best, held_out = self._uncontaminated(best, held_out)
+        contaminated = before - len(best.sights) - len(held_out)
+        best, dropped = self._worthwhile(best, held_out)
+        best, undecided = self._analyzer(best)
+        best, twin = self._twin(best)
+        best, held_out = self._cleared(best, held_out)
+        best, held_out = self._signed(best, held_out)
+        held_out = self._own(held_out, best.values)
+        judgement = judge(held_out, best.values, self.judge_one, self.mapper)
+        nominal = with_masses(held_out, self.build, self.configured)
+        configured = judge(
+            self._own(nominal, self.configured), self.configured, self.judge_one, self.mapper
+        )
+        final = self._fit((*best.sights, *held_out), best.values, best.names)
+        refusals = self._refusals(final, judgement, twin)
+        return Measured(
+            settings=final.values, estimate=final, held=held, dropped=dropped,
+            undecided=undecided, judgement=judgement, configured=configured, held_out=held_out,
+            twin=twin, contaminated=contaminated, refusals=refusals,
+        )  # fmt: skip
+
+    def _fit(
+        self, sights: Sequence[Sight], start: Settings, names: Sequence[str], passes: int = 40
+    ) -> Estimate:
+        return maximise(
+            sights, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
+        )
+
+    def _cleared(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Put the rings of all neighbours into what is expected of every picture."""
+        if not self.others or self.build_wide is None:
+            return best, tuple(held_out)
+        near = Neighbours.fitted(self.others, self.build, self.build_wide, best.values, self.mapper)
+        self.others = near.particles  # where they are is known the next time
+        among = near.around((*best.sights, *held_out), self.mapper)
+        fitted, judged = among[: len(best.sights)], among[len(best.sights) :]
+        judged = self._own(judged, best.values) if judged else ()
+        return self._fit(fitted, best.values, best.names), judged
+
+    def _own(self, sights: Sequence[Sight], settings: Settings) -> tuple[Sight, ...]:
+        """Fit what is a sight's own."""
+        return self._fit(sights, settings, ()).sights
+
+    def _best_state(
+        self, averages: Sequence[Sight], placed: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Try every state on the average picture, the best ones on the pictures to be fitted.
+
+        A mask of which the configuration knows nothing must earn its two parameters.
+        The pictures that are not fitted come back with their places and masses.
+        """
+        states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
+        refined = states.run(averages)
+        top = refined[0].log_likelihood
+        joint: list[tuple[float, Estimate, tuple[Sight, ...]]] = []
+        tried: list[Estimate] = []
+        for rough in refined:
+            far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
+            if far or any(same_state(rough, other) for other in tried):
+                continue
+            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
+            sights = with_masses(
+                [s.placed(s.x_nm + float(x_nm), s.y_nm + float(y_nm)) for s in placed],
+                self.build,
+                rough.values,
+            )
+            names = free_names(self.free, rough.values, FREE["zernike"])
+            tried.append(rough)
+            fit = self._fit(_fitted(sights), rough.values, names, _TRIAL_PASSES)
+            judged = self._fit(_held_out(sights), fit.values, ())
+            new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
+            earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
+            joint.append((earned, fit, judged.sights))
+        _, best, held_out = max(joint, key=lambda each: each[0])
+        if not best.converged:
+            best = self._fit(best.sights, best.values, best.names)
+        return best, held_out
+
+    def _of_known_kind(
+        self, sights: Sequence[Sight], known: Settings
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Go on from a microscope that is near."""
+        names = free_names(self.free, known, FREE["zernike"])
+        fitted = _fitted(sights)
+        best = self._fit(fitted, known, names)
+        # focus and phase move all heights, those of pictures that were not fitted to other fringes
+        rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.sights, fitted, strict=True)])
+        held_out = [s.raised(float(rise)) for s in _held_out(sights)]
+        return best, self._own(held_out, best.values)
+
+    def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
+        """Hold what the pictures do not determine within the plausible range."""
+        held: dict[str, str] = {}
+        while (worst := find_hidden(best.information, best.names)) is not None:
+            name = worst.name
+            held[name] = worst.why
+            kept = tuple(n for n in best.names if n != name)
+            settings = {**best.values, name: self.configured[name]}
+            best = self._fit(best.sights, settings, kept)
+        return best, held
+
+    def _uncontaminated(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Leave out the few pictures in which something else happened, if the others are fine."""
+        good = [
+            judge(sights, best.values, self.judge_one, self.mapper).p_values > CONTAMINATED_P
+            for sights in (best.sights, held_out)
+        ]
+        bad = sum(int(np.sum(~g)) for g in good)
+        if not bad or bad > _CONTAMINATED_SHARE * (len(best.sights) + len(held_out)):
+            return best, tuple(held_out)
+        kept = [s for s, ok in zip(best.sights, good[0], strict=True) if ok]
+        rest = tuple(s for s, ok in zip(held_out, good[1], strict=True) if ok)
+        return self._fit(kept, best.values, best.names), rest
+
+    def _worthwhile(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[str, ...]]:
+        """Keep as many aberrations as improve the pictures that were not fitted."""
+        terms = tuple(n for n in best.names if is_term(n))
+        ladder = [
+            tuple(n for n in terms if n in some)
+            for some in ((), PRIMARY, PRIMARY + SECONDARY, PRIMARY + SECONDARY + HIGHER)
+        ]
+        rungs = list(dict.fromkeys([*ladder, terms]))
+        tried: list[tuple[float, Estimate]] = []
+        for rung in reversed(rungs):  # the most first; fewer than too few are not tried
+            names = tuple(n for n in best.names if not is_term(n) or n in rung)
+            start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
+            fit = best if rung == terms else self._fit(best.sights, start, names, _RUNG_PASSES)
+            tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
+            if tried[-1][0] < tried[0][0] - _TOO_FEW:
+                break
+        _, chosen = max(tried, key=lambda pair: pair[0])
+        return chosen, tuple(n for n in terms if n not in chosen.names)
+
+    def _analyzer(self, best: Estimate) -> tuple[Estimate, tuple[str, ...]]:
+        """Ask whether there is an analyser, which only strong particles tell."""
+        if "polarization" not in self.free:
+            return best, ()
+        was = bool(best.values["analyzer"])
+        other = self._fit(best.sights, {**best.values, "analyzer": not was}, best.names, passes=8)
+        gap = best.log_likelihood - other.log_likelihood
+        if abs(gap) < TWIN_GAP:
+            return best, ("analyzer",)
+        return (best if gap > 0 else other), ()
+
+    def _twin(self, best: Estimate) -> tuple[Estimate, Twin | None]:
+        """Look for the microscope on the other side of focus that makes the same pictures."""
+        if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
+            return best, None
+        z = best.sights[0].z_nm
+        mirrored = dict(best.values)
+        mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
+        mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
+        mirrored |= {name: -best.values[name] for name in RISES if name in best.names}
+        for name in best.names:
+            if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
+                mirrored[name] = -best.values[name]
+        turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
+        other = self._fit(turned, mirrored, best.names, _TWIN_PASSES)
+        if best.log_likelihood - other.log_likelihood > _CLOSE * best.log_likelihood:
+            return best, None
+        other = self._fit(other.sights, other.values, best.names, _TRIAL_PASSES)
+        other, _ = self._cleared(other, ())  # each among the rings that it makes itself
+        gap = best.log_likelihood - other.log_likelihood
+        apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
+        if abs(gap) >= TWIN_GAP or apart < 1.0:
+            return (best if gap > -TWIN_GAP else other), None
+        wanted = self.side or (1 if self.configured["focus_nm"] > 0 else -1)
+        if (other.values["focus_nm"] > 0) == (wanted > 0) != (best.values["focus_nm"] > 0):
+            best, other, gap = other, best, -gap
+        return best, Twin(other.values, gap)
+
+    def _signed(
+        self, best: Estimate, held_out: Sequence[Sight]
+    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        """Choose between a phase and its opposite, which a particle that leaves has."""
+        if "reference_phase_deg" not in best.names:
+            return best, tuple(held_out)
+        masses = np.array([s.mass_kda for s in best.sights])
+        phase = best.values["reference_phase_deg"]
+        if self.landing and abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):
+            flip = np.sign(masses).sum() * self.landing < 0
+        else:
+            flip = math.cos(math.radians(phase - self.configured["reference_phase_deg"])) < 0
+        phase = (phase + 180 * flip + 180) % 360 - 180
+        # those that were not fitted too: with its height free a strong one does not turn by itself
+        turned, judged = (
+            tuple(replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in sights)
+            for sights in (best.sights, held_out)
+        )
+        values = {**best.values, "reference_phase_deg": phase}
+        return replace(best, values=values, sights=turned), judged
+
+    def _refusals(
+        self, final: Estimate, judgement: Judgement, twin: Twin | None
+    ) -> tuple[str, ...]:
+        reasons = []
+        if not final.names:
+            reasons.append("the pictures determine none of the parameters")
+        if not final.converged:
+            reasons.append("the search did not converge")
+        for name in final.names:
+            low, high = self.limits.get(name, (-math.inf, math.inf))
+            if final.values[name] in (low, high):
+                reasons.append(f"{name} = {final.values[name]:g} lies at its limit")
+        if not judgement.good:
+            reasons.append(
+                f"of {judgement.p_values.size} pictures that were not fitted the p-values are not "
+                f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
+                f"{float(np.mean(judgement.chi2_reduced)):.3f})"
+            )
+        if twin is not None and not self.side:
+            reasons.append(
+                "a focus on the other side explains the pictures as well, and optics.focus_nm does "
+                "not say which side it is"
+            )
+        return tuple(reasons)

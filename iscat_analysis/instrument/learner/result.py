@@ -1,0 +1,300 @@
+"""What a calibration of the optics hands on: values with errors, and what could not be known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.config import Config, OpticsCovariance
+from iscat_analysis.instrument.learner.measure import Judgement, Measured
+from iscat_analysis.instrument.learner.particle_images import FOCUS_DRIFT, FOCUS_STEP, RISES
+from iscat_analysis.instrument.learner.pictures import Pictures
+from iscat_analysis.instrument.learner.settings import exists, is_term, with_settings
+from iscat_analysis.records import FloatArray
+from iscat_analysis.units import count
+
+_ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
+_ODD_SIGMAS = 5.0
+
+COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
+"""Columns of `OpticsCalibration.parameters`."""
+
+
+@dataclass(frozen=True, eq=False)
+class OpticsCalibration:
+    """A microscope as a movie shows it."""
+
+    config: Config
+    parameters: pd.DataFrame
+    names: tuple[str, ...]
+    covariance: FloatArray
+    measured: Measured
+    pictures: Pictures
+    sights: int
+    source: Mapping[str, str]
+    notes: tuple[str, ...]
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the measured optics may be used."""
+        return not self.measured.refusals
+
+    def value(self, name: str) -> float:
+        """Value of a continuous parameter, in its unit."""
+        return float(self.measured.settings[name])
+
+    def sigma(self, name: str) -> float:
+        """Give the standard error of a parameter, NaN where it was not measured."""
+        row = self.parameters.set_index("parameter").loc[name]
+        return float(row["sigma"])
+
+    def less_sure(self, error: FloatArray) -> OpticsCalibration:
+        """Add an error of known size to the uncertainty.
+
+        Shapes: `error` (n,).
+        """
+        covariance = self.covariance + np.outer(error, error)
+        parameters = self.parameters.copy()
+        sigmas = dict(zip(self.names, np.sqrt(np.diag(covariance)), strict=True))
+        sigma = parameters["parameter"].map(sigmas)
+        parameters["sigma"] = sigma.where(sigma.notna(), parameters["sigma"])
+        config = self.config
+        if self.accepted:
+            config = _with_covariance(config, *_of_optics(self.names, covariance))
+        return replace(self, config=config, parameters=parameters, covariance=covariance)
+
+    def headline(self, pictures_of: str = "particles") -> str:
+        """Say in one line what was found."""
+        judged, before = self.measured.judgement, self.measured.configured
+        parts = []
+        for name, unit in (("focus_nm", "nm"), ("na", ""), ("reference_phase_deg", "deg")):
+            if name in self.names:
+                label = {"focus_nm": "focus", "na": "NA", "reference_phase_deg": "phase"}[name]
+                parts.append(with_error(label, self.value(name), self.sigma(name), unit))
+        if FOCUS_STEP in self.names:
+            parts.append(
+                with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
+            )
+        if FOCUS_DRIFT in self.names:
+            drift = with_error(
+                "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
+            )
+            parts.append(f"{drift} in 1000 frames")
+        terms = [n for n in self.names if is_term(n)]
+        if terms:
+            rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
+            parts.append(f"aberrations {rms:.1f} nm rms")
+        if self.value("mask_na"):
+            parts.append(f"mask of NA {self.value('mask_na'):.3f}")
+        parts.append(f"{self.measured.settings['polarization']} polarisation")
+        return (
+            f"{', '.join(parts)} from {self.sights} {pictures_of}; reduced chi2 of those that "
+            f"were not fitted {np.mean(judged.chi2_reduced):.3f} "
+            f"({np.mean(before.chi2_reduced):.3g} as configured)"
+        )
+
+    def with_phase(self, phase_deg: float, note: str) -> OpticsCalibration:
+        """Take the reference phase half a turn away, which explains the pictures as well."""
+        name = "reference_phase_deg"
+        parameters = self.parameters.copy()
+        parameters.loc[parameters["parameter"] == name, "value"] = phase_deg
+        optics = self.config.optics.model_copy(update={name: phase_deg})
+        measured = replace(self.measured, settings={**self.measured.settings, name: phase_deg})
+        return replace(
+            self,
+            config=self.config.model_copy(update={"optics": optics}),
+            parameters=parameters,
+            measured=measured,
+            notes=(note, *self.notes),
+        )
+
+    def to_toml(self) -> str:
+        """Write what ``[optics] file`` reads."""
+        optics = self.config.optics
+        lines = ["# Optics measured by `iscat calibrate optics`", "", "[optics]"]
+        keys = ("polarization", "polarization_deg", "analyzer", "na", "attenuation", "mask_na",
+                "focus_nm", "reference_phase_deg")  # fmt: skip
+        for key in keys:
+            value = getattr(optics, key)
+            said = {True: "true", False: "false"}.get(value) if isinstance(value, bool) else None
+            text = said or (f'"{value}"' if isinstance(value, str) else f"{value:.9g}")
+            lines.append(f"{key} = {text}")
+        terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
+        lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
+        names, covariance = _of_optics(self.names, self.covariance)
+        lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
+        quoted = ", ".join(f'"{name}"' for name in names)
+        lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
+        lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in covariance]
+        lines += ["]", "", "[provenance]"]
+        lines += [f"{key} = {_quoted(text)}" for key, text in self.source.items()]
+        if FOCUS_STEP in self.names:
+            lines += [f"{FOCUS_STEP} = {self.value(FOCUS_STEP):.9g}"]
+        return "\n".join([*lines, f"particles = {self.sights}", ""])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give what ``optics.json`` holds."""
+        found = self.measured
+        twin, shown = found.twin, vars(self.pictures)
+        return {
+            "accepted": self.accepted,
+            "refusals": list(found.refusals),
+            "parameters": self.parameters.replace({np.nan: None}).to_dict("records"),
+            "names": list(self.names),
+            "covariance": self.covariance.tolist(),
+            "correlation": correlation(self.covariance).tolist(),
+            "settings": dict(found.settings),
+            "held": dict(found.held),
+            "dropped": list(found.dropped),
+            "undecided": list(found.undecided),
+            "twin": None if twin is None else {"settings": dict(twin.settings), "gap": twin.gap},
+            "held_out": _judged(found.judgement),
+            "held_out_as_configured": _judged(found.configured),
+            "particles": self.sights,
+            "contaminated": found.contaminated,
+            "source": dict(self.source),
+            "pictures": {k: v.tolist() if hasattr(v, "tolist") else v for k, v in shown.items()},
+            "notes": list(self.notes),
+        }
+
+
+def make_result(
+    config: Config,
+    configured: Mapping[str, Any],
+    measured: Measured,
+    pictures: Pictures,
+    source: Mapping[str, str],
+) -> OpticsCalibration:
+    """Put a result together."""
+    estimate = measured.estimate
+    covariance, bound = estimate.covariance, estimate.bound
+    rows = []
+    for name, value in measured.settings.items():
+        turns = name == "polarization_deg"
+        if isinstance(value, str | bool) or (turns and not exists(name, measured.settings)):
+            continue
+        state = "given"
+        sigma = crb = float("nan")
+        if name in estimate.names:
+            k = estimate.names.index(name)
+            sigma, crb = float(np.sqrt(covariance[k, k])), float(np.sqrt(bound[k, k]))
+            state = "measured"
+        elif name in measured.held:
+            state = "held"
+        elif name in measured.dropped:
+            state = "dropped"
+        rows.append((name, float(value), sigma, crb, float(configured[name]), state))
+    if not measured.refusals:
+        config = _with_covariance(
+            with_settings(config, measured.settings), *_of_optics(estimate.names, covariance)
+        )
+    return OpticsCalibration(
+        config=config,
+        parameters=pd.DataFrame(rows, columns=list(COLUMNS)),
+        names=estimate.names,
+        covariance=covariance,
+        measured=measured,
+        pictures=pictures,
+        sights=len(estimate.sights),
+        source=source,
+        notes=(*_notes(measured), *_on_the_pixel(config, configured, measured)),
+    )
+
+
+def _of_optics(
+    names: tuple[str, ...], covariance: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    """Leave out what is no property of the microscope."""
+    kept = [k for k, name in enumerate(names) if name not in RISES]
+    return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
+
+
+def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:
+    """Put the errors beside the values, from where fits take what is common to all events."""
+    errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, covariance.tolist())))
+    optics = config.optics.model_copy(update={"covariance": errors})
+    return config.model_copy(update={"optics": optics})
+
+
+def _notes(measured: Measured) -> tuple[str, ...]:
+    """Say in words what could not be known."""
+    notes = []
+    for name, why in measured.held.items():
+        notes.append(f"{name} is {why} in these pictures and was held as configured")
+    for name in measured.undecided:
+        notes.append(
+            f"the pictures do not tell {name} = true from false; it stays as configured "
+            "(particles of higher contrast would tell)"
+        )
+    if measured.dropped:
+        notes.append(
+            f"{', '.join(measured.dropped)} did not improve pictures that were not fitted and are 0"
+        )
+    if measured.contaminated:
+        notes.append(
+            f"{count(measured.contaminated, 'picture')} left out, because something else happened "
+            "there"
+        )
+    twin = measured.twin
+    if twin is not None:
+        notes.append(
+            f"a twin with focus {twin.settings['focus_nm']:.1f} nm, reference phase "
+            f"{twin.settings['reference_phase_deg']:.1f} deg and the even aberrations reversed "
+            "makes the same pictures (log-likelihood "
+            f"{abs(twin.gap):.1f} {'lower' if twin.gap >= 0 else 'higher'}); the configured side "
+            "of focus was taken. A scan of the focus, particles at several heights or an NA above "
+            "the sample's index would tell them apart"
+        )
+    return tuple(notes)
+
+
+def _on_the_pixel(
+    config: Config, configured: Mapping[str, Any], measured: Measured
+) -> tuple[str, ...]:
+    """Say that a wrong pixel size looks like a wrong aperture, where the aperture is another."""
+    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
+    if "na" not in estimate.names or pixel is None:
+        return ()
+    k = estimate.names.index("na")
+    apart = measured.settings["na"] - configured["na"]
+    if abs(apart) < max(_ODD_NA, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+        return ()
+    other = pixel * measured.settings["na"] / configured["na"]
+    return (
+        f"the numerical aperture differs by {apart:+.3f} from the configured one; pixels of about "
+        f"{other:.1f} nm instead of {pixel:g} nm would look much the same: check "
+        "camera.pixel_size_nm",
+    )
+
+
+def _judged(judgement: Judgement) -> dict[str, Any]:
+    return {
+        "p_values": judgement.p_values.tolist(),
+        "chi2_reduced": judgement.chi2_reduced.tolist(),
+        "uniform_p": judgement.uniform_p,
+    }
+
+
+def correlation(covariance: FloatArray) -> FloatArray:
+    """Give the correlation matrix of a covariance.
+
+    Shapes: `covariance` (n, n), result (n, n).
+    """
+    sigma = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
+
+
+def with_error(label: str, value: float, sigma: float, unit: str) -> str:
+    """Write a value with as many digits as its error deserves."""
+    digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 3
+    return f"{label} {value:.{digits}f} ± {sigma:.{digits}f} {unit}".rstrip()
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

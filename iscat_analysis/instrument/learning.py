@@ -1,0 +1,323 @@
+"""The optics of a movie, learned from its brightest particles.
+
+Before a movie is analysed the configured optics are tested on these; where their fits reject them,
+the optics are learned, and the analysis goes on with what was learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
+from typing import Any
+
+from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.metadata import resolve_metadata
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
+from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, Opening, judge_counts
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.run import unheard
+from iscat_analysis.inference.checks import number_in
+from iscat_analysis.instrument.crowded import learn_in_field, seen_in_field
+from iscat_analysis.instrument.focus_drift import (
+    STEADY,
+    focus_drift,
+    learned_with_drift,
+    with_drift,
+)
+from iscat_analysis.instrument.learner import (
+    FREE,
+    LEAST_SIGHTS,
+    OpticsCalibration,
+    Sight,
+    free_groups,
+    heights_free,
+    settings_of,
+)
+from iscat_analysis.instrument.microscope import calibrate_sights, refuse_uncalibratable, with_sign
+from iscat_analysis.instrument.particle_images import TESTED, bright_sights, kind_of, scan_sights
+from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p, not_alone
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import Progress, Windows, silent
+from iscat_analysis.search.sliding import measure_frames, well_lit
+from iscat_analysis.threads import threads
+from iscat_analysis.units import count
+
+LEAST_TESTED = 4
+"""Bright particles without which the optics are not even tested."""
+
+_MOST_STEP_NM = 5e3  # farther than the model's pictures reach
+_LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
+NOISE = "its noise is not what the camera's numbers predict"
+"""Why optics are not judged where p-values cannot be."""
+
+_STUCK = 0.02  # share of frames that repeat another, which sums of frames count
+
+
+def learn_optics(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    *,
+    tell: Callable[[str], None],
+    notify: Callable[[str], None] = unheard,
+    opening: Opening | None = None,
+) -> tuple[Config, dict[str, Any]]:
+    """Test the configured optics on the brightest particles, and learn them where they fail."""
+    optics = config.optics
+    reason = why_not(config)
+    if reason and optics.calibrate == "always":
+        tell(f"the optics are not learned {reason}; the analysis goes on as configured")
+    if (
+        reason
+        or config.fit.mode == "track"  # which learns from its tracks
+        or optics.calibrate == "never"
+        or (optics.calibrate == "auto" and (optics.file is not None or optics.focus_drift_nm))
+    ):
+        return config, {}
+    tested: dict[str, Any] = {}
+    passed, sliding, drift = False, way_of(config) == "sliding", STEADY
+    frames = fitted_frames(movie, config, config.background.recorded)
+    first_tested = optics.calibrate == "auto" and sliding
+    with threads(config.compute.workers) as pool:
+        sights, others = bright_sights(movie, config, camera, pool, opening, rings=not first_tested)
+        alone, source = len(sights), {"movie": movie.name}
+        together = alone < LEAST_TESTED and way_of(config) == "fixed"
+        windows = _summed(movie, config, camera) if together else None
+        try:
+            if windows is not None:
+                if drift_warning(movie.name, examine_background(movie, camera, windows)):
+                    raise DataError("the edges of a fixed pattern that moved look like particles")
+                sights, others = seen_in_field(windows, config, pool)
+            if len(sights) < LEAST_TESTED:
+                by_noise = noise_differs(movie, config, camera)
+                raise DataError(too_few(movie.name, len(sights), by_noise=by_noise))
+            median, fitted = median_p(sights, config, others, pool.map)
+            if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
+                sights, others = bright_sights(movie, config, camera, pool, opening)
+                alone = len(sights)
+                median, fitted = median_p(sights, config, others, pool.map)
+            if sliding:
+                drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
+            if drift.moves:  # which the first particles of a long movie tell badly
+                sights, others = bright_sights(movie, config, camera, pool, opening, whole=True)
+                alone = len(sights)
+            elif optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
+                pairs, median = not_alone(sights, config, others, pool.map)
+                sights = [sight for k, sight in enumerate(sights) if k not in pairs]
+                alone -= sum(k < alone for k in pairs)
+                if len(sights) < LEAST_TESTED:
+                    raise DataError(too_few(movie.name, len(sights)))
+            tested = {"tested": len(sights), "median_p": median}
+            passed = optics.calibrate == "auto" and median >= REJECTED_P
+            if passed and not drift.moves:
+                return config, tested | {"calibrated": False}
+            if optics.calibrate == "auto" and noise_differs(movie, config, camera):
+                reason = f"{NOISE}; the analysis goes on as configured"
+                tell(f"the optics cannot be tested on this movie: {reason}")
+                return config, tested | {"calibrated": False, "reason": reason}
+            notify("learning the optics from the particles of the movie, which may take minutes…")
+            found = (
+                learned_with_drift(
+                    sights, others, config, settings_of(config), drift, source, pool.map
+                )
+                if passed
+                else learned_from(
+                    sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
+                )
+            )
+        except DataError as error:
+            reason = f"{error}; {drift.said}" if drift.moves else str(error)
+            tell(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
+            return config, tested | {"calibrated": False, "reason": reason}
+    return taken(found, config, tested, drift.said if passed else _verdict(tested), tell=tell)
+
+
+def why_not(config: Config) -> str:
+    """Say of what movies, or with what configuration, no optics are learned."""
+    optics, mode, way = config.optics, config.fit.mode, way_of(config)
+    tracks = mode == "track"
+    reasons = (
+        (
+            tracks and way != "tracks",
+            "in mode track over a background that is not learned with the tracks",
+        ),
+        (optics.scheme == "darkfield", "from dark field"),
+        (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
+        (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
+        (config.background.method == "known", 'with background.method = "known"'),
+        (
+            not tracks and heights_free(config) and way != "fixed",
+            f"in mode {mode} without background frames",
+        ),
+    )
+    return next((reason for holds, reason in reasons if holds), "")
+
+
+def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
+    """Say that too few particles stand alone."""
+    said = (
+        f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
+        f"needed to test the optics, {LEAST_SIGHTS} to learn them"
+    )
+    if by_noise:
+        said += "; they stand out by the noise, which is not what the camera's numbers predict"
+    return said
+
+
+def taken(
+    found: OpticsCalibration,
+    config: Config,
+    tested: Mapping[str, Any],
+    verdict: str,
+    *,
+    pictures_of: str = "particles",
+    tell: Callable[[str], None],
+) -> tuple[Config, dict[str, Any]]:
+    """Take what was learned, where it may be used, and say so."""
+    learned, why = usable(found, config)
+    if learned is None:
+        tell(f"{verdict}: {why}; the analysis goes on as configured")
+        return config, {**tested, **_told(found), "calibrated": False, "reason": why}
+    if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
+        found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
+    headline = found.headline(pictures_of)
+    tell(f"optics learned from the movie, instead of the configured ones: {headline}")
+    for note in found.notes:
+        tell(note)
+    return learned, {**tested, **_told(found), "calibrated": True}
+
+
+def _turned(config: Config) -> str:
+    """Say why the phase is not the one that was found, and what that may mean for masses."""
+    line = config.calibration
+    wanted, found = "brighten", "darken"
+    if line is not None and line.gradient_per_kda < 0:
+        wanted, found = found, wanted
+    return (
+        f"the phase is half a turn from the one that was found, with which particles {found} the "
+        f"image: by calibration.gradient_per_kda they {wanted} it; if that sign is wrong, so is "
+        "that of every mass"
+    )
+
+
+def calibrate_movie(
+    movie: Stack,
+    config: Config,
+    *,
+    free: str | Sequence[str] | None = None,
+    focus_step_nm: float | None = None,
+    progress: Progress = silent,
+    notify: Callable[[str], None] | None = None,
+) -> OpticsCalibration:
+    """Measure the optics of an open movie."""
+    groups = free_groups(free)
+    if focus_step_nm is not None:
+        _check_step(focus_step_nm, movie.shape[0])
+    config, notes = resolve_metadata(config, movie.metadata)
+    for note in notes:
+        if notify is not None:
+            notify(note)
+    refuse_uncalibratable(config)
+    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    with threads(config.compute.workers) as pool:
+        progress("particles", 0, 1)
+        if focus_step_nm is not None:
+            others: list[Sight] = []
+            sights = scan_sights(movie, config, camera)
+        else:
+            sights, others = bright_sights(movie, config, camera, pool)
+        progress("particles", 1, 1)
+        source = {
+            "movie": movie.path.name,
+            "sha256": movie.sha256(),
+            "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
+            "version": version("iscat-analysis"),
+        }  # fmt: skip
+        if focus_step_nm is None:
+            return learned_from(sights, others, movie, config, camera, groups, source, pool)
+        return calibrate_sights(
+            sights, others, config, groups, source,
+            focus_step_nm=focus_step_nm, mapper=pool.map,
+        )  # fmt: skip
+
+
+def _check_step(step_nm: float, frames: int) -> None:
+    """Refuse steps that make no scan: another unit is likely."""
+    number_in("`focus_step_nm`", step_nm, least=-_MOST_STEP_NM, most=_MOST_STEP_NM)
+    travel = abs(step_nm) * (frames - 1)
+    if travel < _LEAST_SCAN_NM:
+        raise ConfigError(
+            f"`focus_step_nm` = {step_nm:g}: over {count(frames, 'frame')} the focus rises by "
+            f"{travel:.3g} nm, which no picture shows; give the step from frame to frame in nm"
+        )
+
+
+def learned_from(
+    sights: Sequence[Sight],
+    others: Sequence[Sight],
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    groups: Sequence[str],
+    source: Mapping[str, str],
+    pool: ThreadPoolExecutor,
+) -> OpticsCalibration:
+    """Learn the optics from particles that stand alone, or where these do not suffice from all."""
+    way = way_of(config)
+    crowded = way == "fixed"
+    if not crowded or len(sights) >= LEAST_SIGHTS:
+        found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        if way == "sliding":
+            frames = fitted_frames(movie, config)
+            return with_drift(found, sights, others, config, frames, source, pool.map)
+        if found.accepted or not crowded:
+            return found
+    return learn_in_field(_summed(movie, config, camera), config, groups, source, pool)
+
+
+def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
+    """Sum the frames before and after particles bound."""
+    return measured_windows(movie, config, camera, *frame_ranges(movie, config))
+
+
+def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
+    """Tell whether the first frames repeat each other, or have not the noise of p-values."""
+    first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
+    counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
+    light, repeats = measure_frames(counts, camera)
+    stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
+    follows = config.background.follows_pattern if way_of(config) == "sliding" else None
+    noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
+    return bool(stuck or noise.differs)
+
+
+def _verdict(tested: dict[str, Any]) -> str:
+    """Say what the test found where the optics are not learned."""
+    if not tested:
+        return "the optics cannot be tested on this movie"
+    if tested["median_p"] >= REJECTED_P:
+        return "the optics cannot be learned from this movie"
+    return (
+        f"the configured optics do not describe the brightest {min(tested['tested'], TESTED)} "
+        f"particles (median p-value {tested['median_p']:.1g}), and they cannot be learned from them"
+    )
+
+
+def _told(found: OpticsCalibration) -> dict[str, Any]:
+    """Give what the summary says of a calibration."""
+    told = found.to_dict()
+    return {
+        key: told[key]
+        for key in ("accepted", "refusals", "parameters", "names", "covariance", "twin", "notes")
+    }
+
+
+def usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
+    """Give the configuration with the learned optics, or why there is none."""
+    if not found.accepted:
+        return None, "; ".join(found.measured.refusals)
+    return with_sign(config.model_copy(update={"optics": found.config.optics}))

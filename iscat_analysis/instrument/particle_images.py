@@ -1,0 +1,389 @@
+"""Pictures of the bright particles of a movie, from which its microscope is measured.
+
+No microscope takes part in finding them: not where they are, and not what they look like.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import Opening, judge_window
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.pattern import corrected
+from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.scene import is_counted, variance_of_background
+from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional, poisson
+from iscat_analysis.instrument.bright import (
+    ALONE_NM,
+    BrightStep,
+    centre_of_energy,
+    energy_of,
+    find_bright_places,
+    find_bright_steps,
+)
+from iscat_analysis.instrument.learner import (
+    FAINTEST,
+    MOST_SIGHTS,
+    PRIVATE,
+    Sight,
+    build_microscope,
+    heights_free,
+    settings_of,
+)
+from iscat_analysis.movie.stack import Stack
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.records import FloatArray, Windows
+from iscat_analysis.search.sliding import stride_of
+from iscat_analysis.search.sliding.chunks import Reader, plan_chunks, reader_of
+from iscat_analysis.threads import over_frames
+
+RINGS_NM = 9000.0
+"""Farther than this from a particle its rings are left out."""
+
+APART_NM = 2000.0
+"""Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
+
+OTHERS_NM = 1700.0
+"""Side of the region on which a neighbour is fitted."""
+
+SAME_NM = 800.0
+"""Nearer than this, and at the same time, two steps are one."""
+
+TESTED = 24
+"""Particles on which optics are tested, the brightest."""
+
+_KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
+_PARTS = 8  # of a movie, that are searched where all of it is asked for
+_SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
+
+
+def bright_sights(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    pool: ThreadPoolExecutor,
+    opening: Opening | None = None,
+    rings: bool = True,
+    whole: bool = False,
+) -> tuple[list[Sight], list[Sight]]:
+    """Find the bright particles of a movie, in the way in which it is analysed.
+
+    Particles with heights of their own are known only from fits of the whole field: there are none
+    then, where frames before and after are compared.
+    """
+    if way_of(config) == "sliding":
+        if opening is not None:
+            return landing_sights(opening.reader, opening.window, config, pool, rings, whole)
+        reader = reader_of(movie, config, camera, fitted_frames(movie, config))
+        window = judge_window(reader, config, pool.map)[2]
+        return landing_sights(reader, window, config, pool, rings, whole)
+    if heights_free(config) and way_of(config) == "fixed":
+        return [], []
+    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
+    return bright_places(windows, config)
+
+
+def kind_of(config: Config) -> str:
+    """Say what such a movie shows, for the record of a calibration."""
+    return "landing movie" if way_of(config) == "sliding" else "frames before and after"
+
+
+def landing_sights(
+    reader: Reader,
+    window: int,
+    config: Config,
+    pool: ThreadPoolExecutor,
+    rings: bool,
+    whole: bool,
+) -> tuple[list[Sight], list[Sight]]:
+    """Find bright steps of a landing movie, chunk by chunk until there are enough."""
+    stride = stride_of(window)
+    found: list[BrightStep] = []
+    rest: list[BrightStep] = []
+    spans = [span for _, span in plan_chunks(reader, config, window, stride)]
+    most = enough = MOST_SIGHTS if rings else TESTED
+    if whole:
+        chosen = np.linspace(0, len(spans) - 1, min(len(spans), _PARTS)).round().astype(int)
+        spans = [spans[k] for k in chosen]
+        most = math.ceil(MOST_SIGHTS / len(spans))
+    for span in spans:
+        chunk = reader.chunk(span, stride, pool)
+        wanted = config.background.follows_pattern
+        chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
+        alone, every = find_bright_steps(
+            chunk,
+            window,
+            pixel_nm=_pixel_nm(config),
+            resolution_nm=config.optics.wavelength_nm / config.optics.na,
+            roi_px=_roi_px(config),
+            most=most,
+            rings=rings,
+            motion=pattern,
+            mapper=over_frames(pool, reader.shape),
+        )
+        found += alone
+        rest += every
+        bright = [step for step in found if step.snr > FAINTEST]
+        if len(bright) >= enough and not whole:
+            break
+    bright.sort(key=lambda step: -step.snr)
+    unique = _without_repeats(bright)
+    others = _without_repeats(rest)
+    model = build_microscope(config, 1000.0, settings_of(config))
+    sights = [
+        [
+            replace(_sight_of(step, config, model), neighbours=_neighbours(step, others, config))
+            for step in steps
+        ]
+        for steps in (unique[:MOST_SIGHTS], others)
+    ]
+    return sights[0], sights[1]
+
+
+def _neighbours(
+    step: BrightStep, others: Sequence[BrightStep], config: Config
+) -> tuple[tuple[int, float], ...]:
+    """List the steps whose rings change while a step's frames are summed, and by what share."""
+    found = []
+    for number, other in enumerate(others):
+        apart = math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) * _pixel_nm(config)
+        if apart > RINGS_NM or (abs(step.frame - other.frame) < 5 and apart < SAME_NM):
+            continue
+        shares = [
+            (stop - min(max(other.frame, start), stop)) / max(stop - start, 1)
+            for start, stop in (step.frames_before, step.frames_after)
+        ]
+        if shares[1] > shares[0]:
+            found.append((number, shares[1] - shares[0]))
+    return tuple(found)
+
+
+def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
+    """Leave out the second of two that chunks with common frames have both found."""
+    kept: list[BrightStep] = []
+    for step in steps:
+        if not any(
+            abs(step.frame - other.frame) < 5
+            and math.hypot(step.x_px - other.x_px, step.y_px - other.y_px) < 5
+            for other in kept
+        ):
+            kept.append(step)
+    return kept
+
+
+def bright_places(
+    windows: Windows, config: Config, alone_nm: float = APART_NM
+) -> tuple[list[Sight], list[Sight]]:
+    """Find bright particles that bound between two ranges of frames."""
+    ratio = windows.power_ratio
+    # the noise of a known background is none
+    noise_before = windows.before_e + windows.read_variance_before_e2 if windows.n_before else 0.0
+    variance = windows.after_e + windows.read_variance_after_e2 + ratio**2 * noise_before
+    used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
+    energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
+    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    sights, others = (
+        [
+            cut_out(row, column, side)
+            for row, column in find_bright_places(
+                energy, pixel_nm=pixel, alone_nm=apart_nm, roi_px=side
+            )
+        ]
+        for apart_nm, side in ((alone_nm, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
+    )
+    sights, others = (
+        [_among(sight, others, SAME_NM) for sight in some] for some in (sights, others)
+    )
+    return _bright(sights), others
+
+
+def known_places(
+    windows: Windows, config: Config, known: Sequence[FloatArray], least: int
+) -> tuple[list[Sight], list[Sight]]:
+    """Cut out particles that are known, those that are farthest from others.
+
+    Shapes: `known` (5,).
+    """
+    pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
+    heights = config.fit.z_range_nm if heights_free(config) else None
+
+    def cut(chosen: FloatArray, side: int) -> list[Sight]:
+        places = np.rint(chosen[:, 1::-1] / pixel).astype(int).tolist()
+        return [
+            replace(cut_out(row, column, side).moved(theta), heights_nm=heights)
+            for (row, column), theta in zip(places, chosen, strict=True)
+        ]
+
+    thetas = np.array(known).reshape(-1, PRIVATE)
+    places_nm = thetas[:, :2]
+    others = cut(thetas, round(OTHERS_NM / pixel))
+    room = (_roi_px(config) // 2 + 1) * pixel
+    far = np.array(windows.after_e.shape[::-1]) * pixel - room
+    inside = ((places_nm >= room) & (places_nm < far)).all(axis=1)
+    apart = np.hypot(*(places_nm[:, None] - places_nm).transpose(2, 0, 1))
+    np.fill_diagonal(apart, np.inf)
+    nearest = apart.min(axis=1, initial=np.inf)[inside]
+    seen = [_among(sight, others, 0.0) for sight in cut(thetas[inside], _roi_px(config))]
+    for alone_nm in _KNOWN_APART_NM:
+        sights = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
+        if len(sights) >= least:
+            break
+    return sights, [_among(other, others, 0.0) for other in others]
+
+
+def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight]:
+    """Give what cuts a square out of the field, as far as it goes."""
+    model = build_microscope(config, 1000.0, settings_of(config))
+    shape, ratio = windows.after_e.shape, windows.power_ratio
+
+    def cut_out(row: int, column: int, side: int) -> Sight:
+        (top, bottom), (left, right) = _region(row, column, side)
+        rows = max(top, 0), min(bottom, shape[0])
+        columns = max(left, 0), min(right, shape[1])
+        grid = PixelGrid.region(rows, columns, _pixel_nm(config))
+        cut = slice(*rows), slice(*columns)
+        likelihood = counts_likelihood(
+            model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
+            background=variance_of_background(config), use_conditional=is_counted(config),
+            read_variance_before_e2=windows.read_variance_before_e2[cut],
+            read_variance_after_e2=windows.read_variance_after_e2[cut],
+            masked=windows.masked[cut],
+        )  # fmt: skip
+        return _centred(likelihood, config)
+
+    return cut_out
+
+
+def _among(sight: Sight, others: Sequence[Sight], least_nm: float) -> Sight:
+    """Tell a sight which of the others are near, but not so near that they are the same."""
+    apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
+    near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
+    return replace(sight, neighbours=tuple(near))
+
+
+def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
+    """Cut the particles of a scan of the focus out of its frames.
+
+    The particles stay where they are, so that no frame shows the background alone.  It comes from
+    ``background.frames`` where the movie has some; otherwise it is taken for even around each
+    particle, at a level that is fitted in every picture.
+    """
+    known = config.background.recorded
+    start = known[1] if known else 0
+    first, last = config.fit.frames or (start, movie.shape[0])
+    counts = movie.read(first, last)
+    check_counts(counts, first, movie.name, camera=camera)
+    frames = camera.to_electrons(counts)
+    read = camera.read_variance_e2((movie.shape[1], movie.shape[2]))
+    background, n_before = np.ones(read.shape), 0
+    if known:
+        n_before = known[1] - known[0]
+        background = camera.to_electrons(movie.read(*known)).sum(axis=0)
+    ratios = np.array([np.median(frame / background) for frame in frames])
+    energies = []
+    for frame, ratio in zip(frames, ratios, strict=True):
+        noise = ratio**2 * (background + n_before * read) if n_before else 0.0
+        energies.append(
+            energy_of(frame - ratio * background, frame + read + noise, frame > 0, _spot_px(config))
+        )
+    energy = np.mean(energies, axis=0) * math.sqrt(len(energies))
+    places = find_bright_places(
+        energy, pixel_nm=_pixel_nm(config), alone_nm=ALONE_NM, roi_px=_roi_px(config)
+    )
+    model = build_microscope(config, 1000.0, settings_of(config))
+    saturated = np.any(camera.saturated(counts), axis=0)
+    sights: list[Sight] = []
+    per_place = max(1, MOST_SIGHTS // max(len(places), 1))
+    taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
+    for row, column in places[:MOST_SIGHTS]:
+        region = _region(row, column, _roi_px(config))
+        grid = PixelGrid.region(*region, _pixel_nm(config))
+        cut = slice(*region[0]), slice(*region[1])
+        masked = np.asarray(saturated)[cut]
+        seen: list[Sight] = []
+        for index in taken.astype(int):
+            frame, ratio = frames[index][cut], float(ratios[index])
+            if n_before:
+                likelihood = conditional(
+                    model, grid, background[cut], frame, ratio,
+                    read_variance_before_e2=n_before * read[cut],
+                    read_variance_after_e2=read[cut], masked=masked,
+                )  # fmt: skip
+            else:
+                level = np.full(frame.shape, float(np.median(frame)))
+                likelihood = poisson(
+                    model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
+                )
+            seen.append(replace(_centred(likelihood, config), focus_steps=float(index)))
+        weights = [sight.snr**2 for sight in seen]
+        x_nm, y_nm = (
+            float(np.average([getattr(sight, key) for sight in seen], weights=weights))
+            for key in ("x_nm", "y_nm")
+        )
+        sights += [replace(sight, x_nm=x_nm, y_nm=y_nm) for sight in seen]
+    return _bright(sights)
+
+
+def _centred(likelihood: Likelihood, config: Config) -> Sight:
+    """Make a sight of a picture, from the centre of its energy."""
+    grid = likelihood.grid
+    information = likelihood.signal_information()
+    contrast = np.nan_to_num(likelihood.measured_signal())
+    used = information > 0
+    contrast = np.where(used, contrast - np.average(contrast, weights=information), 0.0)
+    variance = 1 / np.where(used, information, 1e-6)
+    y, x, snr = centre_of_energy(contrast, variance, grid.pixel_nm)
+    return Sight(
+        grid=grid, kind=likelihood.kind, data=likelihood.data,
+        x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
+        z_nm=config.particle.height_nm, snr=snr,
+    )  # fmt: skip
+
+
+def _bright(sights: Iterable[Sight]) -> list[Sight]:
+    """Keep the pictures that are bright enough, the brightest first."""
+    return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
+
+
+def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> Sight:
+    """Make a sight of a step."""
+    grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
+    likelihood = conditional(
+        model, grid, step.before_e, step.after_e, step.power_ratio * step.motion,
+        read_variance_before_e2=step.n_before * step.read_variance_e2,
+        read_variance_after_e2=step.n_after * step.read_variance_e2, masked=~step.usable,
+    )  # fmt: skip
+    middles = tuple(sum(frames) / 2 for frames in (step.frames_before, step.frames_after))
+    return replace(_centred(likelihood, config), frames=(middles[0], middles[1]))
+
+
+def _pixel_nm(config: Config) -> float:
+    return float(config.camera.pixel_size_nm or math.nan)
+
+
+def _roi_px(config: Config) -> int:
+    return config.fit.roi_px(_pixel_nm(config))
+
+
+def _spot_px(config: Config) -> float:
+    return config.optics.wavelength_nm / config.optics.na / _pixel_nm(config)
+
+
+def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    first, left = row - side // 2, column - side // 2
+    return (first, first + side), (left, left + side)
+
+
+def reach_nm(sight: Sight) -> float:
+    """Distance from a particle, which may move in its picture, to the farthest pixel."""
+    return sight.grid.diagonal_nm / 2 + _SHIFT_NM

@@ -1,0 +1,1 @@
+"""Which particles land and leave?  Windows before and after each step."""

@@ -1,0 +1,251 @@
+"""Landing movies: particles land and leave at unknown times and places, and the windows slide.
+
+The movie is read once, in chunks that fit into memory.  A chunk has a core, whose steps are its
+own, and three windows of frames on either side, so that every step in the core is seen with all
+its neighbours.  A step on the seam may be dated on either side of it: both chunks report what lies
+near it, and the one whose core holds it is believed.  Chunks depend on the movie and the
+configuration alone, so a finished one can be kept on disk and a resumed run gives the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import Trajectory
+from iscat_analysis.camera.lines import Lines, SteadyFrames
+from iscat_analysis.config import Config, with_absolute_paths
+from iscat_analysis.diagnosis.noise import Opening, judge_opening
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.errors import FloodError
+from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.results import Compared, Found
+from iscat_analysis.fitting.run import Notify, Run
+from iscat_analysis.fitting.scene import Scene, make_scene
+from iscat_analysis.landing.chunk_store import Store
+from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
+from iscat_analysis.landing.companion import paired
+from iscat_analysis.landing.merging import Done, Merged
+from iscat_analysis.landing.odd_frames import frame_warnings
+from iscat_analysis.places import Here, Place
+from iscat_analysis.records import CountSource, Progress, Status
+from iscat_analysis.search.sliding import boundaries, stride_of
+from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
+from iscat_analysis.threads import beside, one_thread_algebra, threads
+
+_NEEDED_LATER = "scipy.optimize"  # by species, and a tenth of a second to load
+
+POSTERIORS = 20
+"""Events whose posterior is sampled, where the configuration asks for it."""
+
+
+def find_landings(ready: Prepared, run: Run) -> Found:
+    """Find what lands or leaves between windows that slide over a movie."""
+    for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
+        run.notify(remark)
+    try:
+        found = analyse_landings(
+            ready.movie,
+            ready.config,
+            ready.camera,
+            tell=run.tell,
+            progress=run.progress,
+            prepare=run.warm_up,
+            partial=run.partial,
+            identity=ready.movie.identity if run.partial else "",
+            lines=ready.lines,
+            place=run.place,
+            opening=ready.opening,
+        )
+    except FloodError as error:  # what seems to be noise is then particles
+        raise FloodError(ready.other_kind) if ready.other_kind else error from None
+    run.clock.lap("landing")
+    return found
+
+
+def _nothing(scene: Scene) -> None:
+    """Do nothing."""
+
+
+def analyse_landings(
+    movie: CountSource,
+    config: Config,
+    camera: Camera,
+    *,
+    tell: Notify,
+    progress: Progress,
+    prepare: Callable[[Scene], None] = _nothing,
+    partial: Path | None = None,
+    identity: str = "",
+    lines: Lines | None = None,
+    place: Place | None = None,
+    opening: Opening | None = None,
+) -> Found:
+    """Find and fit every particle that lands or leaves."""
+    place = place or Here()
+    first, last = fitted_frames(movie, config)
+    frames = movie if lines is None else SteadyFrames(movie, lines, camera)
+    if opening is None:
+        reader = reader_of(frames, config, camera, (first, last))
+        opening = judge_opening(reader, config)
+    reader, noise, window = opening.reader, opening.noise, opening.window
+    for text in noise.said(movie.name):
+        tell(text)
+    stride = stride_of(window)
+    count = boundaries(last - first, window)
+    posterior = config.samples_posterior
+    sampling = config.posterior.model_copy(update={"enabled": posterior})
+    config = config.model_copy(update={"posterior": sampling})
+    with one_thread_algebra():
+        scene = make_scene(
+            config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
+        )
+    prepare(scene)
+    plan = plan_chunks(reader, config, window, stride)
+    store = Store(partial, config, identity, reader.shape, (first, last), camera)
+    movie_job = ChunkSetting(
+        frames, camera, with_absolute_paths(config), (first, last), count, window,
+        noise.spectrum, noise.excess, lines,
+    )  # fmt: skip
+    place = paired(place, config, movie_job, len(plan))
+    merged = Merged(reader.shape)
+    interrupted = False
+    with threads(place.threads(config.compute.workers)) as pool:
+
+        def finish(number: int) -> Done:
+            done = None if posterior else store.load(number)
+            if done is None:
+                core, span = plan[number]
+                budget = POSTERIORS - merged.sampled if posterior else 0
+                earlier = merged.earlier(number, core[0] - window)  # before all of this chunk
+                if place.distant:
+                    reader.forget()  # whoever does it has a reader of its own
+                    done = place.call(chunk_job, movie_job, core, span, budget, earlier)
+                else:
+                    chunk = reader.chunk(span, stride, pool)
+                    done = analyse_chunk(
+                        scene, chunk, core, window, pool, budget, noise.excess, earlier
+                    )
+                store.save(number, done)
+            merged.note(number, done)
+            return done
+
+        try:
+            with closing(_finished(finish, len(plan), place, merged, posterior)) as finished:
+                for frames_done, stopped in finished:
+                    if frames_done < last - first:
+                        progress("landing", frames_done, last - first)
+                        import_module(_NEEDED_LATER)  # the other process may still be at work
+                    if stopped:
+                        interrupted = True
+                        break
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            interrupted = True
+    forgetting = beside(reader.forget)
+    fits, views, repeats = merged.result()
+    light, drift = merged.light(), merged.drift()
+    forgetting.result()
+    if not interrupted:  # and their memory is free again
+        progress("landing", last - first, last - first)
+    wanted = config.background.follows_pattern
+    for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
+        tell(text)
+    if merged.cause:
+        tell(f"{movie.name}: {merged.cause}")
+    if not config.background.power_normalization:
+        tell(
+            "background.power_normalization = false has no effect on a landing movie: each frame "
+            "is weighed by its own light"
+        )
+    summary = {
+        "window_frames": window,
+        "stride_frames": stride,
+        "boundaries_searched": count,
+        **_counted(fits),
+        "shot_noise_limited_frames": opening.curve.shot_limited,
+        "noise_frames": list(opening.curve.frames),
+        "noise_variance_over_shot": list(opening.curve.variance_over_shot),
+        "noise_spectrum": noise.summary,
+        "frames_left_out": merged.left_out(),
+        "drift_px": drift,
+        **_way(merged.trajectory()),
+        "chunks": len(plan),
+    }
+    return Found(
+        scene=scene,
+        fits=fits,
+        views=views,
+        image=scene.contrasts(merged.image),
+        compared=Compared(
+            frames_before=(0, 0),
+            frames_after=(first, first + light.size),
+            power_ratio=1.0,
+            power=light / np.nanmean(light) if np.isfinite(light).any() else light,
+            masked_pixels=merged.masked_pixels,
+        ),
+        heading="landing",
+        summary=summary,
+        repeats=repeats,
+        empty=merged.empty,
+        trajectory=merged.trajectory(),
+        interrupted=interrupted,
+    )
+
+
+def _finished(
+    finish: Callable[[int], Done], count: int, place: Place, merged: Merged, posterior: bool
+) -> Generator[tuple[int, bool]]:
+    """Finish chunks and merge them in their order, whichever comes first.
+
+    Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
+    has the posteriors that those before it left to sample: with posteriors, one follows another.
+    """
+
+    def results() -> Iterator[tuple[int, Done]]:
+        alone = 0
+        while posterior and alone < count and merged.sampled < POSTERIORS:
+            yield alone, finish(alone)
+            alone += 1
+        for number, done in place.each(finish, range(alone, count)):
+            yield alone + number, done
+
+    waiting: dict[int, Done] = {}
+    ready = frames = 0
+    for number, done in results():
+        waiting[number] = done
+        merged.note(number, done)
+        frames += done.core[1] - done.core[0]
+        while ready in waiting:
+            merged.add(waiting.pop(ready))
+            ready += 1
+        yield frames, done.stopped
+
+
+def _counted(table: pd.DataFrame) -> dict[str, int]:
+    """Count landings and leavings."""
+    left = table["mass_kda"][table["status"] != Status.SIDELOBE] < 0
+    return {"landings": int((~left).sum()), "leavings": int(left.sum())}
+
+
+def _way(trajectory: Trajectory | None) -> dict[str, Any]:
+    """Give what the summary says of a trajectory."""
+    if trajectory is None:
+        return {
+            "drift_corrected": False,
+            **dict.fromkeys(("drift_frames", "drift_x_px", "drift_y_px", "drift_error_px")),
+        }
+    return {
+        "drift_corrected": True,
+        "drift_frames": trajectory.frames.tolist(),
+        "drift_x_px": trajectory.shift_px[:, 1].tolist(),
+        "drift_y_px": trajectory.shift_px[:, 0].tolist(),
+        "drift_error_px": trajectory.typical_error_px,
+    }

@@ -1,0 +1,193 @@
+"""Finished chunks of a landing movie, joined again: each event once, in order of frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.drift import Trajectory, measure_drift
+from iscat_analysis.pieces.regions import lines_from, numbered
+from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray
+from iscat_analysis.search.empty import EmptySpread
+
+VIEWS = 1000
+"""Events whose images are kept for the report."""
+
+CLIPS = 250
+"""Events of which a clip is kept, the first; the page holds fewer."""
+
+_SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
+
+
+@dataclass(frozen=True)
+class Done:
+    """What is kept of a finished chunk."""
+
+    core: tuple[int, int]
+    lines: pd.DataFrame  # of fits.csv, which have no numbers yet
+    repeats: FloatArray  # of every row, from `iscat_analysis.inference.repeats`
+    views: tuple[EventView, ...]
+    good: BoolArray  # of the core
+    light: FloatArray
+    masked: BoolArray
+    saturated: BoolArray
+    strongest: FloatArray
+    ends_e: FloatArray  # mean images of its first and last quarter
+    sampled: int = field(default=0)
+    stopped: bool = False  # in the middle of its chains
+    trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
+    cause: str = ""  # what the model probably has wrong
+    empty: EmptySpread | None = None  # noise where nothing lands or leaves
+
+
+class Merged:
+    """Finished chunks, in order."""
+
+    def __init__(self, shape: tuple[int, int]) -> None:
+        self._done: list[Done] = []
+        self._dated: dict[int, NDArray[np.int64]] = {}
+        self._strongest = np.zeros((2, *shape))
+        self.sampled = 0
+        self.cause = ""
+        self.empty: EmptySpread | None = None
+
+    def note(self, number: int, done: Done) -> None:
+        """Note when the events of a finished chunk happen, whose turn may not have come yet."""
+        frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
+        self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
+
+    def earlier(self, number: int, frame: int) -> int:
+        """Count the events before a frame, of the finished chunks before one."""
+        known = list(self._dated.items())  # other threads note theirs
+        return sum(int((dated < frame).sum()) for n, dated in known if n < number)
+
+    def add(self, done: Done) -> None:
+        """Take one more."""
+        stronger = done.strongest[0] > self._strongest[0]
+        self._strongest = np.where(stronger, done.strongest, self._strongest)
+        self.sampled += done.sampled
+        self.cause = self.cause or done.cause
+        if done.empty is not None:
+            self.empty = done.empty if self.empty is None else self.empty + done.empty
+        # the images are merged; holding them for every chunk would grow with the movie
+        small = np.empty((2, 0, 0))
+        kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
+        if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
+            kept = tuple(replace(view, clip=None) for view in kept)
+        ends = done.ends_e
+        if len(self._done) > 1:
+            self._done[-1] = replace(self._done[-1], ends_e=small)
+        self._done.append(replace(done, strongest=small, views=kept, ends_e=ends))
+
+    @property
+    def image(self) -> FloatArray:
+        """Amplitude of the strongest step of each pixel."""
+        image: FloatArray = self._strongest[1]
+        return image
+
+    def result(self) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
+        """Events of all chunks, each once, numbered in order of frame; their views and repeats."""
+        homes = [(done, row) for done in self._done for row in range(len(done.lines))]
+        if not homes:
+            return numbered(lines_from([], FRAME_COLUMN), []), (), ()
+        table = pd.concat([d.lines for d in self._done if len(d.lines)], ignore_index=True)
+        cores = np.array([done.core for done, _ in homes])
+        frame = table["frame"].to_numpy()
+        own = (frame >= cores[:, 0]) & (frame < cores[:, 1])
+        finished = np.zeros(len(table), dtype=np.bool_)
+        for done in self._done:
+            finished |= (frame >= done.core[0]) & (frame < done.core[1])
+        kept = np.flatnonzero(own)
+        for stranger in np.flatnonzero(~own & finished):
+            if not _same(table, int(stranger), kept):
+                kept = np.append(kept, stranger)
+        order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
+        views, repeats = [], []
+        for number, i in enumerate(order):
+            done, row = homes[i]
+            repeats.append(done.repeats[row])
+            if number < VIEWS and row < len(done.views):
+                view = replace(done.views[row], event=number)
+                views.append(view if number < CLIPS else replace(view, clip=None))
+        rows = numbered(table.iloc[order], range(len(order)))
+        return rows, tuple(views), tuple(repeats)
+
+    def light(self) -> FloatArray:
+        """Light of the frames that are done; NaN where one was left out."""
+        return np.concatenate([np.empty(0), *(done.light for done in self._done)])
+
+    def left_out(self) -> int:
+        """Frames that are zero or repeat the one before."""
+        return int(sum(np.count_nonzero(~d.good) for d in self._done))
+
+    def repeats(self) -> NDArray[np.int64]:
+        """Frames left out, counted from the first of the movie's part that was read."""
+        good = np.concatenate([np.empty(0, dtype=np.bool_), *(d.good for d in self._done)])
+        return np.flatnonzero(~good.astype(np.bool_))
+
+    def trajectory(self) -> Trajectory | None:
+        """Way of the fixed pattern through all chunks that followed it; None where none did."""
+        parts: list[Trajectory] = []
+        way: Trajectory | None = None  # the chunk before, halo included
+        for done in self._done:
+            part = done.trajectory
+            if part is None:
+                continue
+            if way is not None:
+                common = part.frames <= way.frames[-1]
+                common[0] = True
+                offset = way.at(part.frames[common]) - part.shift_px[common]
+                part = replace(part, shift_px=part.shift_px + offset.mean(axis=0))
+            own = (part.frames >= done.core[0]) & (part.frames < done.core[1])
+            parts.append(Trajectory(part.frames[own], part.shift_px[own], part.error_px[own]))
+            way = part
+        if not parts:
+            return None
+        return Trajectory(
+            np.concatenate([p.frames for p in parts]),
+            np.concatenate([p.shift_px for p in parts]) - parts[0].shift_px[0],
+            np.concatenate([p.error_px for p in parts]),
+        )
+
+    def unfollowed(self) -> list[tuple[int, int]]:
+        """Frames of chunks in which no motion was looked for, or there was no pattern to follow."""
+        return [done.core for done in self._done if done.trajectory is None]
+
+    def drift(self) -> list[float] | None:
+        """Shift (y, x) of the fixed pattern from the first frames to the last [px]."""
+        if not self._done:
+            return None
+        way = self.trajectory()
+        if way is not None:
+            return [float(d) for d in way.shift_px[-1]]
+        dy, dx = measure_drift(self._done[0].ends_e[0], self._done[-1].ends_e[1])
+        return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
+
+    @property
+    def masked_pixels(self) -> int:
+        """Pixels that are not used in some chunk."""
+        return int(np.any([d.masked for d in self._done], axis=0).sum()) if self._done else 0
+
+    def masks(self) -> tuple[int, int]:
+        """Defective and saturated pixels."""
+        if not self._done:
+            return 0, 0
+        masked = np.any([d.masked for d in self._done], axis=0)
+        saturated = np.any([d.saturated for d in self._done], axis=0)
+        return int(np.sum(masked & ~saturated)), int(saturated.sum())
+
+
+def _same(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
+    """Whether some other row describes the same step."""
+    frame, error, x, y, mass = (
+        table[name].to_numpy(dtype=float)
+        for name in ("frame", FRAME_COLUMN, "x_px", "y_px", "mass_kda")
+    )
+    near = np.abs(frame[others] - frame[one]) <= np.maximum(2, error[others] + error[one])
+    near &= np.hypot(x[others] - x[one], y[others] - y[one]) < _SEAM_PX
+    near &= mass[others] * mass[one] > 0
+    return bool(near.any())

@@ -1,0 +1,257 @@
+"""Steps and what they do to each other's light.
+
+A neighbour that lands or leaves in the frames of a step enters its likelihood through ρ, pixel by
+pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the frames after and before
+in which it is there.
+
+Where the sample drifts, a particle moves with it: the mean of C over a window is its expansion to
+second order in the shift since the step, mean and smear.  In the pattern, whose motion is divided
+out, it is held with the share f of the light that makes the pattern, which is taken off again:
+(1 + φ_a C_a)/(1 + φ_b C_b) · (1 + f C_b)/(1 + f C_a).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis._kernels.stepping import add_image, times_change
+from iscat_analysis.camera.drift import derivatives
+from iscat_analysis.fitting.pattern import MovingPattern
+from iscat_analysis.fitting.regions import Region
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.search.sliding import Chunk, StepFrame
+from iscat_analysis.search.templates import LARGEST_IMAGE
+
+_FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
+WHOLE = (slice(None), slice(None))
+"""All of an image."""
+
+_WEAK = 0.05  # contrast up to which several add up
+
+
+@dataclass(frozen=True)
+class Step:
+    """One particle that lands or leaves."""
+
+    sign: int
+    at: StepFrame
+    start: Candidate
+    corner: tuple[int, int]
+    image: FloatArray
+    slopes: FloatArray | None = None
+    theta: FloatArray | None = None
+    snr: float = math.inf
+    excess: float = 0.0
+
+
+class Neighbours:
+    """Which steps see each other, and how."""
+
+    def __init__(
+        self, scene: Scene, chunk: Chunk, window: int, pattern: MovingPattern | None = None
+    ) -> None:
+        self._pattern = pattern
+        self._scene = scene
+        self._chunk = chunk
+        self._window = window
+        self._roi_px = scene.roi_px
+        nominal = scene.model.material.mass_kda
+        self._contrast_per_kda = (
+            scene.model.peak_contrast(scene.config.particle.height_nm, nominal) / nominal
+        )
+        self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
+
+    def draw(
+        self,
+        sign: int,
+        at: StepFrame,
+        start: Candidate,
+        *,
+        theta: FloatArray | None = None,
+        snr: float = math.inf,
+        excess: float = 0.0,
+    ) -> Step:
+        """Make a step, with its contrast drawn where it is.
+
+        Shapes: `theta` (5,).
+        """
+        scene, half = self._scene, self._half(start)
+        sides = []
+        for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
+            middle = round(centre)
+            sides.append((max(middle - half, 0), min(middle + half + 1, size)))
+        grid = PixelGrid.region(sides[0], sides[1], scene.pixel_nm)
+        pixel = scene.pixel_nm
+        shown = at.frame + sign * self._window // 2
+        image = scene.wide_at(shown).image(
+            grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
+        )
+        corner = sides[0][0], sides[1][0]
+        slopes = None if self._pattern is None else derivatives(image)
+        return Step(sign, at, start, corner, image, slopes, theta, snr, excess)
+
+    def _half(self, start: Candidate) -> int:
+        """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
+        return round(self._roi_px * min(max(start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
+
+    def overlaps(self, step: Step, start: int, stop: int) -> bool:
+        """Whether a step lies inside frames relative to the chunk."""
+        return start < step.at.frame - self._chunk.first < stop
+
+    def presence(self, step: Step, frames: slice) -> float:
+        """Share of the frames' light that shines while the particle is there."""
+        power = self._power
+        whole = power[frames.stop] - power[frames.start]
+        if whole <= 0:
+            return 0.0
+        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+        later = (power[frames.stop] - power[turn]) / whole
+        return float(later if step.sign > 0 else 1 - later)
+
+    def box(self, step: Step) -> tuple[slice, slice]:
+        """Pixels of the field that a step's image covers."""
+        (y, x), (height, width) = step.corner, step.image.shape
+        return slice(y, y + height), slice(x, x + width)
+
+    def factor(
+        self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
+    ) -> FloatArray:
+        """Light after over light before that a step's particle makes, pixel by pixel."""
+        image = step.image[inside]
+        shares = self.presence(step, before), self.presence(step, after)
+        if self._pattern is None:
+            factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
+            return factor
+        held = self.presence(step, self._pattern.span(before, after))
+        if shares == (held, held):
+            return np.ones(image.shape)
+        windows = before, after
+        there = [
+            1 + share * self.seen(step, self._present(step, window), inside)
+            for share, window in zip(shares, windows, strict=True)
+        ]
+        known = [1 + held * self.seen(step, window, inside) for window in windows]
+        moving: FloatArray = there[1] / there[0] * known[0] / known[1]
+        return moving
+
+    def apply(
+        self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
+    ) -> None:
+        """Multiply the pixels of a region that a step's image covers with `factor`."""
+        turn = step.at.frame - self._chunk.first
+        if self._pattern is None and not before.start < turn < after.stop:
+            return  # there in all of these frames, or in none
+        shared = self.shared(step, region)
+        if shared is None:
+            return
+        here, inside = shared
+        if self._pattern is not None:
+            ratio[here] *= self.factor(step, before, after, inside)
+            return
+        shares = self.presence(step, before), self.presence(step, after)
+        if shares[0] != shares[1]:
+            times_change(ratio, _ends(here), step.image, _ends(inside), *shares)
+
+    def own_factor(
+        self, step: Step, before: slice, after: slice, inside: tuple[slice, slice]
+    ) -> FloatArray:
+        """`factor` of the step that is fitted, but for its image at its mean place in a window."""
+        with_it = after if step.sign > 0 else before
+        model = 1 + self.seen(step, with_it, inside, smeared=False)
+        factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
+        return factor
+
+    def change(self, step: Step, before: slice, after: slice) -> tuple[FloatArray, float]:
+        """Contrast that a step's particle makes between ranges of frames: a multiple of an image.
+
+        A weak one has the same image, its own, at all times.
+        """
+        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
+        if strong or self._pattern is not None:
+            return self.factor(step, before, after) - 1, 1.0
+        return step.image, self.presence(step, after) - self.presence(step, before)
+
+    def add_change(self, total: FloatArray, step: Step, before: slice, after: slice) -> None:
+        """Add to a field the contrast that a step's particle makes between ranges of frames."""
+        image, share = self.change(step, before, after)
+        add_image(total, step.corner, image, share)
+
+    def _present(self, step: Step, frames: slice) -> slice:
+        """Give those of the frames in which the particle is there; all if it is there in none."""
+        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+        part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
+        return part if part.start < part.stop else frames
+
+    def seen(
+        self, step: Step, frames: slice, inside: tuple[slice, slice], *, smeared: bool = True
+    ) -> FloatArray:
+        """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
+        image = step.image[inside]
+        if self._pattern is None or step.slopes is None:
+            return image
+        (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
+        if not smeared:
+            yy, yx, xx = y * y, y * x, x * x
+        seen: FloatArray = image + np.einsum(
+            "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.slopes[(slice(None), *inside)]
+        )
+        return seen
+
+    def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
+        """For each step, others that its fit should know of, and those that it depends on."""
+        x, y, frame = (
+            np.array(values, dtype=float)
+            for values in zip(
+                *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
+            )
+        )
+        reach = np.array([self._half(s.start) for s in steps]) + self._roi_px / 2 + 2
+        seen, bound = [], []
+        for i in range(len(steps)):
+            dt = np.abs(frame - frame[i])
+            dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
+            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < reach)
+            near[i] = False
+            seen.append([int(k) for k in np.flatnonzero(near)])
+            near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
+            bound.append([int(k) for k in np.flatnonzero(near)])
+        return seen, bound
+
+    def shown(self, step: Step, region: Region) -> tuple[tuple[slice, slice], FloatArray] | None:
+        """Which pixels of a region show a step, and its contrast there, as frames are corrected."""
+        shared = self.shared(step, region)
+        if self._scene.lines is None:
+            return None if shared is None else (shared[0], step.image[shared[1]])
+        total = np.zeros(self._chunk.shape)
+        total[self.box(step)] = step.image
+        return WHOLE, self._scene.left(total)[region.slices]
+
+    def shared(
+        self, step: Step, region: Region
+    ) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
+        """Where a step's image and a region overlap: in the region, and in the image."""
+        (y, x), (height, width) = step.corner, step.image.shape
+        (first, last), (begin, end) = region.rows, region.columns
+        top, bottom = max(y, first), min(y + height, last)
+        left, right = max(x, begin), min(x + width, end)
+        if top >= bottom or left >= right:
+            return None
+        here = slice(top - first, bottom - first), slice(left - begin, right - begin)
+        return here, (slice(top - y, bottom - y), slice(left - x, right - x))
+
+
+def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:
+    """First and last row, first and last column, half-open."""
+    rows, columns = part
+    return rows.start, rows.stop, columns.start, columns.stop
+
+
+def distance_px(one: Step, two: Step) -> float:
+    """Distance between two steps."""
+    return math.hypot(one.start.x_px - two.start.x_px, one.start.y_px - two.start.y_px)

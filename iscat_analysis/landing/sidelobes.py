@@ -1,0 +1,111 @@
+"""Which peaks of a landing movie are steps, and which the side lobes of others.
+
+A peak beside a higher one waits until that one is fitted and taken off.  What is left then must
+exceed what the fits leave over, which `iscat_analysis.search.residue` measures on them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from iscat_analysis._kernels.sliding import in_shadow
+from iscat_analysis.landing.neighbours import Step
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden, size_on_ring
+from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
+from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
+
+_RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
+_RINGS = 0.04  # the same for the rest of its region
+
+
+@dataclass(frozen=True)
+class Sieve:
+    """Tells steps from side lobes."""
+
+    first: int
+    stride: int
+    window: int
+    roi_px: int
+
+    def sift(
+        self, peaks: Sequence[Peak], steps: Sequence[Step], snr: MapArray
+    ) -> tuple[list[Peak], list[Peak]]:
+        """Sort peaks.
+
+        Shapes: `snr` (n, y, x).
+        """
+        fresh: list[Peak] = []
+        doubtful: list[Peak] = []
+        dated = np.array([step.at.frame for step in steps])
+        for peak, waits in zip(peaks, self._waiting(peaks), strict=True):
+            if waits:
+                continue
+            seen = np.abs(dated - peak.frame) <= (STRIDES + 1) * self.stride
+            met = [steps[int(i)] for i in np.flatnonzero(seen)]
+            if any(self._is_residue(step, peak) for step in met):
+                continue
+            size = self._left_over(peak, met, snr)
+            if abs(peak.snr) > size:
+                fresh.append(peak)
+            elif not is_hidden(peak.snr, size):
+                doubtful.append(peak)
+        return fresh, doubtful
+
+    def _waiting(self, peaks: Sequence[Peak]) -> list[bool]:
+        """Tell which peaks may be nothing but the side lobe of a higher one.
+
+        A peak that waits makes others wait too, or its own rings would be taken for particles.
+        """
+        table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
+        reach, side = STRIDES * self.stride, self.roi_px
+        hidden: list[bool] = in_shadow(
+            table, (reach, reach + self.stride), (NEAR * side, side, LARGEST_IMAGE * side),
+            (SIDELOBE, FAR_LOBE),
+        ).tolist()  # fmt: skip
+        return hidden
+
+    def _is_residue(self, step: Step, peak: Peak) -> bool:
+        """Whether a peak may be a residual of a fitted step, whose model is never quite right."""
+        start = step.start
+        distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
+        on_top = distance < self.roi_px / 6
+        if on_top and abs(step.at.frame - peak.frame) > self.stride:
+            return False
+        share = _RESIDUE if on_top else _RINGS
+        return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
+
+    def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
+        """Signal-to-noise ratio that a peak must exceed not to be what the fits left over.
+
+        The nearest steps come first, and the search ends with one that hides the peak.
+        """
+        away = [math.hypot(peak.x_px - s.start.x_px, peak.y_px - s.start.y_px) for s in steps]
+        size = max(
+            (
+                self._inside(s, peak)
+                for s, d in zip(steps, away, strict=True)
+                if d < self.roi_px / 2
+            ),
+            default=0.0,
+        )
+        places = [(s.start.x_px, s.start.y_px) for s in steps]
+        j = round((peak.frame - self.first) / self.stride) - 1
+        for i in np.argsort(away, kind="stable").tolist():
+            if is_hidden(peak.snr, size) or away[i] > LARGEST_IMAGE * self.roi_px:
+                break
+            others = places[:i] + places[i + 1 :]
+            beside = size_on_ring(snr[j], places[i], (peak.x_px, peak.y_px), others)
+            size = max(size, EXCEEDS * beside)
+        return size
+
+    def _inside(self, step: Step, peak: Peak) -> float:
+        """Give what a peak in a step's fitted region must exceed.
+
+        A window that holds only some frames of the step shows only that part of the misfit.
+        """
+        part = max(1 - abs(step.at.frame - peak.frame) / self.window, 0.0)
+        return part * math.sqrt(EXPLAINS * step.excess)

@@ -1,0 +1,326 @@
+"""Repeats: every estimate on parts of its own frames, and the same frames where nothing landed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.field import total_signal
+from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
+from iscat_analysis.fitting.regions import Region, photons_scale
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.repeats import (
+    PARTS,
+    Response,
+    Series,
+    repeats_of,
+    response_of,
+    series_of,
+)
+from iscat_analysis.landing.neighbours import Neighbours, Step
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
+from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.search.sliding import Chunk, Patch
+from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
+
+PLACES, MOVIE_PLACES = 20_000, 100_000
+"""Places times windows at which the noise of a chunk is looked at, and of a whole movie."""
+
+MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
+"""Windows of a chunk that are looked at."""
+
+_LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
+_BLOCK_BYTES = 16 * 2**20
+
+
+def nothing_repeated(mode: str) -> FloatArray:
+    """Give what is known of an event whose frames could not be compared."""
+    empty = Series(np.zeros((len(FREE_PARAMETERS[mode]), 0)), *(np.zeros(0) for _ in range(3)))
+    return repeats_of((empty,))
+
+
+# ---- landing movies --------------------------------------------------------------------------
+
+
+def step_repeats(
+    chunk: Chunk,
+    patch: Patch,
+    event: Event,
+    step: Step,
+    others: Sequence[Step],
+    neighbours: Neighbours,
+    pattern: MovingPattern | None,
+) -> FloatArray:
+    """Compare parts of the frames of one landing or leaving."""
+    region, windows = event.region, event.windows
+    response = _response(event)
+    if response is None:
+        return nothing_repeated("mass")[:, : len(event.fit.free) + 1]
+    local = pattern.local(region, step.at.frame) if pattern else None
+    light = patch.mean_e
+    read = np.square(patch.read_noise_e) * np.ones(region.shape)
+    series = []
+    for span, weights in (
+        (windows.frames_before, response.before),
+        (windows.frames_after, response.after),
+    ):
+        part = patch.frames(*span)
+        one = series_of(
+            part.counts, weights, part.power,
+            gain=part.gain, offset=part.offset, mean_e=light, read_variance_e2=read,
+        )  # fmt: skip
+        known = np.zeros(one.values.shape)
+        frames = np.arange(part.first, part.first + len(part.power))[part.power > 0]
+        for other in others:
+            if not span[0] < other.at.frame < span[1]:
+                continue
+            shown = neighbours.shown(other, region)
+            if shown is None:
+                continue
+            here, image = shown
+            height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
+            known += np.outer(other.sign * height, frames >= other.at.frame)
+        if pattern and local:
+            known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
+        series.append(Series(one.values - known * one.power, one.power, one.shot, one.read))
+    return repeats_of(tuple(series))
+
+
+def _moved(
+    chunk: Chunk,
+    step: Step,
+    region: Region,
+    weights: FloatArray,
+    light: FloatArray,
+    frames: NDArray[np.int64],
+    pattern: MovingPattern,
+    local: LocalPattern,
+    neighbours: Neighbours,
+) -> FloatArray:
+    """Give what the motion of the pattern, and of the particle, adds to each frame."""
+    shared = neighbours.shared(step, region)
+    stride = int(chunk.edges[1] - chunk.edges[0])
+    centres, heights = [], []
+    for start in range(0, frames.size, stride):
+        part = frames[start : start + stride]
+        cut = chunk.cut(int(part[0]), int(part[-1]) + 1)
+        seen = pattern.seen(local, cut)
+        if shared is not None:
+            here, inside = shared
+            there = (part[len(part) // 2] >= step.at.frame) == (step.sign > 0)
+            seen[here] += there * light[here] * neighbours.seen(step, cut, inside)
+        centres.append(float(part.mean()))
+        heights.append(np.einsum("iyx,yx->i", weights, seen))
+    return np.stack([np.interp(frames, centres, height) for height in np.transpose(heights)])
+
+
+def step_controls(
+    scene: Scene,
+    chunk: Chunk,
+    window: int,
+    events: Sequence[Event],
+    steps: Sequence[Step],
+    neighbours: Neighbours,
+) -> EmptySpread | None:
+    """Look at the windows of some events where nothing lands or leaves."""
+    times = sorted({event.frame for event in events})
+    times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
+    if not times:
+        return None
+    field = empty_field(
+        scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
+        [event.fit for event in events], level=True,
+    )  # fmt: skip
+    most = _most_windows(field.places, (chunk.edges.size - 2) / scene.searches)
+    apart: list[int] = []
+    for t in times:
+        if not apart or t >= apart[-1] + window:
+            apart.append(t)
+    chosen = [apart[i] for i in np.unique(np.linspace(0, len(apart) - 1, most).round().astype(int))]
+    total: EmptySpread | None = None
+    for turn in chosen:
+        near = [s for s in steps if abs(s.at.frame - turn) <= window]
+        taken = taken_places(
+            scene, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
+        )
+        sides, powers = [], []
+        for start, stop in ((turn - window, turn), (turn, turn + window)):
+            parts, light = [], []
+            for cut in _cuts(chunk, start, stop):
+                power = float(chunk.power[cut].sum())
+                sum_e = _summed(chunk, cut)
+                known = np.zeros(chunk.shape)
+                for s in near:
+                    box = neighbours.box(s)
+                    known[box] += neighbours.presence(s, cut) * s.image
+                known = scene.left(known)
+                parts.append(field.errors(sum_e, power, known * chunk.mean_e))
+                light.append(power)
+            sides.append(parts)
+            powers.append(np.array(light))
+        if min(len(p) for p in powers) < 2:
+            continue
+        found = field.spread(sides[0], sides[1], (powers[0], powers[1]), taken)
+        total = found if total is None else total + found
+    return total
+
+
+def _most_windows(places: int, share: float) -> int:
+    """Windows to look at in a chunk with so many places, which is a share of its movie."""
+    enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
+    return int(np.clip(enough, FEWEST_WINDOWS, MOST_WINDOWS))
+
+
+def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
+    """Contiguous parts of the good frames of a window, relative to the chunk."""
+    good = np.flatnonzero(chunk.power[chunk.cut(start, stop)] > 0) + (start - chunk.first)
+    parts = min(PARTS, good.size)
+    edges = np.linspace(0, good.size, parts + 1).round().astype(int)
+    for a, b in pairwise(edges):
+        if b > a:
+            yield slice(int(good[a]), int(good[b - 1]) + 1)
+
+
+def _summed(chunk: Chunk, cut: slice) -> FloatArray:
+    span = chunk.first + cut.start, chunk.first + cut.stop
+    (rows, columns) = chunk.shape
+    return chunk.patch(*span, (0, rows), (0, columns)).window(*span)[0]
+
+
+# ---- background frames -----------------------------------------------------------------------
+
+
+@dataclass
+class _Own:
+    """The frames of one event, as they are read."""
+
+    event: Event
+    response: Response
+    sides: tuple[list[Series], list[Series]]
+
+
+def field_repeats(
+    scene: Scene, movie: Stack, camera: Camera, windows: Windows, events: Sequence[Event]
+) -> tuple[list[FloatArray], EmptySpread | None]:
+    """Compare parts of the frames before and after, at the events and where there are none."""
+    if not events:
+        return [], None
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+    read = camera.read_variance_e2(shape)
+    owns: list[_Own | None] = []
+    for event in events:
+        response = _response(event)
+        owns.append(None if response is None else _Own(event, response, ([], [])))
+    spans = (windows.frames_before, windows.frames_after)
+    n_before = windows.n_before
+    power = windows.power
+    if windows.before_e.sum() < _LEAST_LIGHT_E * max(n_before, 1):
+        power = np.ones_like(power)  # too dark to tell one frame's from the next's
+    powers = (power[:n_before], power[n_before:])
+    # the level of the light is the one that the fits use
+    scale = windows.power_ratio * max(powers[0].sum(), 1.0) / powers[1].sum() if n_before else 1.0
+    powers = (powers[0], powers[1] * scale)
+    fits = [event.fit for event in events]
+    field = background_field(scene, windows, powers[0].sum(), read, fits) if n_before > 1 else None
+    signal = scene.left(total_signal(scene, shape, events))
+    taken = taken_by(scene, windows, events, signal)
+    parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
+    lights: tuple[list[float], list[float]] = ([], [])
+    for side, (span, power) in enumerate(zip(spans, powers, strict=True)):
+        count = span[1] - span[0]
+        if not count or (side == 0 and not n_before):
+            continue
+        lit = np.flatnonzero(power > 0)
+        inner = np.linspace(0, lit.size, min(PARTS, lit.size) + 1).round().astype(int)[1:-1]
+        edges = [0, *lit[inner].tolist(), count]
+        sums = windows.after_e if side else windows.before_e
+        mean = sums / power.sum()
+        known = None
+        if side:
+            light = windows.before_e / powers[0].sum() if n_before else windows.before_e
+            known = signal * (photons_scale(scene, windows) / power.sum()
+                              if scene.additive else light)  # fmt: skip
+        for a, b in pairwise(edges):
+            total = np.zeros(shape)
+            for start, stop in _pieces(shape, a, b):
+                counts = movie.read(span[0] + start, span[0] + stop)
+                for own in owns:
+                    if own is not None:
+                        _append(own, side, counts, power[start:stop], mean, read, camera)
+                if field is not None:
+                    total += camera.to_electrons(counts).sum(axis=0)
+            if field is not None:
+                light_sum = float(power[a:b].sum())
+                parts[side].append(field.errors(total, light_sum, known))
+                lights[side].append(light_sum)
+    empty = None
+    if field is not None:
+        light = np.array(lights[0]), np.array(lights[1])
+        left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
+        empty = field.spread(parts[0], parts[1], light, taken, left)
+    return [
+        nothing_repeated(scene.mode) if own is None
+        else repeats_of(tuple(_joined(side) for side in own.sides if side))
+        for own in owns
+    ], empty  # fmt: skip
+
+
+def _append(
+    own: _Own,
+    side: int,
+    counts: NDArray[Any],
+    power: FloatArray,
+    mean: FloatArray,
+    read: FloatArray,
+    camera: Camera,
+) -> None:
+    here = own.event.region.slices
+    gain, offset = (
+        v[here] if isinstance(v, np.ndarray) else v
+        for v in (camera.gain_e_per_adu, camera.offset_adu)
+    )
+    own.sides[side].append(
+        series_of(
+            counts[(slice(None), *here)],
+            own.response.after if side else own.response.before,
+            power,
+            gain=gain,
+            offset=offset,
+            mean_e=mean[here],
+            read_variance_e2=read[here],
+        )
+    )
+
+
+def _joined(series: Sequence[Series]) -> Series:
+    return Series(
+        np.concatenate([s.values for s in series], axis=1),
+        np.concatenate([s.power for s in series]),
+        series[0].shot,
+        series[0].read,
+    )
+
+
+def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int, int]]:
+    size = max(1, _BLOCK_BYTES // (8 * math.prod(shape)))
+    for begin in range(start, stop, size):
+        yield begin, min(begin + size, stop)
+
+
+# ---- both ------------------------------------------------------------------------------------
+
+
+def _response(event: Event) -> Response | None:
+    fit, windows = event.fit, event.windows
+    return response_of(
+        event.likelihood, fit.theta, fit.box.free, windows.before_e, windows.power_ratio
+    )

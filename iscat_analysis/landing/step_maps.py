@@ -1,0 +1,118 @@
+"""Sliding contrast of a chunk, filtered, with the steps that are known taken off.
+
+What a step makes of the contrast reaches no farther than its image and the filter's template, and
+the filter is linear: steps that are found, or fitted anew, change the maps around them alone.
+Where the light in common, the motion of the pattern or correlated noise is taken out as well, a
+step changes the whole field, and maps are made anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from iscat_analysis._kernels.stepping import add_image
+from iscat_analysis.fitting.pattern import MovingPattern
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.landing.neighbours import Neighbours, Step
+from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.search.sliding import STRIDES, Chunk, Filter, MapArray, sliding_maps
+
+
+class StepMaps:
+    """The maps of one chunk, from one search to the next."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        chunk: Chunk,
+        matched: Filter,
+        neighbours: Neighbours,
+        pattern: MovingPattern | None = None,
+    ) -> None:
+        self._scene, self._chunk, self.matched = scene, chunk, matched
+        self._neighbours, self._pattern = neighbours, pattern
+        self._is_local = pattern is None and scene.lines is None and matched.noise is None
+        self._maps: tuple[MapArray, FloatArray] | None = None
+        self._known: list[Step] = []
+        self._near: list[list[Step]] = []  # of those known, which were taken off each map
+
+    def without(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
+        """Take known steps off."""
+        if self._is_local:
+            maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
+            for step in _missing(self._known, steps):
+                self._add(maps, step, 1.0)
+            for step in _missing(steps, self._known):
+                self._add(maps, step, -1.0)
+        else:
+            maps = self._anew(steps, mapper)
+        self._maps, self._known = maps, list(steps)
+        return maps
+
+    def _windows(self, boundary: int) -> tuple[slice, slice]:
+        """Frames before and after a boundary that are compared there, relative to the chunk."""
+        edges = self._chunk.edges
+        low, high = max(boundary + 1 - STRIDES, 0), min(boundary + 1 + STRIDES, edges.size - 1)
+        middle = int(edges[boundary + 1])
+        return slice(int(edges[low]), middle), slice(middle, int(edges[high]))
+
+    def _add(self, maps: tuple[MapArray, FloatArray], step: Step, share: float) -> None:
+        """Add a multiple of what a step makes of the contrast to the maps around it."""
+        snr, effective = maps
+        here = int(np.searchsorted(self._chunk.edges, step.at.frame - self._chunk.first))
+        filtered = None
+        for boundary in range(max(here - STRIDES - 1, 0), min(here + STRIDES, len(snr))):
+            before, after = self._windows(boundary)
+            if not self._neighbours.overlaps(step, before.start, after.stop):
+                continue
+            image, part = self._neighbours.change(step, before, after)
+            if filtered is None or image is not filtered[0]:
+                filtered = image, *self.matched.response(step.corner, image)
+            _, box, response = filtered
+            scale = share * part * math.sqrt(effective[boundary])
+            corner = box[0].start, box[1].start
+            add_image(snr[boundary], corner, response, np.float32(scale))
+
+    def _anew(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
+        """Make the maps again in which what is known has changed."""
+        moving, chunk = self._pattern, self._chunk
+        near = []
+        for boundary in range(chunk.edges.size - 2):
+            before, after = self._windows(boundary)
+            span = moving.span(before, after) if moving else slice(before.start, after.stop)
+            near.append([s for s in steps if self._neighbours.overlaps(s, span.start, span.stop)])
+
+        def explained(boundary: int, before: slice, after: slice) -> FloatArray | None:
+            if not near[boundary]:
+                return moving.contrast[boundary] if moving else None
+            total = np.zeros(chunk.shape)
+            for step in near[boundary]:
+                self._neighbours.add_change(total, step, before, after)
+            total = self._scene.left(total)
+            return total + moving.contrast[boundary] * (1 + total) if moving else total
+
+        changed = [
+            j
+            for j, (old, now) in enumerate(zip(self._near or near, near, strict=True))
+            if _ids(old) != _ids(now)
+        ]
+        self._near = near
+        return sliding_maps(
+            chunk, self.matched, STRIDES,
+            explained=explained if steps or moving else None,
+            earlier=self._maps, changed=changed, mapper=mapper,
+        )  # fmt: skip
+
+
+def _ids(steps: Sequence[Step]) -> set[int]:
+    """Tell apart the very same steps from those that were fitted anew."""
+    return {id(step) for step in steps}
+
+
+def _missing(some: Sequence[Step], others: Sequence[Step]) -> list[Step]:
+    """Give those that are not among others."""
+    there = _ids(others)
+    return [step for step in some if id(step) not in there]

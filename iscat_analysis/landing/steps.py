@@ -1,0 +1,373 @@
+"""Steps in one chunk of a landing movie: found, dated and fitted, with their neighbours in view.
+
+Each step is fitted on the frames just before and just after it, by the conditional likelihood of
+those very frames.  Turns of all fits with all others in place settle in two or three sweeps; what
+they explain is taken off the sliding contrast, which is then searched again.  `neighbours` says
+what steps do to each other's light, `tasks` sets up the likelihood of one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import compress
+
+import numpy as np
+
+from iscat_analysis._kernels.sliding import strongest_maps
+from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.pattern import MovingPattern
+from iscat_analysis.fitting.scene import Scene, reported_steps
+from iscat_analysis.inference.fit import (
+    POOR_FIT_P,
+    detection_snr,
+    fit_particle,
+    search_box,
+    start_theta,
+)
+from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
+from iscat_analysis.landing.sidelobes import Sieve
+from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
+from iscat_analysis.landing.step_maps import StepMaps
+from iscat_analysis.landing.tasks import Task, TaskBuilder
+from iscat_analysis.landing.traces import clip_of, patch_of, trace_of
+from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
+from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.search.residue import chi2_excess
+from iscat_analysis.search.sliding import (
+    Chunk,
+    Peak,
+    StepFrame,
+    find_steps,
+    make_filter,
+)
+from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
+
+ROUNDS = 6
+"""Searches at most; each takes what was found so far off the contrast."""
+
+_SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
+_EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
+_SAME_PX = 1.5
+
+
+@dataclass(frozen=True)
+class StepEvent:
+    """A step that was fitted for good, and what its frames say beside it."""
+
+    event: Event
+    step: Step
+    others: tuple[Step, ...]
+    repeats: FloatArray
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """A step after its last fit, before it is judged."""
+
+    fitted: StepEvent
+    crowded: bool  # as of its `Task`
+    lobe: bool  # found where the fit of a known step may have left a residual
+
+
+class ChunkFitter:
+    """Finds and fits the steps of one chunk."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        chunk: Chunk,
+        window: int,
+        pool: ThreadPoolExecutor,
+        pattern: MovingPattern | None = None,
+        *,
+        excess_noise: ExcessNoise | None = None,
+    ) -> None:
+        self._excess_noise = excess_noise
+        self._scene = scene
+        self._chunk = chunk
+        self._pattern = pattern
+        self._window = window
+        self._pool = pool
+        self._roi_px = scene.roi_px
+        self._neighbours = Neighbours(scene, chunk, window, pattern)
+        self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
+        self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._sieve = Sieve(chunk.first, self._stride, window, scene.roi_px)
+        self._doubtful: list[Peak] = []
+        self.strongest = np.zeros((2, *chunk.shape))
+        self.rounds = 0
+        self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
+
+    def run(self, keep: tuple[int, int]) -> list[StepEvent]:
+        """Find and fit every step."""
+        templates = self._scene.templates
+        matched = make_filter(self._chunk, templates.images[0], templates.noise)
+        maps = StepMaps(self._scene, self._chunk, matched, self._neighbours, self._pattern)
+        steps: list[Step] = []
+        rejected: list[Step] = []
+        for self.rounds in range(1, ROUNDS + 1):
+            fresh = [
+                s
+                for s in self._search(maps, steps)
+                if not any(
+                    _apart(s, r) <= self._stride and distance_px(s, r) < _SAME_PX for r in rejected
+                )
+            ]
+            if not fresh:
+                break
+            known = len(steps)
+            steps = steps + fresh
+            seen, bound = self._neighbours.of(steps)
+            chosen = set(range(known, len(steps)))
+            for _ in range(_SWEEPS):
+                improved = self._improve(steps, chosen, seen)
+                moved = {i for i in chosen if _has_moved(steps[i], improved[i])}
+                steps = improved
+                chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
+                if not chosen:
+                    break
+            if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+                steps = self._lifted(steps, set(range(known, len(steps))), seen)
+            credible = self._credible(steps)
+            kept = {id(s) for s in credible}
+            rejected += [s for s in steps if id(s) not in kept]
+            steps = credible
+        del maps  # fits need their memory
+        if not steps:
+            return []
+        lobes = [self._begin(peak) for peak in self._doubtful]
+        everything = steps + lobes
+        seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
+        # steps of the other polarity are fitted too: their rings have the one that is reported
+        sign = reported_steps(self._scene)
+        own = [
+            i
+            for i, s in enumerate(everything)
+            if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
+        ]
+        found = self._pool.map(
+            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
+        )
+        fitted = self._judged([one for one in found if one is not None])
+        if fitted and not self._pattern:
+            events = standing_out([f.event for f in fitted])
+            self.empty = step_controls(
+                scene=self._scene, chunk=self._chunk, window=self._window,
+                events=events, steps=everything, neighbours=self._neighbours,
+            )  # fmt: skip
+        return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
+
+    def shown(
+        self, fitted: Sequence[StepEvent], clips: int
+    ) -> list[tuple[Trace | None, Clip | None]]:
+        """Give what the report shows of steps beside their images."""
+        chunk, window = self._chunk, self._window
+
+        def one(number: int) -> tuple[Trace | None, Clip | None]:
+            step = fitted[number]
+            patch = patch_of(step, chunk, window)
+            trace = trace_of(step, patch, chunk, self._neighbours, self._tasks)
+            clip = None
+            if number < clips:
+                clip = clip_of(step, patch, self._scene, chunk, window, self._pattern)
+            return trace, clip
+
+        return list(self._pool.map(one, range(len(fitted))))
+
+    # ---- search ----------------------------------------------------------------------------
+
+    def _search(self, maps: StepMaps, steps: Sequence[Step]) -> list[Step]:
+        scene, chunk, matched = self._scene, self._chunk, maps.matched
+        snr, effective = maps.without(steps, self._pool.map)
+        if not steps and len(snr):
+            where = np.empty(chunk.shape, dtype=np.int64)
+            strongest_maps(snr, where)
+            best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
+            frames = np.maximum(effective[where], 1e-9)
+            self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
+        peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
+        refuse_flood(
+            len(peaks), scene.templates, self._excess_noise,
+            images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
+        )  # fmt: skip
+        fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
+        return [self._begin(peak) for peak in fresh]
+
+    def _begin(self, peak: Peak) -> Step:
+        scene = self._scene
+        sign = 1 if peak.amplitude > 0 else -1
+        mass = float(scene.model.scale.mass(np.asarray(abs(peak.amplitude))))
+        if "mass_kda" not in FREE_PARAMETERS[scene.mode]:
+            mass = scene.model.material.mass_kda
+        mass = max(mass, 1e-3 * scene.model.material.mass_kda)
+        start = Candidate(
+            peak.x_px, peak.y_px, scene.config.particle.height_nm, mass, abs(peak.snr)
+        )
+        return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
+
+    # ---- one step --------------------------------------------------------------------------
+
+    def _improve(
+        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
+    ) -> list[Step]:
+        """Fit the chosen steps at the heights that they have, each with the others as they were."""
+        z_range = self._scene.config.fit.z_range_nm
+
+        def fitted(step: Step, task: Task) -> Step:
+            likelihood, start = task.likelihood, _displaced(step.start, *task.offset_px)
+            box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
+            theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
+            theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
+            best = likelihood.maximize(theta, box.free, box.lower, box.upper)
+            if likelihood.model.scale.mass(best.theta[3]) <= 0:
+                return replace(step, at=task.at, snr=0.0)
+            return self._moved(step, task, best.theta, detection_snr(likelihood, best, box))
+
+        return self._refitted(steps, chosen, near, fitted)
+
+    def _lifted(
+        self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
+    ) -> list[Step]:
+        """Fit the chosen steps at all heights, so that their rings are those of their own."""
+        z_range = self._scene.config.fit.z_range_nm
+
+        def fitted(step: Step, task: Task) -> Step:
+            start = _displaced(step.start, *task.offset_px)
+            fit = fit_particle(
+                task.likelihood, start, self._scene.mode, z_range, level=True, correct_bias=False
+            )
+            return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
+
+        return self._refitted(steps, chosen, near, fitted)
+
+    def _refitted(
+        self,
+        steps: Sequence[Step],
+        chosen: set[int],
+        near: Sequence[Sequence[int]],
+        fitted: Callable[[Step, Task], Step],
+    ) -> list[Step]:
+        def one(index: int) -> Step:
+            task = self._tasks.build(index, steps, near)
+            return steps[index] if task is None else fitted(steps[index], task)
+
+        refitted = list(steps)
+        for index, step in zip(sorted(chosen), self._pool.map(one, sorted(chosen)), strict=True):
+            refitted[index] = step
+        return refitted
+
+    def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
+        """Put a step where a fit found it."""
+        likelihood, (y_px, x_px) = task.likelihood, task.offset_px
+        pixel = self._scene.pixel_nm
+        start = replace(
+            step.start,
+            x_px=float(theta[0]) / pixel - x_px,
+            y_px=float(theta[1]) / pixel - y_px,
+            z_nm=float(theta[2]),
+            mass_kda=float(likelihood.model.scale.mass(theta[3])),
+        )
+        excess = chi2_excess(likelihood.residuals(theta))
+        return self._neighbours.draw(step.sign, task.at, start, theta=theta, snr=snr, excess=excess)
+
+    @property
+    def _quick_mode(self) -> str:
+        """Where z is free it is found after place and mass, from all heights at once."""
+        return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
+
+    def _finish(
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
+    ) -> _Finished | None:
+        """Fit a step for good."""
+        scene, step = self._scene, steps[index]
+        task = self._tasks.build(index, steps, near)
+        if task is None:
+            return None
+        likelihood = task.likelihood
+        if likelihood.n_pixels < 0.5 * math.prod(likelihood.grid.shape):
+            return None
+        y_px, x_px = task.offset_px
+        start = _displaced(step.start, y_px, x_px)
+        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
+        if fit.mass_kda <= 0 and "mass_kda" in fit.free:
+            return None
+        pixel = scene.pixel_nm
+        event = Event(
+            task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
+            task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
+        )  # fmt: skip
+        if event.snr < _EXPLAINED * scene.templates.threshold:
+            return None
+        step = replace(step, at=task.at)
+        seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
+        others = tuple(steps[i] for i in seen)
+        repeats = step_repeats(
+            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern
+        )
+        return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
+
+    def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
+        """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
+        steps = [own.fitted.step for own in finished]
+        described = [own.fitted.event.described for own in finished]
+        frame = np.array([step.at.frame for step in steps])
+        x_px, y_px = _places(steps)
+        judged = []
+        for number, own in enumerate(finished):
+            away = np.hypot(x_px - x_px[number], y_px - y_px[number])
+            at_once = np.abs(frame - frame[number]) < self._window
+            near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
+            event = own.fitted.event
+            flags = remarks(
+                self._scene, event, event.windows,
+                sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
+                too_close=own.crowded,
+                poor_fit=steps[number].at.p_constant < POOR_FIT_P,
+            )  # fmt: skip
+            judged.append(replace(own.fitted, event=replace(event, flags=flags)))
+        return judged
+
+    def _credible(self, steps: Sequence[Step]) -> list[Step]:
+        """Leave out what the others explain, and the weaker of two steps that describe one."""
+        steps = sorted(steps, key=lambda s: -s.start.snr)
+        sign = np.array([s.sign for s in steps])
+        frame = np.array([s.at.frame for s in steps])
+        width = np.array([s.at.half_width for s in steps])
+        x_px, y_px = _places(steps)
+        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._scene.templates.threshold
+        for number in np.flatnonzero(kept).tolist():
+            same = kept[:number] & (sign[:number] == sign[number])
+            same &= np.abs(frame[:number] - frame[number]) <= np.maximum(
+                2, width[:number] + width[number]
+            )
+            away = np.hypot(x_px[:number] - x_px[number], y_px[:number] - y_px[number])
+            kept[number] = not np.any(same & (away < _SAME_PX))
+        return list(compress(steps, kept))
+
+
+def _has_moved(old: Step, new: Step) -> bool:
+    """Whether a fit changed what the neighbours see by more than its error."""
+    if old.theta is None or old.at.frame != new.at.frame:
+        return True
+    tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
+    return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
+
+
+def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:
+    """Give x and y of all [pixels]."""
+    x_px, y_px = (np.array([getattr(s.start, axis) for s in steps]) for axis in ("x_px", "y_px"))
+    return x_px, y_px
+
+
+def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:
+    """Move a candidate."""
+    if y_px == x_px == 0:  # where nothing drifts
+        return start
+    return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)
+
+
+def _apart(one: Step, two: Step) -> int:
+    return abs(one.at.frame - two.at.frame)

@@ -1,0 +1,254 @@
+"""From a step and its neighbours to its likelihood: when, which frames, which pixels, which ρ.
+
+A neighbour nearer than ``detection.min_separation_nm`` is kept out: the window ends where it lands
+or leaves.  Others enter through ρ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
+from iscat_analysis.fitting.regions import Region, region_around
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional
+from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.records import FloatArray, Windows
+from iscat_analysis.search.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
+
+FEWEST_FRAMES = 10
+"""A neighbour that would leave fewer is fitted beside the step, and both are flagged."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """A step's likelihood and what it is made of."""
+
+    likelihood: Likelihood
+    region: Region
+    patch: Patch
+    windows: Windows
+    at: StepFrame
+    n_before: int
+    n_after: int
+    crowded: bool
+    offset_px: FloatArray
+
+
+class TaskBuilder:
+    """Builds the likelihoods of the steps of one chunk."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        chunk: Chunk,
+        window: int,
+        neighbours: Neighbours,
+        pattern: MovingPattern | None = None,
+    ) -> None:
+        self._pattern = pattern
+        self._scene = scene
+        self._chunk = chunk
+        self._window = window
+        self._neighbours = neighbours
+        self._roi_px = scene.roi_px
+        self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
+
+    def build(
+        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
+    ) -> Task | None:
+        """Set up the likelihood of a step with its neighbours in place; None without frames."""
+        scene, chunk, step = self._scene, self._chunk, steps[index]
+        region = region_around(self._roi_px, chunk.shape, step.start)
+        neighbours = [steps[i] for i in near[index]]
+        limit_px = scene.config.detection.min_separation_nm / scene.pixel_nm
+        close = [s for s in neighbours if distance_px(s, step) < limit_px]
+        span, crowded = self._span(step, close)
+        patch = chunk.patch(*span, region.rows, region.columns)
+        if len(patch.counts) < 2:
+            return None
+        moving = self._pattern
+        local = moving.local(region, step.at.frame) if moving else None
+        at = self._locate(step, neighbours, region, patch, local)
+        if at is None:
+            return None
+        if moving and at.frame != step.at.frame:
+            local = moving.local(region, at.frame)
+        step = replace(step, at=at)
+        span, crowded = self._span(step, close)
+        gap = min(at.gap, self._window // 5)
+        begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
+        first = (begin, max(at.frame - gap, begin))
+        second = (min(at.frame + gap, end), end)
+        if begin < patch.first or end > patch.first + len(patch.counts):
+            patch = chunk.patch(begin, end, region.rows, region.columns)
+        before, n_before, power_before = patch.window(*first)
+        after, n_after, power_after = patch.window(*second)
+        if not n_before or not n_after:
+            return None
+        ratio = np.full(before.shape, power_after / power_before)
+        cuts = chunk.cut(*first), chunk.cut(*second)
+        for other in neighbours:
+            self._neighbours.apply(ratio, other, *cuts, region)
+        if scene.lines is not None:
+            there = [self._present(steps, span, cut) for cut in cuts]
+            taken = [scene.lines.taken(signal)[region.slices] for signal in there]
+            ratio *= taken[0] / taken[1]
+        offset = np.zeros(2)
+        if moving and local:
+            seen = [moving.seen(local, cut) for cut in cuts]
+            ratio *= seen[1] / seen[0]
+            shared = self._neighbours.shared(step, region)
+            if shared is not None:
+                here, inside = shared
+                ratio[here] *= self._neighbours.own_factor(step, *cuts, inside)
+            with_it = cuts[1] if step.sign > 0 else cuts[0]
+            offset = moving.shift(with_it) - moving.at(at.frame)
+        read = self._read_e2[region.slices]
+        variances = [n_before * read, n_after * read]
+        if step.sign < 0:
+            before, after, ratio = after, before, 1 / ratio
+            variances.reverse()
+        counts = (n_before, n_after)[:: step.sign]
+        ranges = (first, second)[:: step.sign]
+        grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+        used = chunk.usable[region.slices]
+        shown = second if step.sign > 0 else first
+        likelihood = conditional(
+            scene.model_at(sum(shown) // 2), grid, before, after, ratio,
+            read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
+            masked=~used,
+        )  # fmt: skip
+        windows = Windows(
+            before_e=before,
+            after_e=after,
+            n_before=counts[0],
+            n_after=counts[1],
+            power_ratio=(power_after / power_before) ** step.sign,
+            read_variance_before_e2=variances[0],
+            read_variance_after_e2=variances[1],
+            masked=~used,
+            saturated=chunk.saturated[region.slices],
+            frames_before=ranges[0],
+            frames_after=ranges[1],
+            power=np.empty(0),
+        )
+        return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)
+
+    def _present(self, steps: Sequence[Step], span: tuple[int, int], cut: slice) -> FloatArray:
+        """Contrast over the field, in some frames, of what lands or leaves in a span of them."""
+        total = np.zeros(self._chunk.shape)
+        for step in steps:
+            if span[0] < step.at.frame < span[1]:
+                total[self._neighbours.box(step)] += (
+                    self._neighbours.presence(step, cut) * step.image
+                )
+        return total
+
+    def _span(self, step: Step, close: Sequence[Step]) -> tuple[tuple[int, int], bool]:
+        """Frames used around a step, and whether another one could not be kept out of them."""
+        frame = step.at.frame
+        begin, end = frame - self._window, frame + self._window
+        crowded = False
+        for other in sorted(close, key=lambda s: abs(s.at.frame - frame)):
+            gap = min(other.at.gap, self._window // 5)
+            if other.at.frame <= frame - FEWEST_FRAMES - gap:
+                begin = max(begin, other.at.frame + gap)
+            elif other.at.frame >= frame + FEWEST_FRAMES + gap:
+                end = min(end, other.at.frame - gap)
+            else:
+                crowded = True
+        return (begin, end), crowded
+
+    def _locate(
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        pattern: LocalPattern | None,
+    ) -> StepFrame | None:
+        shared = self._neighbours.shared(step, region)
+        if shared is None:
+            return None
+        image = step.image[shared[1]]
+        if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
+            return None
+        known = self._added(step, neighbours, region, patch, pattern, image)
+        reach = self._stride + self._stride // 2 + 1
+        search = (step.at.frame - reach, step.at.frame + reach + 1)
+        return locate_step(patch, step.sign * image, search, known=step.sign * known)
+
+    def added(
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        image: FloatArray,
+    ) -> FloatArray:
+        """Height that neighbours, and the motion of the pattern, add to each frame.
+
+        Shapes: `image` (ny, nx), result (t,).
+        """
+        local = self._pattern.local(region, step.at.frame) if self._pattern else None
+        return self._added(step, neighbours, region, patch, local, image)
+
+    def _added(
+        self,
+        step: Step,
+        neighbours: Sequence[Step],
+        region: Region,
+        patch: Patch,
+        pattern: LocalPattern | None,
+        image: FloatArray,
+    ) -> FloatArray:
+        known = np.zeros(len(patch.counts))
+        frames = np.arange(patch.first, patch.first + known.size)
+        seen, images = [], []
+        for other in neighbours:
+            near = distance_px(other, step) < self._roi_px
+            both = self._neighbours.shared(other, region) if near else None
+            if both is None or not frames[0] < other.at.frame <= frames[-1]:
+                continue
+            here, inside = both
+            padded = np.zeros(image.shape)
+            padded[here] = other.image[inside]
+            seen.append(other)
+            images.append(padded)
+        for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
+            known += other.sign * height * (frames >= other.at.frame)
+        own = self._neighbours.shared(step, region)
+        if self._pattern and pattern and own is not None:
+            known += self._drifting(step, image, own[1], patch, self._pattern, pattern)
+        return known
+
+    def _drifting(
+        self,
+        step: Step,
+        image: FloatArray,
+        inside: tuple[slice, slice],
+        patch: Patch,
+        moving: MovingPattern,
+        pattern: LocalPattern,
+    ) -> FloatArray:
+        """Height that the motion of the pattern, and of the particle itself, adds to each frame."""
+        frames = np.arange(patch.first, patch.first + len(patch.counts))
+        light = np.maximum(patch.mean_e, 1e-300)
+        centres, patterns, moved = [], [], []
+        for start in range(0, frames.size, self._stride):
+            part = frames[start : start + self._stride]
+            cut = self._chunk.cut(int(part[0]), int(part[-1]) + 1)
+            centres.append(float(part.mean()))
+            patterns.append(moving.seen(pattern, cut) / light - 1)
+            moved.append(self._neighbours.seen(step, cut, inside) - image)
+        there = (frames >= step.at.frame) == (step.sign > 0)
+        height: FloatArray = np.interp(frames, centres, crosstalk(patch, image, patterns))
+        height += there * np.interp(frames, centres, crosstalk(patch, image, moved))
+        return height

@@ -1,0 +1,1 @@
+"""How do particles move?  Frames, links, tracks and their background."""

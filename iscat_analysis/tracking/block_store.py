@@ -1,0 +1,211 @@
+"""What is kept of a finished block of frames, in memory and on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.canvas import box_of
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.diagnosis.causes import smear_warning
+from iscat_analysis.diagnosis.noise import Noise, judge_beside
+from iscat_analysis.fitting.checkpoint import Shelf, packed_views, unpacked_views
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
+from iscat_analysis.threads import beside
+from iscat_analysis.tracking.aligned import Aligned, align
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.linking import typical_error
+from iscat_analysis.tracking.moving import follow
+from iscat_analysis.tracking.moving_table import common_masses, moving_table
+
+
+@dataclass(frozen=True)
+class Block:
+    """What was found in a block of frames."""
+
+    span: tuple[int, int]
+    rows: Rows
+    error: float
+    table: pd.DataFrame
+    inside: BoolArray
+    masses: pd.DataFrame
+    views: tuple[EventView, ...]
+    level: FloatArray
+    power: FloatArray
+    total_e: FloatArray
+    used: BoolArray
+    saturated: BoolArray
+    noise: tuple[str, ...] = ()
+    noise_differs: bool = False
+    aligned: Aligned | None = None
+
+    @property
+    def frames(self) -> int:
+        """Frames in the block."""
+        return self.span[1] - self.span[0]
+
+    def windows(self, camera: Camera) -> Windows:
+        """Put the background and the sum of all frames side by side."""
+        read = self.frames * camera.read_variance_e2((self.used.shape[0], self.used.shape[1]))
+        return Windows(
+            before_e=self.level * self.power.sum(),
+            after_e=self.total_e,
+            n_before=self.frames,
+            n_after=self.frames,
+            power_ratio=1.0,
+            read_variance_before_e2=read,
+            read_variance_after_e2=read,
+            masked=~self.used,
+            saturated=self.saturated,
+            frames_before=self.span,
+            frames_after=self.span,
+            power=np.concatenate([self.power, self.power]),
+        )
+
+
+def analyse_block(
+    scene: Scene,
+    movie: CountSource,
+    camera: Camera,
+    span: tuple[int, int],
+    *,
+    goes_on: tuple[bool, bool],
+    check: Callable[[NDArray[Any], int], None],
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    cautious: bool = False,
+) -> Block:
+    """Follow the particles of a block of frames."""
+    first, frames = span[0], span[1] - span[0]
+    # Nearer to a border than this a track may go on in the next block.
+    near = scene.config.track.memory_frames + 1
+    inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
+    moving = follow(
+        scene, movie, camera, span,
+        check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
+    )  # fmt: skip
+    field, ground, rows = moving.field, moving.ground, moving.rows
+
+    def without(count: int) -> FloatArray:
+        pictures.result()  # of which all frames are drawn
+        light: FloatArray = ground.level * ground.power[:count, None, None]
+        return light + field.residual(ground, rows, 0, count)
+
+    if not goes_on[0]:
+        seen = rows.frame + first, rows.theta[:, :2]
+        pictures = beside(align, scene, moving)
+        judged = beside(judge_beside, scene, movie, camera, span, seen, field.used, without)
+    table, inside = moving_table(scene, moving, first), field.holds(rows.theta)
+    masses = common_masses(scene, moving)
+    best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
+    aligned, noise = None, Noise()
+    if not goes_on[0]:
+        aligned = pictures.result()
+        noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
+        smeared = smear_warning(scene.config, table, moving.smear_nm)
+        if smeared:  # what is left over of pictures, far around them, is not the camera's
+            noise = Noise(messages=(smeared,))
+    return Block(
+        span=span,
+        rows=replace(rows, frame=rows.frame + first),
+        error=typical_error(moving.judged.fisher) if len(rows.frame) else 0.0,
+        table=table,
+        inside=inside,
+        masses=masses,
+        views=tuple(row_view(field, ground, rows, int(row)) for row in best.index),
+        level=ground.level,
+        power=ground.power,
+        total_e=field.total_e,
+        used=field.used,
+        saturated=field.saturated,
+        noise=noise.messages,
+        noise_differs=noise.differs,
+        aligned=aligned,
+    )
+
+
+def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> EventView:
+    """Draw a particle in one frame."""
+    frame, theta = int(rows.frame[mine]), rows.theta[mine]
+    spans = [
+        box_of(float(centre), field.pixel_nm, field.roi_px, size)
+        for centre, size in zip((theta[1], theta[0]), field.used.shape, strict=True)
+    ]
+    cut = slice(*spans[0]), slice(*spans[1])
+    others = rows.only((rows.frame == frame) & (np.arange(len(rows.frame)) != mine))
+    left, alone = (field.residual(ground, r, frame, frame + 1)[0][cut] for r in (rows, others))
+    light = ground.power[frame] * ground.level[cut]
+    used = field.used[cut]
+    noise = np.sqrt(light + (alone - left) + field.read_e2[cut])
+    blank = np.where(used, 1.0, np.nan)
+    return EventView(
+        event=int(rows.track[mine]),
+        row_px=spans[0][0],
+        column_px=spans[1][0],
+        contrast=blank * alone / light,
+        model=(alone - left) / light,
+        residual=blank * left / noise,
+    )
+
+
+class BlockStore(Shelf):
+    """Finished blocks of frames on disk."""
+
+    def load(self, number: int, span: tuple[int, int]) -> Block | None:
+        """Give a finished block, or None."""
+        found = self.read(number)
+        if found is None or tuple(found[1].get("span", ())) != span:
+            return None
+        table, data = found
+        try:
+            numbers = data["events"].tolist()
+            views = unpacked_views(data)
+            names = [str(name) for name in data["mass_names"]]
+            masses = pd.DataFrame(data["masses"], columns=names)
+            return Block(
+                span=span,
+                rows=Rows.of(data["frame"], data["track"], data["theta"], data["group"]),
+                error=float(data["error"]),
+                table=table,
+                inside=data["inside"],
+                masses=masses.set_index(pd.Index(np.arange(len(masses)), name="track")),
+                views=tuple(replace(v, event=n) for n, v in zip(numbers, views, strict=True)),
+                level=data["level"],
+                power=data["power"],
+                total_e=data["total_e"],
+                used=data["used"],
+                saturated=data["saturated"],
+                noise=tuple(str(text) for text in data["noise"]),
+                noise_differs=bool(data["noise_differs"]),
+                aligned=Aligned.unpacked(data),
+            )
+        except (ValueError, KeyError):
+            return None
+
+    def save(self, number: int, block: Block) -> None:
+        """Keep a finished block."""
+        rows = block.rows
+        arrays = {
+            "span": np.array(block.span),
+            "frame": rows.frame, "track": rows.track, "theta": rows.theta, "group": rows.group,
+            "error": np.array(block.error),
+            "inside": block.inside,
+            "masses": block.masses.to_numpy(float),
+            "mass_names": np.array(list(block.masses.columns)),
+            "events": np.array([view.event for view in block.views], dtype=np.int64),
+            **packed_views(block.views),
+            "level": block.level, "power": block.power, "total_e": block.total_e,
+            "used": block.used, "saturated": block.saturated,
+            "noise": np.array(block.noise, dtype=np.str_),
+            "noise_differs": np.array(block.noise_differs),
+            **({} if block.aligned is None else block.aligned.packed()),
+        }  # fmt: skip
+        self.write(number, block.table, arrays)

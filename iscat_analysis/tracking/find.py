@@ -1,0 +1,333 @@
+"""Mode ``track``: every frame is fitted, and the positions are linked into tracks.
+
+`find_moving` learns the background from the frames in which the particles move, block by block;
+`track_frames` takes one that was recorded or is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.camera.background import Check, add_frames, start_power
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.causes import (
+    misfit_warning,
+    pixel_warnings,
+    plane_warning,
+    shaking_warning,
+)
+from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.checkpoint import GOES_ON, saying
+from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.ranges import checked, fitted_frames
+from iscat_analysis.fitting.regions import contrast_image
+from iscat_analysis.fitting.results import Compared, Followed, Found, lines_of, view_of
+from iscat_analysis.fitting.run import Run
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.pieces.regions import lines_from, numbered
+from iscat_analysis.records import (
+    CountSource,
+    EventView,
+    FloatArray,
+    FrameSource,
+    Progress,
+    Status,
+    Windows,
+)
+from iscat_analysis.search.sliding import DARK, well_lit
+from iscat_analysis.threads import beside, threads
+from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
+from iscat_analysis.tracking.blocks import Plan, plan_blocks
+from iscat_analysis.tracking.frame_search import link
+from iscat_analysis.tracking.frame_subset import keep_frames
+from iscat_analysis.tracking.held_height import held_height_warning
+from iscat_analysis.tracking.joining import join_blocks
+from iscat_analysis.tracking.moving_field import track_scene
+from iscat_analysis.tracking.tracked_optics import Begun, learn_from_tracks
+from iscat_analysis.trust.null_field import FrameNoise
+
+_STEPS = 100  # of the progress of a block
+_PATTERN = 6  # places in a frame that are taken for the light's unevenness,
+_NEARLY_ALL = 0.8  # where so many of them are no particles
+
+
+def find_moving(ready: Prepared, run: Run) -> Found:
+    """Track particles over backgrounds that are learnt with them."""
+    config, camera = ready.config, ready.camera
+    additive = config.optics.scheme == "darkfield"
+    span = fitted_frames(ready.steady, config)
+    kept = keep_frames(ready.steady, camera, span, additive=additive)
+    movie, (first, last) = kept.movie, kept.span
+    if kept.message:
+        run.tell(kept.message)
+    run.clock.lap("model")
+    check = checked(movie, camera)
+    shaking = beside(shaking_warning, movie, camera, (first, last))
+    with threads(config.compute.workers) as pool:
+        plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
+    if message := plan.message(movie.name):
+        run.tell(message)
+    shaken = shaking.result()
+    if shaken:
+        run.tell(f"{movie.name}: {shaken}")
+    run.clock.lap("background")
+    identity = ready.steady.identity if run.partial else ""
+    shelves: list[BlockStore] = []
+
+    def shelf(config: Config, folder: Path | None) -> BlockStore:
+        shelves.append(BlockStore(folder, config, identity, ready.shape, (first, last), camera))
+        return shelves[-1]
+
+    with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
+
+        def begin(config: Config, *, cautious: bool = False) -> Begun:
+            scene = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
+            block = _analysed(
+                scene, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
+                check=check, pool=pool, progress=run.progress, cautious=cautious,
+            )  # fmt: skip
+            return Begun(config, scene, block)
+
+        begun, learned = learn_from_tracks(
+            config, begin, name=movie.name, pool=pool, tell=run.tell, notify=run.notify
+        )
+        config, scene = begun.config, begun.scene
+        blocks, interrupted = track_movie(
+            scene, movie, camera, plan, shelf(config, run.partial),
+            check=check, pool=pool, progress=run.progress, first=begun.block,
+        )  # fmt: skip
+        joined = join_blocks(config, blocks, camera)
+        if not interrupted and not plane_warning(config, joined.fits):  # which says it already
+            held = held_height_warning(
+                ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
+            )
+            if held:
+                run.tell(held)
+    windows = joined.followed.windows
+    for text in () if shaken else blocks[0].noise:
+        run.tell(text)
+    for text in pixel_warnings(*windows.left_out):
+        run.tell(text)
+    if not len(joined.fits) and not interrupted:
+        run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
+    run.clock.lap("track")
+    found = Found(
+        scene=replace(scene, mode="track", config=config),
+        fits=joined.fits,
+        views=joined.views,
+        image=windows.after_e / windows.before_e - 1,
+        compared=Compared.of(windows),
+        heading="blocks",
+        summary=plan.summary,
+        followed=joined.followed,
+        optics=learned,
+        interrupted=interrupted,
+    )
+    return kept.put_back(found)
+
+
+@contextmanager
+def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
+    """Say in an interrupt whether a block was finished, from which the same command goes on."""
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        if any(shelf.kept for shelf in shelves):
+            raise saying(stop, GOES_ON) from None
+        parts = f"in {len(plan.spans)} of them, of which the first is not"
+        if len(plan.spans) == 1:
+            parts = f"in one of {plan.frames} frames, which is not"
+        nothing = (
+            "nothing is kept, and the same command begins anew: tracks are kept when a block of "
+            f"frames is done, and this movie is analysed {parts}"
+        )
+        raise saying(stop, nothing) from None
+
+
+def _nothing_found(scene: Scene, block: Block) -> str:
+    """Say why a movie may show no particle: how far one stands out of a frame's noise."""
+    model, grid = scene.model, PixelGrid.centred(scene.roi_px | 1, scene.pixel_nm)
+    light, mass = float(block.level[block.used].mean()), model.material.mass_kda
+    signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
+    height = math.sqrt(light * float(np.sum(signal**2)))
+    return (
+        f"no particle was found: over {light:.3g} e per pixel and frame one of particle.mass_kda = "
+        f"{mass:.4g} stands out of the noise of a frame by {height:.2g} standard deviations, and "
+        f"{scene.templates.threshold:.2g} are needed; if there are particles, record with more "
+        "light, or longer exposures"
+    )
+
+
+def track_movie(
+    scene: Scene,
+    movie: CountSource,
+    camera: Camera,
+    plan: Plan,
+    store: BlockStore,
+    *,
+    check: Check,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    first: Block | None = None,
+) -> tuple[list[Block], bool]:
+    """Track particles that are there in all frames, over backgrounds learnt with them."""
+    blocks: list[Block] = [] if first is None else [first]
+    interrupted = False
+    try:
+        for number in range(len(blocks), len(plan.spans)):
+            block = _analysed(
+                scene, movie, camera, plan, store, number,
+                check=check, pool=pool, progress=progress,
+            )  # fmt: skip
+            blocks.append(block)
+    except KeyboardInterrupt:
+        if not blocks:
+            raise
+        progress("report", 0, 1)  # what was finished is now gathered and kept, which takes a moment
+        pool.shutdown(wait=False, cancel_futures=True)
+        interrupted = True
+    return blocks, interrupted
+
+
+def _analysed(
+    scene: Scene,
+    movie: CountSource,
+    camera: Camera,
+    plan: Plan,
+    store: BlockStore,
+    number: int,
+    *,
+    check: Check,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    cautious: bool = False,
+) -> Block:
+    """Give a block of a movie, kept or analysed now."""
+    count, span = len(plan.spans), plan.spans[number]
+    told = progress if count == 1 else _part_of(progress, number, count)
+    block = store.load(number, span)
+    if block is not None:
+        told("track", 1, 1)
+        return block
+    block = analyse_block(
+        scene, movie, camera, span,
+        goes_on=(number > 0, number + 1 < count),
+        check=check, pool=pool, progress=told, cautious=cautious,
+    )  # fmt: skip
+    store.save(number, block)
+    return block
+
+
+def _part_of(progress: Progress, number: int, count: int) -> Progress:
+    """Tell the progress of one block as that of all; reading is no stage of its own."""
+
+    def told(stage: str, done: int, total: int) -> None:
+        if stage == "track":
+            progress(stage, round(_STEPS * (number + done / total)), _STEPS * count)
+
+    return told
+
+
+def track_frames(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    summary: Mapping[str, Any],
+    *,
+    check: Check,
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    doubt: str = "",
+    tell: Callable[[str], None],
+) -> Found:
+    """Fit each frame after the background, starting from the frame before, and link."""
+    first, last = windows.frames_after
+    lines: list[dict[str, Any]] = []
+    views: list[EventView] = []
+    repeats: list[FloatArray] = []
+    noise: FrameNoise | None = None
+    events: tuple[Event, ...] = ()
+    interrupted = False
+    shown = np.ones(last - first, dtype=np.bool_)
+    if not scene.additive:
+        shown = well_lit(windows.power, DARK)[-shown.size :]
+    try:
+        for frame in (first + np.flatnonzero(shown)).tolist():
+            here = _one_frame(movie, camera, windows, frame, check, scene)
+            starts = [event.candidate for event in events]
+            events, here = fit_field(scene, here, starts=starts, pool=pool)
+            if events and noise is None:
+                if cause := misfit_warning(scene.config, events):
+                    tell(cause)
+                elif doubt:
+                    _refuse_pattern(doubt, frame, events)
+                read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))
+                noise = FrameNoise(scene, windows, read, [event.fit for event in events])
+            if events and noise is not None:
+                repeats += [noise.look(here, events)] * len(events)
+            views += [view_of(number, event) for number, event in enumerate(events)]
+            lines += lines_of(scene, events)  # last, so that an interrupted frame has no rows
+            progress("track", frame + 1 - first, last - first)
+    except KeyboardInterrupt:
+        interrupted = True
+    track = scene.config.track
+    places = np.array([(line["x_nm"], line["y_nm"]) for line in lines]).reshape(-1, 2)
+    frames = np.array([line["frame"] for line in lines], dtype=np.int64)
+    numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
+    order = np.lexsort((frames, numbers))
+    own = numbers[order]
+    fits = numbered(lines_from([lines[k] for k in order]).assign(track=own), own)
+    seen: dict[int, EventView] = {}
+    for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
+        if number not in seen:
+            seen[number] = replace(view, event=number)
+    return Found(
+        scene=scene,
+        fits=fits,
+        views=tuple(seen[number] for number in sorted(seen)),
+        image=contrast_image(scene, windows),
+        compared=Compared.of(windows),
+        heading="background",
+        summary=summary,
+        repeats=tuple(repeats[row] for row in order),
+        empty=noise.spread if noise else None,
+        followed=Followed(windows),
+        interrupted=interrupted,
+    )
+
+
+def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
+    """Refuse to follow what is fixed, where it is that which is found in a frame."""
+    poor = sum(Status.POOR_FIT in event.flags for event in events)
+    if len(events) >= _PATTERN and poor >= _NEARLY_ALL * len(events):
+        raise DataError(
+            f"of {len(events)} places in frame {frame} that look like particles {poor} do not look "
+            f"like the model's picture, and would be followed through all frames: {doubt}"
+        )
+
+
+def _one_frame(
+    movie: FrameSource,
+    camera: Camera,
+    windows: Windows,
+    frame: int,
+    check: Check,
+    scene: Scene,
+) -> Windows:
+    counts = movie.read(frame, frame + 1)
+    check(counts, frame)
+    single = add_frames(windows, camera, counts, frame)
+    return start_power(single) if scene.config.background.power_normalization else single

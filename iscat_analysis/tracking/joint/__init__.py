@@ -1,0 +1,1 @@
+"""The joint likelihood of moving particles and the background that they share."""

@@ -1,0 +1,79 @@
+"""Rows and background of particles that hardly move, by steps that the likelihood allows.
+
+Of a particle that hardly moves the background takes all but its displacements times its mass, and
+how large these are for themselves is told by what is of second order in them.  Newton's step along
+that direction is the quotient of two small numbers, of which the lower one, 1 − E, is known no
+better than the expected information is the observed one: some steps are twenty times too long, or
+lead the other way.  So a step is taken back where the likelihood falls, and the next is damped
+(Levenberg 1944, Marquardt 1963).  A turn without Newton's step always climbs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.tracking.joint.likelihood import BLOCK, MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Rows
+
+AMPLIFIED = 5.0
+"""Newton's step over the move of one turn, from which it is not trusted."""
+
+_DAMPING = 0.01  # at first and at least: by as much 1 − E is wrong
+_STIFFER, _SOFTER = 10.0, 0.5
+_NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
+_ENOUGH = 0.05  # expected gain of the step that is the last one
+_MOST_STEPS = 40
+_DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
+
+
+def climb(
+    field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
+) -> tuple[Rows, Ground, BoolArray]:
+    """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""
+    counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
+    damping, best, kept = _DAMPING, -np.inf, (rows, ground)
+    for _ in range(_MOST_STEPS):
+        rows, found, done = field.fit(ground, rows)
+        found = Ground(found.level, found.power if follow_power else ground.power)
+        move = np.where(field.used, np.log(found.level / ground.level), 0.0)
+        value = log_likelihood(field, found, rows)
+        if value < best - _NOISE:
+            rows, ground = kept
+            damping *= _STIFFER
+            continue
+        best, kept = max(best, value), (rows, found)
+        damping = max(_SOFTER * damping, _DAMPING)
+        step, gain = _uphill(field, move, counts, damping)
+        ground = Ground(found.level * np.exp(step - move), found.power)
+        if gain < _ENOUGH:
+            return field.followed(rows, step), ground, done
+    return *kept, done
+
+
+def _uphill(
+    field: MovingField, move: FloatArray, counts: FloatArray, damping: float
+) -> tuple[FloatArray, float]:
+    """Give Newton's step, damped until it climbs, and by how much it should."""
+    while True:
+        step = field.where_turns_end(move, damping)
+        gain = 0.5 * float(np.sum(counts * move * step))
+        if not gain <= 0 or not move.any():  # one that is no number climbs no better when damped
+            return step, gain
+        damping *= _STIFFER
+
+
+def log_likelihood(field: MovingField, ground: Ground, rows: Rows) -> float:
+    """Give the log-likelihood of rows over the background that is most likely under them."""
+    total, power = field.draw(ground, rows, coarse=False), ground.power
+
+    def block(first: int) -> FloatArray:
+        here = slice(first, first + BLOCK)
+        signal = np.maximum(total[here].astype(np.float64), -_DARKEST)
+        bright = power[here, None, None] * (1 + signal)
+        seen = np.einsum("tyx,tyx->yx", field.exposures.electrons(here), np.log1p(signal))
+        return np.stack([seen, bright.sum(axis=0)])
+
+    seen, stretch = field.sum_of(block)
+    each = seen - field.total_e * np.log(stretch)
+    return float(each[field.used].sum() + field.frame_totals @ np.log(power))

@@ -1,0 +1,254 @@
+"""What the frames of one track have in common: one mass, and the errors of its background.
+
+The information on all parameters of a track over an unknown background is, per pixel,
+
+    J = Σ_t w_t B ∂C_t ∂C_tᵀ/(1 + C_t) − (Σ_t w_t B ∂C_t)(Σ_t w_t B ∂C_t)ᵀ / Σ_t w_t B (1 + C_t).
+
+The second part, of rank one in each pixel, is what the background takes.  Shared among the frames
+it takes 1/T from each, but adds up for what they have in common: a particle that hardly moves is
+told from its background by its motion alone, and how it moved must be told as well.
+
+With F_t = (R_t R_tᵀ)⁻¹ the information of frame t on its own (x, y, z, a), G_t = w_t B ∂C_t, N the
+counts of each pixel and E = N⁻½ Σ_t G_tᵀ F_t⁻¹ G_t N⁻½, a row has the covariance
+
+    F_t⁻¹ + R_t P_t (1 − E)⁻¹ P_tᵀ R_tᵀ,    P_t = R_tᵀ G_t N⁻½.
+
+P_t P_tᵀ is some 1/T, so that the eigenvalues of E add up to no more than a row has parameters: few
+of them are large, however many pixels the track covers.  (1 − E)⁻¹ is therefore worked out in the
+space that a few images span, which are sent through E until the largest are among them (block
+Krylov method: Musco and Musco, Adv. Neural Inf. Process. Syst. 28, 2015), and is 1 beyond.
+
+A mass that is common to the frames has the information Σ_t J_t − cᵀ (1 − E')⁻¹ c, with J_t that of
+frame t when its place follows, c the image that it sends then, and E' the E of the places alone; it
+is solved by conjugate gradients.  Tracks are taken one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.track_coupling import Coupling
+
+IntArray = NDArray[np.int64]
+
+_SINGULAR = 1e-9
+_IMAGES = 4  # that are sent through E at a time
+_LEFT = 3e-4  # of the variance of a row, that may be left out
+_SEED = 1  # of the images to begin with
+_ROUNDS = 3  # of a mean and of the weights there
+_UNLIKE = 2.0  # amplitude over the mean, beyond which weights stay
+_UNSOLVED = 1e-6  # of the information on a mass, that a step of the conjugate gradients adds
+_MOST_STEPS = 400
+
+
+@dataclass(frozen=True)
+class CommonAmplitudes:
+    """Amplitudes that are common to the frames of each track."""
+
+    amplitude: FloatArray
+    variance: FloatArray
+    known: FloatArray
+    frames: FloatArray
+
+
+def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> FloatArray:
+    """Say what the background adds to the errors of the rows.
+
+    Shapes: result (n, 4, 4).
+    """
+    index = np.flatnonzero(field.free[:4])
+    covariance = np.zeros((len(rows.frame), 4, 4))
+
+    tracks = [mine for mine in _tracks(rows, judged, index) if mine.size]
+
+    def of_one(k: int) -> None:
+        coupling = Coupling(field, ground, judged.slopes, tracks[k])
+        added = _added(coupling, _inverse(judged.fisher[tracks[k]], index))
+        covariance[np.ix_(tracks[k], index, index)] = added
+
+    field.share(of_one, len(tracks))
+    return covariance
+
+
+def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
+    """Covariance of every row besides its own, shape (n, free, free)."""
+    free = inverse.shape[1]
+    root = np.asarray(np.linalg.cholesky(inverse), dtype=np.float64)
+    turned = np.swapaxes(root, 1, 2)
+    inner = turned @ coupling.own() @ root
+    most = float(np.linalg.eigvalsh(inner)[:, -1].max())
+    # as no eigenvalue is larger than their sum
+    if _left(most, float(np.einsum("nii->", inner))) > _LEFT:
+        more = _beyond(coupling, root, most)
+        if more is None:
+            return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
+        inner += more
+    return np.asarray(root @ inner @ turned)
+
+
+def _left(most: float, largest: float) -> float:
+    """Tell how much of the variance of a row is left out with eigenvalues of E, at most."""
+    return most * largest / (1 - largest) if largest < 1 else np.inf
+
+
+def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
+    """P (1 − E)⁻¹ Pᵀ − P Pᵀ of every row, but for what is small; None where 1 − E is singular."""
+    n, free = root.shape[:2]
+    covariance = root @ np.swapaxes(root, 1, 2)
+    rank = min(n * free, coupling.pixels)
+    some = np.random.default_rng(_SEED).standard_normal((n, min(_IMAGES, rank), free))
+    images = coupling.sent(some @ np.swapaxes(root, 1, 2))
+    basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
+    largest = 1.0
+    while len(basis) < rank and _left(most, largest) > _LEFT:
+        added = _orthonormal(images, basis)[: rank - len(basis)]
+        seen, images = coupling.followed(covariance, added)
+        seen = seen @ root
+        basis, felt = np.concatenate([basis, added]), np.concatenate([felt, seen], axis=1)
+        # those of the next images, and of what is left out, are smaller
+        largest = float(np.linalg.eigvalsh(_products(seen))[-1])
+    values, turns = np.linalg.eigh(_products(felt))
+    if values[-1] > 1 - _SINGULAR:
+        return None
+    along = np.swapaxes(felt, 1, 2) @ turns
+    return np.asarray((along * (values / (1 - values))) @ np.swapaxes(along, 1, 2))
+
+
+def _products(felt: FloatArray) -> FloatArray:
+    """E between images that rows feel, shape (n, b, free)."""
+    return np.tensordot(felt, felt, axes=((0, 2), (0, 2)))
+
+
+def _orthonormal(images: FloatArray, basis: FloatArray) -> FloatArray:
+    """Make images orthonormal, to a basis as well."""
+    for _ in range(2):  # what rounding leaves of the basis goes the second time
+        images = images - (images @ basis.T) @ basis
+        images = np.linalg.qr(images.T)[0].T
+    return images
+
+
+def variances_left(information: FloatArray, index: IntArray) -> FloatArray:
+    """Give the variances that matrices of information leave.
+
+    Shapes: `information` (n, 4, 4), result (n, 4).
+    """
+    out = np.full(information.shape[:2], np.nan)
+    scaled, scale = _scaled(information, index)
+    good = np.flatnonzero(np.isfinite(scaled).all(axis=(1, 2)))
+    if not good.size:
+        return out
+    good = good[np.linalg.eigvalsh(scaled[good])[:, 0] > _SINGULAR]
+    inverse = np.einsum("nii->ni", np.linalg.inv(scaled[good])) * scale[good] ** 2
+    out[good[:, None], index] = inverse
+    return out
+
+
+def _scaled(fisher: FloatArray, index: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Informations of some parameters with ones on the diagonal, and what made them so."""
+    part = fisher[:, index][:, :, index]
+    scale = 1 / np.sqrt(np.maximum(np.einsum("nii->ni", part), 1e-300))
+    return part * scale[:, :, None] * scale[:, None, :], scale
+
+
+def _inverse(fisher: FloatArray, index: IntArray) -> FloatArray:
+    """Invert informations on some parameters, shape (n, len(index), len(index))."""
+    scaled, scale = _scaled(fisher, index)
+    return np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+
+
+def _tracks(rows: Rows, judged: Judged, index: IntArray) -> list[IntArray]:
+    """Give the rows of each track whose own information is no singular matrix."""
+    known = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
+    order = np.argsort(rows.track, kind="stable")
+    edges = np.searchsorted(rows.track[order], np.arange(1, int(rows.track.max(initial=-1)) + 1))
+    return [mine[known[mine]] for mine in np.split(order, edges)] if order.size else []
+
+
+def common_amplitudes(
+    field: MovingField, ground: Ground, rows: Rows, judged: Judged, counted: BoolArray
+) -> CommonAmplitudes:
+    """Fit one amplitude to all frames of each track, with the background that is most likely then.
+
+    Shapes: `counted` (n,).
+    """
+    index = np.flatnonzero(field.free[:4])
+    tracks = _tracks(rows, judged, index)
+    out = np.full((4, len(tracks)), np.nan)
+
+    def of_one(k: int) -> None:
+        mine = tracks[k]
+        used = counted[mine]
+        if not used.any():
+            return
+        fisher = judged.fisher[mine]
+        along, information = _marginal(fisher, index[:-1])
+        estimate = rows.theta[mine, 3] - judged.bias[mine, 3]
+        information = used * information
+        mean, more = _at_their_mean(rows.theta[mine, 3], estimate, information, judged.growth[mine])
+        weight = information * more
+        sends = np.column_stack([-along, np.ones(mine.size)]) * (used * np.sqrt(more))[:, None]
+        covariance = _inverse(fisher, index)
+        covariance[used] = 0.0
+        covariance[used, :-1, :-1] = _inverse(fisher[used], index[:-1])
+        coupling = Coupling(field, ground, judged.slopes, mine)
+        off = estimate - mean
+        mode, pulled = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
+        total = weight.sum()
+        answer, taken = _answer(coupling, covariance, mode, total)
+        left = total - taken
+        out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
+        if left > _SINGULAR * total:
+            out[:2, k] = mean + (weight @ off - answer @ pulled) / left, 1 / left
+
+    field.share(of_one, len(tracks))
+    return CommonAmplitudes(*out)
+
+
+def _at_their_mean(
+    amplitude: FloatArray, estimate: FloatArray, information: FloatArray, growth: FloatArray
+) -> tuple[float, FloatArray]:
+    """Give the mean of amplitudes, and by what the information on each is more at that."""
+    power = np.average(growth, weights=information)
+    mean, more = float(np.average(estimate, weights=information)), np.ones(len(estimate))
+    for _ in range(_ROUNDS):
+        more = np.clip(amplitude / mean, 1 / _UNLIKE, _UNLIKE) ** -power
+        mean = float(np.average(estimate, weights=information * more))
+    return mean, more
+
+
+def _answer(
+    coupling: Coupling, covariance: FloatArray, image: FloatArray, total: float
+) -> tuple[FloatArray, float]:
+    """Solve (1 − E') answer = image by conjugate gradients; give image · answer as well.
+
+    That is infinite where 1 − E' is singular.
+    """
+    answer, taken = np.zeros_like(image), 0.0
+    left, way = image.copy(), image.copy()
+    size = float(left @ left)
+    for _ in range(_MOST_STEPS):
+        turned = way - coupling.followed(covariance, way[None])[1][0]
+        bend = float(way @ turned)
+        if not bend > _SINGULAR * float(way @ way):
+            return answer, np.inf
+        step = size / bend
+        answer += step * way
+        taken += step * size
+        if step * size < _UNSOLVED * (total - taken):
+            break
+        left -= step * turned
+        before, size = size, float(left @ left)
+        way = left + size / before * way
+    return answer, taken
+
+
+def _marginal(fisher: FloatArray, others: IntArray) -> tuple[FloatArray, FloatArray]:
+    """How places follow an amplitude, shape (n, others), and the information on that then."""
+    along = np.einsum("nij,nj->ni", _inverse(fisher, others), fisher[:, others, 3])
+    return along, fisher[:, 3, 3] - np.einsum("ni,ni->n", along, fisher[:, others, 3])

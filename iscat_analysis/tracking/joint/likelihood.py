@@ -1,0 +1,422 @@
+"""The maximum of one likelihood for all particles that move over an unknown, constant background.
+
+The counts n of pixel p in frame t are Poisson with w_t B_p (1 + C_tp), C the sum of the signals of
+all particles.  Given their sum over the frames the counts of a pixel are multinomial with
+p_t ∝ w_t (1 + C_tp), from which B has dropped out.  The score of that likelihood is the Poisson
+score with the background that is most likely given the particles,
+
+    B̂_p = Σ_t n_tp / Σ_t w_t (1 + C_tp),
+
+put in (envelope theorem), so that fitting the particles over B̂ and B̂ under the particles in turn
+ends at its maximum, and nothing is left of the particles in their background.  Turns alone converge
+as slowly as the particles move.  How the rows follow a change of the background is known from their
+informations, so that Newton's method sees where the turns would end (`settle`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis._kernels.canvas import (
+    Canvas,
+    Field,
+    Light,
+    Pictures,
+    add_squares,
+    leave_over,
+)
+from iscat_analysis._kernels.following import Slopes
+from iscat_analysis._kernels.judging import judge_frames
+from iscat_analysis._kernels.moving import Search
+from iscat_analysis._kernels.scoring import CONVERGED
+from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.tracking.joint.exposures import Exposures
+from iscat_analysis.tracking.joint.frame_fits import draw_rows, fit_rows, room_for
+from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.newton import Response
+from iscat_analysis.tracking.joint.pictures import PictureBook
+from iscat_analysis.tracking.joint.render_plan import Sheet, blank
+
+IntArray = NDArray[np.int64]
+
+DRAWN = 4
+"""Side of the square in which a particle is drawn, over that in which it is fitted."""
+
+COARSE = 2
+"""Of the fitted square's side, by which it is cut while particles are still being looked for."""
+
+BLOCK = 32
+"""Frames that one thread takes at a time."""
+
+_SWEPT = 4  # of them, where every row is fitted several times
+_TOLERANCE = 2e-4  # as in `Likelihood.maximize`
+_PASSING = 0.02  # the same, of a fit that the next turn goes on with
+_PASSES = 40
+_SLACK = np.array([0.1, 0.1, 0.01, 0.05])
+"""How far particles may go from their rings: pixels, wavelengths, relative."""
+_ANY = 1e300
+_MORE_ROWS = 2.0  # for which there is room, than those of the first fit: untouched it is free
+_BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
+
+
+class MovingField:
+    """A movie in memory, and the pictures of what moves in it."""
+
+    def __init__(
+        self,
+        exposures: Exposures,
+        read_e2: FloatArray,
+        used: BoolArray,
+        near: ForwardModel,
+        far: ForwardModel,
+        *,
+        pixel_nm: float,
+        roi_px: int,
+        z_range_nm: tuple[float, float] | None,
+        largest: float,
+        pool: ThreadPoolExecutor,
+        saturated: BoolArray | None = None,
+    ) -> None:
+        self.exposures, self.used = exposures, used
+        self.saturated = np.zeros_like(used) if saturated is None else saturated
+        self.read_e2 = np.ascontiguousarray(np.broadcast_to(read_e2, used.shape), dtype=float)
+        self._pool = pool
+        rows, columns = used.shape
+        grid = PixelGrid.region((0, rows), (0, columns), pixel_nm)
+        self.pixel_nm, self.roi_px = pixel_nm, roi_px
+        pixels = near.pixels(grid)
+        wavelength = near.optics.wavelength_nm
+        slack = _SLACK * np.array([pixel_nm, pixel_nm, wavelength, 1.0])
+        along_z = z_range_nm is not None
+        drawn = DRAWN * roi_px
+        if along_z:  # no farther than the tables reach, into the corners of the square
+            drawn = min(drawn, 2 * int(far.reach_nm / (math.sqrt(2) * pixel_nm) - 1))
+        self._whole = Field(pixels, pixel_nm, roi_px, drawn, slack, along_z)
+        self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack, True)
+        if along_z:  # the rings tell one fringe from the next, and reach far
+            self._coarse = self._whole
+        self._canvas: Sheet | None = None
+        self._room_of_slopes = np.empty(0, dtype=np.int16)
+        self.free = np.array([True, True, z_range_nm is not None, True, False])
+        reach = window_nm(pixel_nm)
+        half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
+        if z_range_nm is not None:  # rings reach farther
+            half = max(half, roi_px * pixel_nm / 4)
+        low, high = z_range_nm or (near.height_nm, near.height_nm)
+        sign_kept = z_range_nm is not None
+        self._search = Search(
+            self.free,
+            np.array([reach, reach, _ANY, _ANY, 0.0]),
+            np.array([-half, -half, low, 0.0 if sign_kept else -largest, 0.0]),
+            np.array(
+                [(columns - 1) * pixel_nm + half, (rows - 1) * pixel_nm + half, high, largest, 0.0]
+            ),
+            np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _ANY, 1.0]),
+            _TOLERANCE,
+            _PASSES,
+        )
+        farthest = max(rows, columns) + _BEYOND * wavelength / (near.optics.na * pixel_nm)
+        self._book = PictureBook(
+            near, far,
+            pixel_nm=pixel_nm,
+            near_px=(roi_px + 1) / 2 + _SLACK[0] + reach / pixel_nm,
+            far_px=min((self._whole.drawn + 1) / 2, farthest) + 1,
+            z_range_nm=z_range_nm,
+        )  # fmt: skip
+        self._pictures = self._book.of(np.zeros(1))
+
+    @cached_property
+    def _room(self) -> NDArray[np.float32]:
+        """Of the canvas, shape (t, y, x)."""
+        return np.empty(self.exposures.counts.shape, dtype=np.float32)
+
+    @cached_property
+    def total_e(self) -> FloatArray:
+        """Photoelectrons of all frames, shape (y, x) [e]."""
+        counts = self.exposures.counts
+        total = self.sum_of(
+            lambda first: np.sum(counts[first : first + BLOCK], axis=0, dtype=np.float64)
+        )
+        return self.exposures.in_electrons(total, self.frames)
+
+    @cached_property
+    def frame_totals(self) -> FloatArray:
+        """Photoelectrons in the used pixels of each frame, shape (t,) [e]."""
+        counts = self.exposures.counts
+        unused = counts[:, ~self.used].sum(axis=1, dtype=np.float64)
+        blocks = range(0, self.frames, BLOCK)
+        parts = self._pool.map(
+            lambda first: counts[first : first + BLOCK].sum(axis=(1, 2), dtype=np.float64), blocks
+        )
+        total = np.concatenate(list(parts)) - unused
+        return self.exposures.in_electrons(total, int(self.used.sum()))
+
+    @property
+    def frames(self) -> int:
+        """Frames in the movie."""
+        return len(self.exposures.counts)
+
+    def renew(self, block: Callable[[int, int], NDArray[Any]]) -> None:
+        """Put other frames in the place of these."""
+
+        def put(first: int) -> None:
+            last = min(first + BLOCK, self.frames)
+            self.exposures.counts[first:last] = block(first, last)
+
+        list(self._pool.map(put, range(0, self.frames, BLOCK)))
+        for told in ("total_e", "frame_totals"):
+            self.__dict__.pop(told, None)
+        self.draw_anew()
+
+    def set_blurs(self, variances_nm2: FloatArray) -> None:
+        """Make the pictures that `Rows.group` numbers.
+
+        Shapes: `variances_nm2` (groups,).
+        """
+        self._pictures = self._book.of(variances_nm2)
+        self._canvas = None
+
+    def fit(
+        self, ground: Ground, rows: Rows, *, sweeps: int = 1, coarse: bool = False
+    ) -> tuple[Rows, Ground, BoolArray]:
+        """Fit every row over a background, and give the background under the rows.
+
+        Rows that overlap follow one another in the end, but those of smaller squares, some of which
+        are only tried.  How all of them follow their background is kept for `where_turns_end`.
+
+        Shapes: `converged` (n,).
+        """
+        light = self._light(ground)
+        near, far = self._pictures_for(coarse=coarse)
+        theta = rows.theta.copy()
+        starts = rows.starts(self.frames)
+        outcome = np.full(len(theta), CONVERGED, dtype=np.int64)
+        fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
+        canvas = self._canvas_for(rows, coarse=coarse)
+        field = self._coarse if coarse else self._whole
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
+        slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
+        expected = np.zeros(self.frames)
+
+        def block(first: int) -> NDArray[np.float32]:
+            sums = np.zeros(self.used.shape, dtype=np.float32)
+            last = min(first + BLOCK, self.frames)
+            draw_rows(field, near, far, starts, first, last, theta, rows.group, canvas)
+            fit_rows(
+                light, field, near, search, starts, first, last, sweeps, theta, rows.group, canvas,
+                slopes, outcome, fisher, gain, expected, sums,
+            )  # fmt: skip
+            return sums
+
+        stretch = ground.power.sum() + self.sum_of(block)
+        fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
+        self._canvas = Sheet(fitted, canvas, coarse)
+        if sweeps:
+            own = np.ascontiguousarray(fisher[:, self.free[:4]][:, :, self.free[:4]])
+            self._response = Response(
+                slopes, starts, light, canvas.total, own, self._pool, joint=not coarse
+            )
+        if sweeps and not coarse:  # among rows that are only tried some would be pushed away
+            walls = search.lower, search.upper
+            fitted = replace(fitted, theta=self._response.together(theta, self.free, walls))
+        level = np.where(stretch > 0, self.total_e / np.where(stretch > 0, stretch, 1.0), 1.0)
+        totals = self.frame_totals
+        expected += light.background.sum()
+        power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
+        return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
+
+    def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
+        """Give the step of the background whose first turn, with the last fit, is `move`.
+
+        Shapes: `move` (y, x), result (y, x).
+        """
+        return self._response.step(move, self.total_e, self.used, damping)
+
+    def followed(self, rows: Rows, step: FloatArray) -> Rows:
+        """Let the rows of the last fit follow a step of the background, to first order.
+
+        Shapes: `step` (y, x).
+        """
+        search = self._search
+        walls = search.lower, search.upper
+        theta = self._response.followed(rows.theta, step, self.free, walls)
+        return replace(rows, theta=theta)
+
+    def draw_anew(self) -> None:
+        """Draw all rings where their particles are, at the next pass."""
+        self._canvas = None
+
+    def draw(self, ground: Ground, rows: Rows, *, coarse: bool = True) -> NDArray[np.float32]:
+        """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
+
+        Shapes: result (t, y, x).
+        """
+        self.draw_anew()  # rings that stayed where rows were before are not good enough
+        self.fit(ground, rows, sweeps=0, coarse=coarse)
+        return self._room
+
+    def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+        """Give the counts of some frames minus what is expected.
+
+        Shapes: result (last - first, y, x).
+        """
+        if self._canvas is not None and self._canvas.rows is rows and self._canvas.coarse:
+            signal = self._canvas.canvas.total[first:last]
+        else:
+            signal = self._signal(rows, first, last)
+        left = np.empty_like(signal)
+        leave_over(self._light(ground), signal, first, left)
+        return left
+
+    def add_squares(
+        self, ground: Ground, rows: Rows, which: IntArray, corner: IntArray, owner: IntArray,
+        out: FloatArray,
+    ) -> None:  # fmt: skip
+        """Put squares around rows on top of each other, with all rows taken off.
+
+        Shapes: `which` (n,), `corner` (n, 2), `owner` (n,), `out` (m, 3, side, side).
+        """
+        total, light = self.draw(ground, rows), self._light(ground)
+
+        def add(number: int) -> None:
+            mine = np.flatnonzero(owner == number)
+            add_squares(light, total, rows.frame[which[mine]], corner[mine], owner[mine], out)
+
+        self.share(add, len(out))
+
+    def _signal(self, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+        """Draw the rows of some frames alone."""
+        within = rows.only((rows.frame >= first) & (rows.frame < last))
+        canvas = blank(np.empty((last - first, *self.used.shape), dtype=np.float32), within)
+        near, far = self._pictures_for(coarse=True)
+        starts = np.searchsorted(within.frame, np.arange(first, last + 1)).astype(np.int64)
+        draw_rows(
+            self._coarse, near, far, starts, 0, last - first, within.theta, within.group, canvas
+        )
+        return canvas.total
+
+    def judge(self, ground: Ground, rows: Rows) -> Judged:
+        """Say what the likelihood knows of every row."""
+        n = len(rows.frame)
+        light = self._light(ground)
+        near, far = self._pictures_for(coarse=False)
+        starts = rows.starts(self.frames)
+        fisher, (turned, ways) = np.zeros((n, 4, 4)), np.full((2, n, 4, 4), np.nan)
+        bias, numbers = np.zeros((n, 4)), np.zeros((n, 6))
+        canvas = self._canvas_for(rows, coarse=False)
+        slopes = self._slopes_of(n, self._whole.side)
+
+        def block(first: int) -> FloatArray:
+            last = min(first + BLOCK, self.frames)
+            draw_rows(self._whole, near, far, starts, first, last, rows.theta, rows.group, canvas)
+            judge_frames(
+                light, self._whole, near, self.free, starts, first, last, rows.theta, rows.group,
+                canvas, slopes, fisher, turned, ways, bias, numbers,
+                room_for(self._whole, near, self.free),
+            )  # fmt: skip
+            return np.zeros(1)
+
+        self.sum_of(block)
+        return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
+
+    def sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
+        """Run blocks of frames and add what they give, in their order."""
+        parts = list(self._pool.map(block, range(0, self.frames, BLOCK)))
+        total = parts[0].astype(np.float64)
+        for part in parts[1:]:
+            total += part
+        return total
+
+    def share(self, task: Callable[[int], None], count: int) -> None:
+        """Run a numbered task for every number below `count`, several at a time."""
+        list(self._pool.map(task, range(count)))
+
+    def holds(self, theta: FloatArray) -> BoolArray:
+        """Tell which particles are in the field.
+
+        Shapes: `theta` (..., 5), result (...).
+        """
+        rows, columns = self.used.shape
+        places = theta[..., :2] / self.pixel_nm
+        within = (places >= -0.5) & (places < np.array([columns, rows]) - 0.5)
+        return np.asarray(within.all(axis=-1))
+
+    def refit(self, ground: Ground, rows: Rows, *, sweeps: int) -> tuple[Rows, BoolArray]:
+        """Fit all particles of a few frames, the smaller square of each.
+
+        Shapes: `converged` (n,).
+        """
+        light = self._light(ground)
+        near, far = self._pictures_for(coarse=True)
+        times, frame = np.unique(rows.frame, return_inverse=True)
+        light = light._replace(counts=light.counts[times], power=light.power[times])
+        starts = np.searchsorted(frame, np.arange(times.size + 1)).astype(np.int64)
+        theta, n = rows.theta.copy(), len(frame)
+        canvas = blank(np.empty(light.counts.shape, dtype=np.float32), rows)
+        outcome = np.zeros(n, dtype=np.int64)
+        fisher, gain = np.zeros((n, 4, 4)), np.empty(n)
+        slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
+
+        def block(part: int) -> None:
+            first, last = part * _SWEPT, min((part + 1) * _SWEPT, times.size)
+            draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
+            fit_rows(
+                light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
+                rows.group, canvas, slopes, outcome, fisher, gain, expected,
+                np.zeros(self.used.shape, dtype=np.float32),
+            )  # fmt: skip
+
+        self.share(block, -(-times.size // _SWEPT))
+        return rows.fitted(theta, fisher, gain), outcome == CONVERGED
+
+    def on_wall(self, rows: Rows) -> BoolArray:
+        """Tell which rows ended on a wall of the search.
+
+        Shapes: result (n,).
+        """
+        search = self._search
+        near = (rows.theta <= search.lower + 1e-6) | (rows.theta >= search.upper - 1e-6)
+        near[:, 3] &= rows.theta[:, 3] >= search.upper[3]  # no mass is the end of none
+        return np.asarray((near & self.free).any(axis=1))
+
+    def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
+        """Give the pictures to fit and to draw, which are the same where little is drawn."""
+        near, far = self._pictures
+        return near, near if coarse and not self.free[2] else far
+
+    def _light(self, ground: Ground) -> Light:
+        level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
+        shot = self.exposures
+        return Light(shot.counts, shot.gain, shot.offset, ground.power, level, read)
+
+    def _canvas_for(self, rows: Rows, *, coarse: bool) -> Canvas:
+        """Give the canvas, with the frames marked in which it holds other rows than these."""
+        last = self._canvas
+        if last is None or last.coarse != coarse:
+            canvas = blank(self._room, rows)
+        else:
+            canvas = last.moved(rows, self.frames)
+        self._canvas = Sheet(rows, canvas, coarse)
+        return canvas
+
+    def _slopes_of(self, rows: int, side: int) -> Slopes:
+        """Room for slopes, in the place of those before."""
+        free = int(self.free[:4].sum())
+        size = rows * free * side**2
+        if self._room_of_slopes.size < size:
+            # It is cleared where it is first used, as long as a fit takes: once, for all to come.
+            most = round(_MORE_ROWS * rows) * free * self._whole.side**2
+            self._room_of_slopes = np.empty(most, dtype=np.int16)
+        values = self._room_of_slopes[:size].reshape(rows, free, side**2)
+        squares, units, moves = np.zeros((rows, 4), dtype=np.int64), *np.zeros((2, rows, free))
+        return Slopes(squares, values, units, moves)

@@ -1,0 +1,331 @@
+"""Particles that move in every frame of a movie: background, tracks and fits, each from the others.
+
+median → find → fit over the background under the fits → find what is left → link → drop what
+is no track, fill gaps → D of each track → blurred pictures → fit until nothing changes
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.config import Config
+from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.optics.blur import path_variance_nm2
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
+from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.threads import beside
+from iscat_analysis.tracking.extension import extended
+from iscat_analysis.tracking.frame_search import Sightings, load_linker
+from iscat_analysis.tracking.heights import decide_heights
+from iscat_analysis.tracking.identity import identified
+from iscat_analysis.tracking.joint.common import (
+    CommonAmplitudes,
+    common_amplitudes,
+    shared_errors,
+    variances_left,
+)
+from iscat_analysis.tracking.joint.joint_fit import MOST_TURNS, settle
+from iscat_analysis.tracking.joint.likelihood import MovingField
+from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.linking import (
+    AS_FOUND,
+    alone,
+    crowded,
+    held,
+    linked,
+    mass_error,
+    mass_places,
+    meeting,
+    numbered,
+    seen,
+    shares_mass,
+    trimmed,
+    typical,
+    typical_error,
+)
+from iscat_analysis.tracking.moving_field import (
+    exposure_of,
+    give_back,
+    load_field,
+    opening_ground,
+    search_frames,
+)
+from iscat_analysis.tracking.outlier_positions import brought_back
+
+ROUNDS = 8
+"""Searches of the whole movie; each sees what the fits so far leave over."""
+
+_FIRST_TURNS = 2  # of background and particles after each of the first `_FULL` searches; after one
+# turn what hardly moves would be lost
+_NEXT_TURNS = 2  # between two extensions of the tracks
+_LEAST_POSITIONS = 4  # of a track whose D is fitted
+_USELESS = 300.0  # times the median error of a track: such a place says nothing
+_FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
+_BLUR_STEP = 0.03  # the same, relative
+_FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
+_FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
+_SEVERAL = 1.5  # rows in a frame, from which some will be linked by trackpy
+_FLOOD = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
+_FULL = 2  # searches of all frames, after which some of them tell whether to go on
+_FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
+_HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
+
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Moving:
+    """What was found in a movie."""
+
+    rows: Rows
+    ground: Ground
+    judged: Judged
+    converged: BoolArray
+    close: BoolArray
+    variances_nm2: FloatArray
+    diffusion: FloatArray
+    field: MovingField
+    shared: FloatArray
+    common: CommonAmplitudes
+
+    @property
+    def smear_nm(self) -> FloatArray:
+        """Spread of the path of every row about its mean, along each axis, shape (n,) [nm]."""
+        return np.asarray(np.sqrt(self.variances_nm2)[self.rows.group])
+
+
+def follow(
+    scene: Scene,
+    movie: CountSource,
+    camera: Camera,
+    span: tuple[int, int],
+    *,
+    check: Callable[[NDArray[Any], int], None],
+    pool: ThreadPoolExecutor,
+    progress: Progress,
+    inner: tuple[int, int] | None = None,
+    cautious: bool = False,
+) -> Moving:
+    """Find and fit every particle in every frame."""
+    config = scene.config
+    field = load_field(scene, movie, camera, span, check, pool, progress)
+    follow_power = config.background.power_normalization
+    follow_level = config.background.method == "tracks"
+    ground = opening_ground(config, field)
+    nothing = np.zeros(0, dtype=np.int64)
+    rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
+    total = ROUNDS + 3
+    for number in range(ROUNDS):
+        progress("track", number, total)
+        before = len(rows.frame)
+        enough = round(_FEW * before) if number >= _FULL else 0
+        found = search_frames(
+            scene, field, ground, rows, pool, enough=enough, cautious=cautious
+        )  # fmt: skip
+        if number and len(found.frame) <= _FEW * before:
+            break
+        rows = _joined(scene, rows, found)
+        if len(rows.frame) > _SEVERAL * len(np.unique(rows.frame)):  # there will be a choice
+            beside(load_linker)
+        rows, ground, done = settle(
+            field,
+            ground,
+            rows,
+            follow_power=follow_power,
+            follow_level=follow_level,
+            turns=_FIRST_TURNS if number < _FULL else 1,
+            coarse=True,
+        )
+        if scene.mode == "joint" and number < _FIRST_HEIGHTS:
+            rows = _in_their_fringes(scene, field, ground, rows)
+            rows, _, done = field.fit(ground, rows, coarse=True)
+        rows = _credible(scene, field, rows, done)
+        if scene.mode == "joint" and number == 0:  # sharp pictures leave over of gold what is seen
+            rows = linked(config, rows, mass_places(config, rows))
+            rows, variances, _ = _moved(config, field, rows)
+            field.set_blurs(variances)
+            rows, ground, done = settle(
+                field, ground, rows, follow_power=follow_power, follow_level=follow_level,
+                turns=_NEXT_TURNS, coarse=True,
+            )  # fmt: skip
+        _refuse_flood(config, field, rows)
+        if number and len(rows.frame) <= (1 + _FEW) * before:
+            break
+    progress("track", ROUNDS, total)
+    rows = linked(config, rows, mass_places(config, rows), inner=inner)
+    resolution = config.optics.wavelength_nm / config.optics.na
+    for number in range(ROUNDS):
+        # at first nothing is only tried, and the search has settled nearly all
+        rows, ground, done = settle(
+            field, ground, rows, follow_power=follow_power, follow_level=follow_level,
+            turns=_NEXT_TURNS if number else 1, coarse=True,
+        )  # fmt: skip
+        rows, added = trimmed(rows), 0
+        if not cautious:
+            rows, added = extended(
+                field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
+            )
+        rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
+        rows = alone(scene, rows, inner=inner)
+        if number < _HELD_ROUNDS and follow_level and not cautious:
+            rows, tried = held(config, field, rows)
+            added += tried
+        # the background that is told of all frames, before these are fitted over it
+        _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0, coarse=True)
+        ground = replace(ground, level=found_ground.level) if follow_level else ground
+        if added <= (_FEW_TRIED if number < _HELD_ROUNDS else _FEW) * len(rows.frame):
+            break
+    rows = _told_apart(config, trimmed(rows))
+    for stage in range(2):
+        give_back(scene, field, movie, camera, span[0], ground, rows)
+        if scene.mode == "joint":
+            rows = _in_their_fringes(scene, field, ground, rows)
+        rows, ground, done = settle(
+            field, ground, brought_back(rows), follow_power=follow_power,
+            follow_level=follow_level, turns=MOST_TURNS if stage else 1, coarse=not stage,
+        )  # fmt: skip
+        progress("track", ROUNDS + 1 + stage, total)
+        if stage == 0:
+            rows, variances, diffusion = _moved(config, field, rows)
+            field.set_blurs(variances)
+    there = seen(scene, rows)  # the rings of others, drawn far out, may explain a track
+    if not there.all():
+        numbers = np.cumsum(there) - 1
+        rows = rows.only(there[rows.track])
+        rows, diffusion = replace(rows, track=numbers[rows.track]), diffusion[there]
+        rows, ground, done = settle(
+            field, ground, rows, follow_power=follow_power, follow_level=follow_level, turns=1
+        )
+    judged = field.judge(ground, rows)
+    shared = shared_errors(field, ground, rows, judged)
+    near = meeting(rows, config.detection.min_separation_nm)
+    unlike = shares_mass(rows, judged)
+    close = near | unlike
+    if scene.mode == "joint":  # a path along z takes as much of the mass, and must count
+        unlike = unlike & crowded(rows, scene.roi_px * scene.pixel_nm)
+    counted = done & field.holds(rows.theta) & ~near & ~unlike
+    common = common_amplitudes(field, ground, rows, judged, counted)
+    progress("track", total, total)
+    return Moving(rows, ground, judged, done, close, variances, diffusion, field, shared, common)
+
+
+def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:
+    """Refuse a frame with more rows than particles that could be told apart."""
+    side_um = field.pixel_nm / 1e3
+    area = side_um**2 * float(field.used.sum())
+    resolution = config.optics.wavelength_nm / config.optics.na / 1e3
+    each = len(rows.frame) / field.frames
+    if each > _FLOOD * area / resolution**2:
+        raise DataError(
+            f"{each:.0f} places in every frame of {area:.0f} um2 look like particles, more than "
+            "can be told apart: the light changes from frame to frame, as where the stage drifts "
+            "or vibrates, or the optics are far off; record a steadier movie or fewer particles, "
+            "or analyse fewer frames (fit.frames), in which it stands still"
+        )
+
+
+def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+    """Put every row into the fringe that its track says."""
+    return decide_heights(
+        field, ground, rows,
+        fringe_nm=scene.model.fringe_nm, z_range_nm=scene.config.fit.z_range_nm,
+    )  # fmt: skip
+
+
+def _told_apart(config: Config, rows: Rows) -> Rows:
+    """Give particles that met their own numbers again."""
+    if not len(rows.frame):
+        return rows
+    error = mass_error(config, rows, typical_error(rows.fisher))
+    resolution = config.optics.wavelength_nm / config.optics.na
+    told = identified(rows, near_nm=resolution, error=error)
+    return numbered(told)
+
+
+def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
+    """Add candidates to the rows."""
+    n = len(found.frame)
+    pixel = scene.pixel_nm
+    theta = np.column_stack([
+        found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n),
+    ])  # fmt: skip
+    unknown = replace(rows, track=np.full(len(rows.frame), -1))
+    blur = int(np.bincount(rows.group).argmax()) if len(rows.group) else 0
+    return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
+
+
+def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> Rows:
+    """Keep the rows that a particle explains, each particle once."""
+    # of light that is no picture a fit may be lost
+    known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
+    rows, done = rows.only(known), done[known]
+    kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * scene.templates.threshold)
+    near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
+    starts = rows.starts(field.frames)
+    for t in np.unique(rows.frame[crowded(rows, near)]):
+        order = starts[t] + np.argsort(-rows.snr[starts[t] : starts[t + 1]])
+        for i, a in enumerate(order):
+            for b in order[:i]:
+                apart = np.hypot(*(rows.theta[a, :2] - rows.theta[b, :2]))
+                if kept[a] and kept[b] and apart < near:
+                    kept[a] = False
+    return rows.only(kept)
+
+
+def _moved(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, FloatArray, FloatArray]:
+    """Give tracks their blurs, with the variances that these number and the D they are made of."""
+    diffusion = diffusion_of(config, field.free, rows)
+    _, exposure = exposure_of(config)
+    return *blurred_rows(rows, diffusion, exposure), diffusion
+
+
+def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
+    """Fit D to the places of every track, where it is alone.
+
+    Places in a meeting are off by more than their errors say, and would count as steps.
+
+    Shapes: `free` (5,), result (tracks, 2).
+    """
+    tracks = int(rows.track.max(initial=-1)) + 1
+    out = np.zeros((tracks, 2))
+    sigma = np.sqrt(variances_left(rows.fisher, np.flatnonzero(free[:4])))
+    axes = [0, 1]
+    rate, exposure = exposure_of(config)
+    apart = ~meeting(rows, config.detection.min_separation_nm)
+    for k in range(tracks):
+        mine = apart & (rows.track == k)
+        error = sigma[:, axes].max(axis=1)
+        if mine.any():
+            mine &= error < _USELESS * np.nanmedian(error[mine])
+        if mine.sum() < _LEAST_POSITIONS:
+            continue
+        out[k] = estimate_diffusion(
+            rows.frame[mine], rows.theta[mine][:, axes], sigma[mine][:, axes],
+            frame_rate_hz=rate,
+            exposure_ms=1e3 * exposure,
+        )  # fmt: skip
+    return out
+
+
+def blurred_rows(rows: Rows, diffusion: FloatArray, exposure_s: float) -> tuple[Rows, FloatArray]:
+    """Give the blurs of tracks numbers, those that hardly differ the same.
+
+    Shapes: `diffusion` (tracks, 1 or more), `variances_nm2` (groups,).
+    """
+    d = np.nan_to_num(diffusion[:, 0])
+    q = np.array([path_variance_nm2(float(v), exposure_s) for v in d]).reshape(-1)
+    scale = _FINEST_NM2 / _BLUR_STEP  # steps are even below, relative above
+    steps = np.rint(np.arcsinh(q / scale) / _BLUR_STEP)
+    numbers, group = np.unique(steps, return_inverse=True)
+    variances = np.maximum(scale * np.sinh(numbers * _BLUR_STEP), 0.0)
+    if not len(variances):
+        return rows, np.zeros(1)
+    return replace(rows, group=group[rows.track].astype(np.int64)), variances

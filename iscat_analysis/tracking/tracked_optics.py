@@ -1,0 +1,357 @@
+"""The optics of a movie in which particles move, tested on its tracks and learned from them.
+
+The pictures of `iscat_analysis.tracking.aligned` show what the model leaves over of all frames.  A
+good model leaves over noise, and less than a hundredth of the particle where there is little of it;
+an NA of 1.40 for 1.42, a focus wrong by 20 nm or 15 nm of coma leave over a tenth.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
+from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.instrument.learner import (
+    FREE,
+    MOST_SIGHTS,
+    OpticsCalibration,
+    Settings,
+    heights_free,
+    settings_of,
+    with_settings,
+)
+from iscat_analysis.instrument.learning import taken, usable
+from iscat_analysis.instrument.microscope import calibrate_sights, with_sign
+from iscat_analysis.instrument.tested_optics import REJECTED_P
+from iscat_analysis.instrument.unknown_heights import learn_with_heights
+from iscat_analysis.records import BoolArray
+from iscat_analysis.tracking.aligned import Aligned
+from iscat_analysis.tracking.block_store import Block
+from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.units import count
+
+REJECTED_SHARE = 0.04
+"""Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
+that leave over less are wrong by less than masses are."""
+
+REJECTED_CHI2 = 2.0
+"""Times the noise of single frames, what it leaves over too: less is seen in good movies whose
+particles meet often."""
+
+MASS_SHARE = 0.4
+"""Error of masses over what optics that are wrong leave over of the pictures: root mean square of
+eleven such microscopes, 0 to 0.97."""
+
+ROUNDS = 8
+"""Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
+tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
+
+_ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
+_NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
+_LOOKED_AT = 24  # pictures in which the cause is looked for
+
+
+@dataclass(frozen=True)
+class LeftOver:
+    """What the model leaves over of all pictures of tracks together."""
+
+    share: float
+    clear: bool
+    tracks: int
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the optics are not those of the movie."""
+        return self.share > REJECTED_SHARE and self.clear
+
+    @property
+    def verdict(self) -> str:
+        """Say so."""
+        if not self.rejected:
+            return "the optics cannot be learned from this movie"
+        return (
+            f"the configured optics do not describe the particles: of the pictures of "
+            f"{count(self.tracks, 'track')} they leave over {self.share:.0%}"
+        )
+
+
+@dataclass(frozen=True)
+class Begun:
+    """The first frames of a movie, followed with some optics."""
+
+    config: Config
+    scene: Scene
+    block: Block
+
+    @cached_property
+    def left(self) -> LeftOver | None:
+        """What the model leaves over of all pictures; None where there is none."""
+        return _left_over(self.block, self.scene)
+
+    @property
+    def described(self) -> bool:
+        """Whether the optics describe the tracks."""
+        return self.left is not None and not self.left.rejected
+
+
+class Begin(Protocol):
+    """Follows the first frames of a movie."""
+
+    def __call__(self, config: Config, *, cautious: bool = False) -> Begun:
+        """Follow them with some optics; `cautious` as in `follow`."""
+        ...
+
+
+def learn_from_tracks(
+    config: Config,
+    begin: Begin,
+    *,
+    name: str,
+    pool: ThreadPoolExecutor,
+    tell: Callable[[str], None],
+    notify: Callable[[str], None] = unheard,
+) -> tuple[Begun, dict[str, Any]]:
+    """Follow the first frames, test the optics on them, and learn better ones where they fail.
+
+    Through optics that are very wrong a particle leaves rings which are taken for others, until
+    nothing can be linked or learned.  Then only what stands alone is followed, and learned from.
+    """
+    optics = config.optics
+    suited = optics.convention == "exact" and optics.psf == "model"
+    begun, trouble = _first(config, begin) if suited else (begin(config), None)
+    left = begun.left
+    if trouble is not None and (left is None or not left.rejected):
+        raise trouble
+    if left is None or not suited:
+        return begun, {}
+    tested = {"tested": left.tracks, "left_over": left.share}
+    if not left.rejected and optics.calibrate != "always":
+        return begun, tested | {"calibrated": False}
+    cause = _cause(begun) if left.rejected else None
+    noisy = begun.block.noise_differs and trouble is None
+    if noisy and cause is None and optics.calibrate != "always":
+        return begun, tested | {"calibrated": False, "reason": _NOISE}
+
+    def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+        if trouble is not None and cause is None:
+            raise trouble
+        if trouble is not None:
+            raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
+        tell(said)
+        return begun, tested | {"calibrated": False, "reason": reason}
+
+    learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
+    if not learns or (cause is not None and cause.name == PIXEL):
+        said = _said(left, cause, learns=learns)
+        return as_configured(said, said)
+    reason = ""
+    notify("learning the optics from the tracks of the movie, which may take minutes…")
+    # with free heights rings are taken for many particles, each with its own: that takes long
+    apart = trouble is not None or heights_free(config)
+    for cautious in (True,) if apart else (False, True):
+        try:
+            trial = begin(config, cautious=True) if cautious and trouble is None else begun
+            found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
+            if found is not None:
+                learned, told = taken(
+                    found, config, tested, left.verdict, pictures_of="pictures of tracks", tell=tell
+                )
+                return begin(learned), told
+            if trouble is not None and near is not None:
+                tell(f"{left.verdict}; others are used that describe them better, but: {why}")
+                rest = near.left.share if near.left is not None else 0.0
+                told = {"calibrated": True, "reason": why, "left_over_then": rest}
+                return near, tested | told
+        except (DataError, ConfigError) as error:  # or what was learned asks for too much memory
+            why = str(error)
+        reason = reason or why
+    if left.rejected:
+        said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
+    else:
+        said = f"{left.verdict}: {reason}; the analysis goes on as configured"
+    return as_configured(said, reason)
+
+
+def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
+    """Follow the first frames, cautiously where there is trouble, which is given then."""
+    try:
+        return begin(config), None
+    except DataError as error:
+        try:
+            return begin(config, cautious=True), error
+        except DataError:
+            raise error from None
+
+
+def _described(
+    trial: Begun,
+    begin: Begin,
+    config: Config,
+    cause: Cause | None,
+    *,
+    name: str,
+    pool: ThreadPoolExecutor,
+) -> tuple[OpticsCalibration | None, Begun | None, str]:
+    """Measure optics from tracks that were followed with optics that describe them.
+
+    Where none are good enough: what was followed last, if it is described, and why.
+    """
+    reason = "what was learned does not describe them either"
+    near = trial if trial.described else None
+    best: tuple[Round, Begun] | None = None
+    rounds = Rounds()
+    for number in range(ROUNDS):
+        if number == _ROUGH_ROUNDS and near is None and best is None:
+            break
+        known = None
+        if number:
+            trial, trouble = _first(rounds.next if near else rounds.all[-1].after, begin)
+            if trouble is not None and best is not None:
+                break
+            near = trial if trouble is None and trial.described else None
+            known = settings_of(trial.config) if near else None
+        found = _measured(trial, _start(config, cause), name, pool, known=known)
+        learned, refusal = usable(found, config)
+        guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
+        reason = refusal or reason
+        if guess is None:
+            break
+        rounds = rounds.with_one(Round(trial.config, guess, found))
+        if learned is not None and near is not None:
+            best = rounds.all[-1], near
+        if near is not None and rounds.settled:
+            break
+    if best is None:
+        return None, near, reason
+    return best[0].found.less_sure(rounds.error_of(best[0])), best[1], ""
+
+
+def mass_error(summary: Mapping[str, Any]) -> float:
+    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks."""
+    if "left_over_then" in summary:
+        return MASS_SHARE * float(summary["left_over_then"])
+    share = float(summary.get("left_over", 0.0))
+    rejected = share > REJECTED_SHARE and "reason" in summary and not summary["calibrated"]
+    return MASS_SHARE * share if rejected else 0.0
+
+
+def _left_over(block: Block, scene: Scene) -> LeftOver | None:
+    """Add up what the model leaves over of all pictures; None where there is none."""
+    aligned = block.aligned
+    if aligned is None or not len(aligned.track):
+        return None
+    tracks = len(np.unique(aligned.track))
+    if scene.mode == "joint":
+        return _left_over_singly(aligned, scene, tracks)
+    rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
+    for number, theta in enumerate(aligned.theta):
+        likelihood = aligned.likelihood(scene, number)
+        noise = np.where(likelihood.used, aligned.light_e[number] + aligned.read_e2[number], 0.0)
+        rest += theta[3] * np.nan_to_num(likelihood.residuals(theta)) * np.sqrt(noise)
+        signal += theta[3] * noise * likelihood.signal(theta)
+        variance += theta[3] ** 2 * noise
+    used = variance > 0
+    usual = max(1.0, float(block.table["chi2_reduced"].median()))
+    square = rest[used] ** 2 / variance[used] / usual
+    power = float(np.sum(signal[used] ** 2 / variance[used])) / usual
+    share = _share(float(np.sum(square - 1)), power)
+    return LeftOver(share, float(square.mean()) > REJECTED_CHI2, tracks)
+
+
+def _left_over_singly(aligned: Aligned, scene: Scene, tracks: int) -> LeftOver | None:
+    """Say the same of pictures that no two have in common, as of particles at other heights."""
+    excess, power, p_values = 0.0, 0.0, []
+    for number, theta in enumerate(aligned.theta):
+        likelihood = aligned.likelihood(scene, number)
+        signal = likelihood.signal(theta)
+        chi2, p_value = goodness_of_fit(likelihood, theta, _free(scene))
+        excess += (chi2 - 1) * likelihood.n_pixels
+        power += float(np.sum(signal**2 * likelihood.signal_information(signal)))
+        p_values.append(p_value)
+    return LeftOver(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
+
+
+def _share(excess: float, power: float) -> float:
+    """Root of the share of a signal's power."""
+    return math.sqrt(max(excess, 0.0) / power) if power > 0 else 0.0
+
+
+def _free(scene: Scene) -> BoolArray:
+    """Tell what is fitted of a picture, as `Likelihood` has it."""
+    return np.array([True, True, scene.mode == "joint", True, False])
+
+
+def _brightest(aligned: Aligned, most: int) -> list[int]:
+    """Numbers of the pictures that say most, the brightest first."""
+    energy = aligned.frames * aligned.theta[:, 3] ** 2 * aligned.light_e.mean(axis=(1, 2))
+    order: list[int] = np.argsort(-energy, kind="stable")[:most].tolist()
+    return order
+
+
+def _cause(begun: Begun) -> Cause | None:
+    """Name the part of the microscope that what is left over looks most like."""
+    aligned, scene = begun.block.aligned, begun.scene
+    if aligned is None:
+        return None
+    shown = _brightest(aligned, _LOOKED_AT)
+    fits = [(aligned.likelihood(scene, n), aligned.theta[n], _free(scene)) for n in shown]
+    return likely_cause(scene.config, fits)
+
+
+def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
+    """Say what is wrong, and what to do."""
+    if cause is None:
+        return (
+            f"the model does not describe the particles: of the pictures of "
+            f"{count(left.tracks, 'track')} it leaves over {left.share:.0%}, and no part of the "
+            "microscope explains that: see whether the light under them changes slowly "
+            "(track.block_frames), or several things are wrong in the optics"
+        )
+    text = f"{left.verdict}, and masses are wrong too"
+    advice = [] if learns else ['optics.calibrate = "auto" learns them from the movie']
+    text += f"; it looks most like {cause.likeness}"
+    advice = ["correct that", *(advice if cause.name != PIXEL else [])]
+    return f"{text}: {', or '.join(advice)}"
+
+
+def _start(config: Config, cause: Cause | None) -> Config:
+    """Where the search begins: the aperture is not found across the critical angle."""
+    if cause is None or cause.name != "numerical aperture" or cause.step is None:
+        return config
+    most = min(config.optics.n_immersion, config.optics.n_glass)
+    na = min(config.optics.na + cause.step, 0.5 * (config.optics.na + most))
+    return config.model_copy(update={"optics": config.optics.model_copy(update={"na": na})})
+
+
+def _measured(
+    begun: Begun,
+    start: Config,
+    name: str,
+    pool: ThreadPoolExecutor,
+    *,
+    known: Settings | None = None,
+) -> OpticsCalibration:
+    """Measure the microscope from the pictures of tracks; `known` as in `measure_microscope`."""
+    aligned, scene = begun.block.aligned, begun.scene
+    shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
+    sights = [aligned.sight(scene, n) for n in shown] if aligned is not None else []
+    source: Mapping[str, str] = {"movie": name}
+    if scene.mode != "joint":
+        return calibrate_sights(
+            sights, (), start, tuple(FREE), source, known=known, mapper=pool.map
+        )
+    return learn_with_heights(
+        sights, (), start, tuple(FREE), source,
+        known=known or settings_of(start), around=known is None, mapper=pool.map,
+    )  # fmt: skip

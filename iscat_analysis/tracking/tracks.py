@@ -1,0 +1,383 @@
+"""From the fits of mode ``track`` to its tracks: their table, what is said of them, their films."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from iscat_analysis.camera.background import add_frames, start_power
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.regions import Region, region_likelihood
+from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.drawing import signals_within
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid
+from iscat_analysis.optics.materials import material
+from iscat_analysis.records import (
+    Film,
+    FloatArray,
+    FrameSource,
+    Progress,
+    TrackStatus,
+    Windows,
+    track_numbers,
+)
+from iscat_analysis.species.tracks import Correlation, TrackSetup, changes_together, describe_tracks
+from iscat_analysis.threads import one_thread_algebra
+from iscat_analysis.tracking.moving_field import exposure_of
+from iscat_analysis.units import listed
+
+SHORT_MOVIE = 20
+"""Fewer frames than this hardly tell a diffusion coefficient."""
+
+FILMS = 3
+"""Tracks of each kind, the best and the worst, that are shown frame by frame."""
+
+FILM_FRAMES = 40
+"""Frames of such a film, at most."""
+
+_OF_FILM = ("frame", "x_px", "y_px", "chi2_reduced")
+_PLACE = ("frame", "x_nm", "y_nm", "z_nm", "mass_kda")
+_ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this share
+_NAMED = 3  # of pairs of tracks that met, in a message
+_TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
+_ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
+_ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
+
+
+def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
+    """Say what frame rate, exposure and length of a movie leave unknown of its tracks."""
+    rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
+    if rate is None:
+        yield (
+            "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, "
+            "as in camera.frame_rate_hz = 331.0; positions and masses do not need it"
+        )
+    elif exposure is None:
+        yield (
+            f"camera.exposure_ms is not known and taken as the {1e3 / rate:.3g} ms from frame to "
+            "frame, over which motion is averaged: add it if it is shorter"
+        )
+    elif exposure > 1e3 / rate * (1 + _ROUNDING):
+        raise ConfigError(
+            f"camera.exposure_ms = {exposure:g} is longer than the {1e3 / rate:.4g} ms from frame "
+            f"to frame at camera.frame_rate_hz = {rate:g}: correct one of them"
+        )
+    elif exposure <= (1 + _ROUNDING) / rate:
+        yield (
+            f"camera.exposure_ms = {exposure:g} is no more than a thousandth of the "
+            f"{1e3 / rate:.4g} ms from frame to frame: if it is in seconds, write "
+            f"{1e3 * exposure:g}, since motion during the exposure blurs pictures and changes D"
+        )
+    if way_of(config) == "tracks" and frames < config.track.min_frames:
+        raise ConfigError(
+            f"track.min_frames = {config.track.min_frames} is more than the {frames} frames of "
+            f"{name} that are tracked, so that no track is long enough: lower it"
+        )
+    # A movie without any is refused, as is one of few frames whose background is learnt.
+    if 0 < frames < SHORT_MOVIE and way_of(config) != "tracks":
+        best = 100 / np.sqrt(max(frames - 1, 1))
+        text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
+        if frames < config.track.min_frames:
+            text += f", and none at all below track.min_frames = {config.track.min_frames}"
+        yield f"{text}; record more, at least {SHORT_MOVIE}"
+
+
+def tracks_of(
+    scene: Scene,
+    fits: pd.DataFrame,
+    windows: Windows,
+    *,
+    masses: pd.DataFrame | None,
+    tell: Callable[[str], None],
+    progress: Progress,
+) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Describe the tracks of a movie."""
+    setup = track_setup(scene, windows)
+    setup = replace(setup, change=changes_together(fits, setup.frames))
+    with one_thread_algebra():
+        tracks = describe_tracks(
+            fits,
+            setup,
+            correlation=mass_correlation(scene, fits),
+            masses=masses,
+            seed=scene.config.compute.seed,
+            workers=scene.config.compute.workers,
+            progress=progress,
+        )
+    if setup.change:
+        tell(
+            f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
+            "frames, as where the focus drifts: tracks that this puts off by more than their "
+            "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
+        )
+    met = tracks[tracks["nearest_nm"] < setup.near_nm]
+    if len(met):
+        tell(_crossings(met, setup))
+    cut = cut_steps(tracks, setup, scene.config.track.max_step_nm)
+    if cut:
+        tell(cut)
+    return tracks, {"tracks": len(tracks), "motion": _summary(tracks, setup)}
+
+
+def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
+    """Gather what all tracks of a movie have in common."""
+    config = scene.config
+    rows, columns = windows.after_e.shape
+    matter = material(config.particle, config.optics.wavelength_nm)
+    resolution_nm = config.optics.wavelength_nm / config.optics.na
+    absorbs = abs(matter.permittivity.imag) > _ABSORBS or matter.permittivity.real <= 0
+    return TrackSetup(
+        frame_rate_hz=config.camera.frame_rate_hz,
+        exposure_ms=config.camera.exposure_ms,
+        frames=windows.frames_after,
+        field_nm=((rows - 1) * scene.pixel_nm, (columns - 1) * scene.pixel_nm),
+        near_nm=config.detection.min_separation_nm,
+        min_frames=config.track.min_frames,
+        volume=config.track.free == "joint",
+        viscosity_mpa_s=config.track.viscosity_mpa_s,
+        temperature_c=config.track.temperature_c,
+        index=None if absorbs else float(np.sqrt(matter.permittivity.real)),
+        density_kg_m3=matter.density_kg_m3,
+        n_medium=config.optics.n_sample,
+        hidden_nm=resolution_nm if way_of(config) == "tracks" else 0.0,
+    )
+
+
+def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
+    """Give the correlation of the masses of frames that share a background recorded before.
+
+    A mass is the picture h times the pixels, over Σ h², and of their pictures two frames have
+    K = Σ h(u) h(u − r)/Σ h² in common.  With n frames before, the noise of their mean (f = 1) or
+    median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
+    well, h is what of the picture its derivative along z does not explain.
+    """
+    config = scene.config
+    before = fits["n_before"].median() if len(fits) else 0
+    known = config.background.method == "known" or scene.additive or way_of(config) == "tracks"
+    if known or not before > 0:
+        return None
+    share = scene.background_variance / (scene.background_variance + before)
+    side = scene.roi_px
+    middle = (side - 1) / 2 * scene.pixel_nm
+    grid = PixelGrid.region((0, side), (0, side), scene.pixel_nm)
+    height, mass = (float(fits[name].median()) for name in ("z_nm", "mass_kda"))
+    slopes = scene.model.gradient(grid, middle, middle, height, mass)[1]
+    picture = slopes[3]
+    if fits["sigma_z_nm"].notna().any():
+        along = slopes[2]
+        picture = picture - along * np.sum(along * picture) / np.sum(along**2)
+    light = np.abs(np.fft.rfft2(picture, (2 * side - 1, 2 * side - 1))) ** 2
+    common = np.fft.fftshift(np.fft.irfft2(light, (2 * side - 1, 2 * side - 1)))
+    common /= common[side - 1, side - 1]
+
+    def correlation(places_nm: FloatArray) -> FloatArray:
+        apart = (places_nm[:, None] - places_nm) / scene.pixel_nm + (side - 1)
+        shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
+        both = (shared + shared.T) / 2
+        return np.asarray((1 - share) * np.eye(len(both)) + share * both)
+
+    return correlation
+
+
+def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
+    """Say which tracks came near each other."""
+    return (
+        f"tracks {listed(met['track'], _NAMED)} come nearer than {setup.near_nm:g} nm to another "
+        f"(to {met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be "
+        "exchanged: they are flagged crosses; record fewer particles to avoid it"
+    )
+
+
+def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> str:
+    """Say where steps are left out that make D too small; empty where hardly any are.
+
+    Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²), and without
+    these their mean square is less by R²/2s² p/(1 − p) of itself.
+    """
+    d = tracks.loc[tracks["status"] == TrackStatus.OK, "d_um2_s"].max()
+    if setup.frame_rate_hz is None or not d > 0:
+        return ""
+    step = 1e3 * float(np.sqrt(2 * d / setup.frame_rate_hz))
+    ratio = reach_nm**2 / (2 * step**2)
+    longer = float(np.exp(-ratio))
+    if ratio * longer / (1 - longer) < _TRUNCATED:
+        return ""
+    return (
+        f"particles move {step:.0f} nm from frame to frame along each axis, so that "
+        f"{100 * longer:.2g} % of steps are longer than track.max_step_nm = {reach_nm:g}: they cut "
+        f"tracks and make D too small; set it to {_ENOUGH * step:.0f}"
+    )
+
+
+def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:
+    """Count and take medians over the tracks that are ok."""
+    good = tracks[tracks["status"] == TrackStatus.OK]
+    names = ("n_frames", "mass_kda", "d_um2_s", "diameter_nm", "refractive_index")
+    medians = {}
+    for name in names:
+        values = good[name].dropna().to_numpy(float)
+        medians[name] = float(np.median(values)) if values.size else None
+    ratios = good["sigma_d_um2_s"] / good["d_um2_s"]
+    flags = Counter(flag for flags in tracks["flags"] for flag in flags.split(";") if flag)
+    return {
+        "frame_rate_hz": setup.frame_rate_hz,
+        "exposure_ms": setup.exposure_ms,
+        "status": dict(sorted(Counter(tracks["status"]).items())),
+        "flags": dict(sorted(flags.items())),
+        "medians": medians,
+        "sigma_d_over_d_median": float(ratios.median()) if ratios.notna().any() else None,
+        "begin_inside": int((tracks["begins"] == "inside").sum()),
+        "end_inside": int((tracks["ends"] == "inside").sum()),
+        "cross_border": int(((tracks["begins"] == "border") | (tracks["ends"] == "border")).sum()),
+        "crossed": int((tracks["nearest_nm"] < setup.near_nm).sum()),
+    }
+
+
+def make_films(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Sequence[Windows],
+    fits: pd.DataFrame,
+    tracks: pd.DataFrame,
+) -> tuple[Film, ...]:
+    """Draw the best and the worst tracks frame by frame."""
+    numbers = track_numbers(fits)
+    of_film = fits[list(_OF_FILM)].assign(track=numbers)
+    chosen = [
+        (track, why, _shown(of_film[of_film["track"] == track].sort_values("frame"), worst))
+        for track, why, worst in _chosen(tracks)
+    ]
+    chosen = [film for film in chosen if len(film[2])]
+    frames = np.unique([t for *_, rows in chosen for t in rows["frame"]])
+    known = fits["frame"].isin(frames) & fits["mass_kda"].notna()
+    there = fits.loc[known, list(_PLACE)]
+    frame, x, y, z, mass = (there[name].to_numpy() for name in _PLACE)
+    z = np.clip(z, *scene.wide.z_range_nm)
+    theta = np.column_stack([x, y, z, scene.wide.scale.amplitudes(mass)])
+    of_row = numbers[known].to_numpy()
+    seen = [
+        _Seen(model, frame[mine], theta[mine])
+        for track, model in _models(scene, tracks).items()
+        if (mine := of_row == track).any()
+    ]
+    return tuple(_film(scene, movie, camera, windows, seen, *film) for film in chosen)
+
+
+def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
+    """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
+    known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
+    if way_of(scene.config) != "tracks":
+        known[:] = 0.0
+    _, exposure_s = exposure_of(scene.config)
+    upwards = scene.config.track.free == "joint"
+    return {
+        int(track): blurred(scene.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
+        for track, d in zip(tracks["track"], known, strict=True)
+    }
+
+
+def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
+    """Choose tracks: the longest that are ok, and those with the worst remarks."""
+    good = tracks[tracks["status"] == TrackStatus.OK].sort_values(
+        ["n_frames", "mass_scatter"], ascending=[False, True]
+    )
+    for track, frames in good[["track", "n_frames"]].head(FILMS).to_numpy().tolist():
+        yield track, f"one of the longest that are ok: {frames} frames", False
+    rank = tracks["status"].map([str(status) for status in TrackStatus].index)
+    bad = tracks.assign(rank=rank)[tracks["status"] != TrackStatus.OK]
+    shown = bad[bad["status"] != TrackStatus.FEW_FRAMES].sort_values(
+        ["rank", "n_frames"], ascending=[True, False]
+    )
+    for track, status in shown[["track", "status"]].head(FILMS).to_numpy().tolist():
+        yield track, TrackStatus(status).advice, True
+    rest = good.iloc[FILMS:].sort_values("mass_scatter", ascending=False)
+    for row in rest[["track", "mass_scatter"]].head(max(0, FILMS - len(shown))).itertuples():
+        text = f"ok; its frames scatter most, {row.mass_scatter:.2f} times their errors"
+        yield int(row.track), text, True
+
+
+def _shown(rows: pd.DataFrame, worst: bool) -> pd.DataFrame:
+    """Take the first frames of a track, or of a bad one those around its worst fit."""
+    if len(rows) < 2:  # not enough for a film
+        return rows[:0]
+    start = 0
+    if worst and rows["chi2_reduced"].notna().any():
+        start = int(np.nanargmax(rows["chi2_reduced"].to_numpy(float))) - FILM_FRAMES // 2
+    start = max(0, min(start, len(rows) - FILM_FRAMES))
+    return rows.iloc[start : start + FILM_FRAMES]
+
+
+class _Seen(NamedTuple):
+    """A particle: its model, frames, and places in them [nm] with its amplitude, shape (n, 4)."""
+
+    model: ForwardModel
+    frame: NDArray[np.int64]
+    theta: FloatArray
+
+
+def _film(
+    scene: Scene,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Sequence[Windows],
+    seen: Sequence[_Seen],
+    track: int,
+    why: str,
+    shown: pd.DataFrame,
+) -> Film:
+    """Draw data, model and residual of some frames of a track, with all particles in them."""
+    region, frames = _square(scene, windows[0], shown), shown["frame"].to_numpy(int)
+    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+    data, model, residual = np.zeros((3, len(frames), *region.shape))
+    for particle in seen:
+        here = np.isin(particle.frame, frames)
+        place = np.searchsorted(frames, particle.frame[here])
+        model[place] += signals_within(particle.model, grid, particle.theta[here])
+    for number, frame in enumerate(frames.tolist()):
+        likelihood = region_likelihood(
+            scene, _single(scene, movie, camera, windows, frame), region, None
+        )
+        data[number] = likelihood.measured_signal()
+        information = likelihood.signal_information(model[number])
+        residual[number] = (data[number] - model[number]) * np.sqrt(information)
+        if scene.additive:
+            data[number] *= likelihood.data[2]
+            model[number] *= likelihood.data[2]
+    return Film(track, tuple(frames.tolist()), why, data, model, residual)
+
+
+def _single(
+    scene: Scene, movie: FrameSource, camera: Camera, windows: Sequence[Windows], frame: int
+) -> Windows:
+    """Give a frame over its background, at its power: as learnt with the tracks, or as it says."""
+    here = next((w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0])
+    single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
+    if not scene.config.background.power_normalization:
+        return single
+    if way_of(scene.config) != "tracks":
+        return start_power(single)
+    before, after = np.split(here.power, [here.n_before])
+    return replace(single, power_ratio=float(after[frame - here.frames_after[0]] / before.sum()))
+
+
+def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
+    """Place a square in the field around the middle of the places."""
+    spans = []
+    for name, size in zip(("y_px", "x_px"), windows.after_e.shape, strict=True):
+        side = min(scene.roi_px, size)
+        middle = (rows[name].min() + rows[name].max()) / 2
+        low = int(np.clip(round(middle - side / 2), 0, size - side))
+        spans.append((low, low + side))
+    return Region(*spans)
