@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,7 +33,6 @@ if TYPE_CHECKING:
     from iscat_analysis.records import Analysis
 
 FLAGGED = 3
-_LARGE_BYTES = 2**30  # of a movie whose chunks take more time and memory than what draws
 ROWS_SHOWN = 20
 GAP = 3  # characters between the columns of a table on a terminal
 
@@ -115,7 +113,7 @@ def fit(
     coefficient of every particle.
     """
     messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug), ExitStack() as ending:
+    with failures(messages, debug=debug):
         from iscat_analysis.errors import ConfigError
 
         if len(stacks) > 1:
@@ -126,49 +124,30 @@ def fit(
                 'for movie in *.tif; do iscat-fit "$movie" --config setup.toml; done'
             )
         (stack,) = stacks
-        from iscat_analysis.hashing import BegunHash
-
-        begun_hash = None
-        if raw is None and _bytes_of(stack):  # another processor is idle while this one loads
-            begun_hash = ending.enter_context(closing(BegunHash(stack)))
-
         from iscat_analysis.config import load_config
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
 
-        from iscat_analysis.draughtsman import Draughtsman
-        from iscat_cli.lean import load_numpy, without
+        from iscat_analysis.movie.addresses import MARK, beside
+        from iscat_analysis.pipeline import fit_stack
+        from iscat_analysis.places import open_place
 
-        load_numpy()
-        with closing(Draughtsman()) as pen:
-            # memory for figures is better taken when that for large chunks is free again
-            if resolved.background.method != "sliding" or _bytes_of(stack) <= _LARGE_BYTES:
-                pen.start()  # early, because it has as much to load
-            from iscat_analysis.movie.addresses import MARK, beside
-
-            if raw is not None:
-                stack = Path(f"{stack}{MARK}{raw}")
-
-            with without("coverage"):  # which Numba would tell what of a kernel is run
-                from iscat_analysis.pipeline import fit_stack
-            from iscat_analysis.places import open_place
-
-            folder = beside(stack, ".iscat") if out is None else out
-            with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
-                analysis = fit_stack(
-                    stack,
-                    resolved,
-                    out=folder,
-                    overwrite=overwrite,
-                    progress=progress,
-                    notify=messages.notify,
-                    command=context.obj,
-                    inject=inject or 0,
-                    place=place,
-                    draughtsman=pen,
-                    begun_hash=begun_hash,
-                )
+        if raw is not None:
+            stack = Path(f"{stack}{MARK}{raw}")
+        folder = beside(stack, ".iscat") if out is None else out
+        with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
+            analysis = fit_stack(
+                stack,
+                resolved,
+                out=folder,
+                overwrite=overwrite,
+                progress=progress,
+                notify=messages.notify,
+                command=context.obj,
+                inject=inject or 0,
+                place=place,
+            )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
             found: dict[str, Any] = {**analysis.summary, "events": rows, "out": str(folder)}
@@ -189,14 +168,6 @@ def fit(
         understated = analysis.summary.get("repeats", {}).get("understated", False)
         if strict and (flagged or understated):
             raise typer.Exit(FLAGGED)
-
-
-def _bytes_of(stack: Path) -> int:
-    """Size of a file; none of what is no file, or what nobody may look at."""
-    try:
-        return stack.stat().st_size if stack.is_file() else 0
-    except OSError:
-        return 0
 
 
 def _changes(

@@ -36,10 +36,10 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 LONGEST_FIRST = (
     "test_tracked_optics", "test_output", "test_report_browser", "test_crowded", "test_day",
     "test_cluster", "test_pipeline", "test_report", "test_landing", "test_moving",
-    "test_draughtsman", "test_equilibrium_spread", "test_cli_help", "test_misfit_search",
+    "test_equilibrium_spread", "test_cli_help", "test_misfit_search",
     "test_focus_scan", "test_movers", "test_benchmark", "test_optics_calibration", "test_public",
     "test_arguments", "test_bounds_laws", "test_distribution", "test_many_movers",
-    "test_companion", "test_posterior", "test_mass_calibration", "test_systematic",
+    "test_posterior", "test_mass_calibration", "test_systematic",
 )  # fmt: skip
 """Modules that take longest; they are begun first, so that no worker is left with one."""
 

@@ -7,11 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from iscat_analysis.fitting.compilation import Compilation
 from iscat_analysis.fitting.scene import Scene
-from iscat_analysis.inference.noise import compile_kernels
+from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.places import Place
-from iscat_analysis.records import Analysis, Progress
+from iscat_analysis.records import FREE_PARAMETERS, Progress
 
 Notify = Callable[[str], None]
 
@@ -40,11 +39,9 @@ class Run:
 
     notify: Notify
     progress: Progress
-    compilation: Compilation
     partial: Path | None
     place: Place
     inject: int
-    begin_report: Callable[[Analysis], None]
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)
 
@@ -55,4 +52,5 @@ class Run:
 
     def warm_up(self, scene: Scene) -> None:
         """Load the compiled kernels of fits, or compile them."""
-        compile_kernels(scene.model, self.compilation.needs)
+        posteriors = scene.config.samples_posterior
+        compile_kernels(scene.model, parts_of(FREE_PARAMETERS[scene.mode], posteriors=posteriors))

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +30,6 @@ from iscat_analysis.fitting.run import Notify, Run
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
-from iscat_analysis.landing.companion import paired
 from iscat_analysis.landing.merging import Done, Merged
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.places import Here, Place
@@ -39,8 +37,6 @@ from iscat_analysis.records import CountSource, Progress, Status
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
 from iscat_analysis.threads import beside, one_thread_algebra, threads
-
-_NEEDED_LATER = "scipy.optimize"  # by species, and a tenth of a second to load
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -114,7 +110,6 @@ def analyse_landings(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
-    place = paired(place, config, movie_job, len(plan))
     merged = Merged(reader.shape)
     interrupted = False
     with threads(place.threads(config.compute.workers)) as pool:
@@ -142,7 +137,6 @@ def analyse_landings(
                 for frames_done, stopped in finished:
                     if frames_done < last - first:
                         progress("landing", frames_done, last - first)
-                        import_module(_NEEDED_LATER)  # the other process may still be at work
                     if stopped:
                         interrupted = True
                         break

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import BegunHash, fingerprint, sha256_of_files
+from iscat_analysis.hashing import fingerprint, sha256_of_files
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.threads import beside
@@ -388,13 +388,8 @@ class Stack:
             return digest.hexdigest()
         return sha256_of_files(self._files, self._part)
 
-    def hashed(self, begun: BegunHash | None = None) -> Future[str]:
+    def hashed(self) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.
-
-        Parameters
-        ----------
-        begun : BegunHash, optional
-            Of a file, which may be all of this movie.
 
         Returns
         -------
@@ -402,10 +397,7 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            if begun is not None and not self._part and begun.is_of(self._files):
-                self._hashing = begun.digest
-            else:
-                self._hashing = beside(self.sha256)
+            self._hashing = beside(self.sha256)
         return self._hashing
 
     def _require(self, start: int, stop: int) -> None:

@@ -13,23 +13,19 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack, nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.background_mode import Way, way_of
 from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept
-from iscat_analysis.fitting.compilation import compiling, needs_of
+from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import Found
 from iscat_analysis.fitting.run import Notify, Run, unheard
-from iscat_analysis.hashing import BegunHash
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.landing.find import find_landings
-from iscat_analysis.memory import freed_memory_kept
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
 from iscat_analysis.pipeline.finish import gather
@@ -37,12 +33,9 @@ from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Analysis, Progress, silent
-from iscat_analysis.report import EVENT_FIGURES, atomic_folder, fill_report
+from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.tracking.find import find_moving
-
-if TYPE_CHECKING:
-    from iscat_analysis.draughtsman import Draughtsman
 
 FIND: Mapping[Way, Callable[[Prepared, Run], Found]] = {
     "fixed": find_bound,
@@ -50,9 +43,6 @@ FIND: Mapping[Way, Callable[[Prepared, Run], Found]] = {
     "tracks": find_moving,
 }
 """Background, search and fits of a movie, by which of its frames stand against which."""
-
-_CHUNKS_DONE = {("landing", True), ("report", False)}
-"""Stages of a landing movie, and whether they are done, when its chunks need no more memory."""
 
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
@@ -69,8 +59,6 @@ def fit_stack(
     command: str = "",
     inject: int = 0,
     place: Place | None = None,
-    draughtsman: Draughtsman | None = None,
-    begun_hash: BegunHash | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -95,11 +83,6 @@ def fit_stack(
         and how well they are measured; ``summary["injection"]``.
     place : Place, optional
         Where the chunks of a landing movie are analysed; default in this process.
-    draughtsman : Draughtsman, optional
-        The process that draws the report, started with it or, by a landing movie, when its chunks
-        are done; default this one.
-    begun_hash : BegunHash, optional
-        Of the movie's file, where that was begun before.
 
     Returns
     -------
@@ -116,12 +99,6 @@ def fit_stack(
         The user stopped it; what was finished is in the folder, or kept beside it where the report
         was not yet begun or not done, as the interrupt says.
     """
-
-    def told(stage: str, done: int, total: int) -> None:
-        if draughtsman is not None and (stage, done >= total) in _CHUNKS_DONE:
-            draughtsman.start()
-        progress(stage, done, total)
-
     stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
@@ -129,33 +106,20 @@ def fit_stack(
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
-        with ExitStack() as writing:
-            buildings: list[Path] = []
-
-            def begin_report(known: Analysis) -> None:
-                building = writing.enter_context(atomic_folder(folder, overwrite))
-                buildings.append(building)
-                if draughtsman is not None:
-                    # where anything fails, nobody draws into a folder that is being removed
-                    writing.push(lambda failed, *_: draughtsman.close() if failed else None)
-                    (building / "figures").mkdir()
-                    draughtsman.begin(known, building / "figures", figures)
-
-            with open_stack(stack) as movie:
-                movie.hashed(begun_hash)
-                analysis = analyse(
-                    movie,
-                    config,
-                    progress=told,
-                    notify=notify,
-                    command=command,
-                    partial=partial,
-                    inject=inject,
-                    place=place,
-                    begin_report=begin_report,
-                )
-            with parts_kept(None if way == "fixed" else partial):
-                fill_report(analysis, buildings[0], event_figures=figures, draughtsman=draughtsman)
+        with open_stack(stack) as movie:
+            movie.hashed()
+            analysis = analyse(
+                movie,
+                config,
+                progress=progress,
+                notify=notify,
+                command=command,
+                partial=partial,
+                inject=inject,
+                place=place,
+            )
+        with parts_kept(None if way == "fixed" else partial):
+            write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
         if not analysis.summary["interrupted"]:
             shutil.rmtree(partial, ignore_errors=True)
     if analysis.summary["interrupted"]:
@@ -164,10 +128,6 @@ def fit_stack(
         notify(f"interrupted; what was finished is in {folder}{goes_on}")
         raise KeyboardInterrupt
     return analysis
-
-
-def _nobody_draws(known: Analysis) -> None:
-    """Do nothing."""
 
 
 def analyse(
@@ -180,7 +140,6 @@ def analyse(
     partial: Path | None = None,
     inject: int = 0,
     place: Place | None = None,
-    begin_report: Callable[[Analysis], None] = _nobody_draws,
 ) -> Analysis:
     """Analyse an open movie."""
     if place is not None and place.distant and not movie.identity:
@@ -189,9 +148,8 @@ def analyse(
             "numpy.save, and give its path; or leave `scheduler` out"
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
-    kept = freed_memory_kept() if way_of(config) == "tracks" else nullcontext()
-    with kept, compiling(notify, config.compute.workers, needs_of(config)) as compilation:
-        run = Run(notify, progress, compilation, partial, place or Here(), inject, begin_report)
+    with compiling(notify):
+        run = Run(notify, progress, partial, place or Here(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
         with parts_kept(None if ready.way == "fixed" else partial):

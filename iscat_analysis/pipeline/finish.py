@@ -133,7 +133,6 @@ def gather(
         tracks=tracks,
         films=films,
     )
-    run.begin_report(analysis)
     return replace(analysis, summary=summary | species_of(scene, table))
 
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from concurrent.futures import Future
-from contextlib import suppress
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +11,6 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
-from iscat_analysis.copies import LostError, aside
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
@@ -36,7 +32,7 @@ from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
-from iscat_analysis.threads import beside, one_thread_algebra, processors
+from iscat_analysis.threads import beside, one_thread_algebra
 from iscat_analysis.tracking.tracks import judge_times
 
 _OPENING = 64  # frames that are looked at before anything else
@@ -86,7 +82,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
                 judged, opened, _ = _landing_light(movie, config, camera, span)
         else:
             if tracked:  # in the light as it is; again if anything of it is unsteady
-                looking = _looking(movie, config, camera, span)
+                looking = beside(look_at_changes, movie, config, camera, span)
             judged = judge_light(movie, config, camera)
     for text in judged.messages:
         run.tell(f"{movie.name}: {text}")
@@ -95,7 +91,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if lines is not None:
         summary["lines"] = lines.summary
     if way == "sliding" or (tracked and unsteady):
-        looking = _looking(steady, config, camera, span)
+        looking = beside(look_at_changes, steady, config, camera, span)
     digest = movie.hashed()
     configured = config
     wrong = wrong_sign(config)
@@ -112,10 +108,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     run.clock.lap("optics")
     other_kind = ""
     if looking is not None:
-        try:
-            changes = looking.result()
-        except LostError:
-            changes = look_at_changes(steady, configured, camera, span)
+        changes = looking.result()
         if config.optics.na != configured.optics.na:
             changes = look_at_changes(steady, config, camera, span)
         summary["changes"] = changes_summary(changes)
@@ -127,21 +120,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
     )  # fmt: skip
-
-
-def _looking(
-    movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
-) -> Future[Changes]:
-    """Begin to look at what changes, beside all else: threads would take turns at Python.
-
-    A second process shares frames that lie in a file as they are; what decodes others it would have
-    to share as well.
-    """
-    placed = sys.platform == "linux" and movie.in_place(*span) is not None
-    if placed and processors() > 1:
-        with suppress(OSError):  # there is no room for another process
-            return aside(partial(look_at_changes, movie, config, camera, span))
-    return beside(look_at_changes, movie, config, camera, span)
 
 
 def _landing_light(

@@ -1,9 +1,9 @@
 """The last stage: an `Analysis` becomes a folder of tables, figures and one self-contained page.
 
-``tables`` writes what programs read, ``figures`` what papers print, ``page`` what people open;
-``drawing`` makes both of the latter, in a process of its own where a `Draughtsman` was begun, and
-``output`` makes the folder appear whole or not at all.  The page templates are shared: anything
-that wants to look like the report calls `render_page`, most easily with ``document.html``.
+``tables`` writes what programs read, ``figures`` what papers print, ``page`` what people open.
+``drawing`` makes both of the latter, and ``output`` makes the folder appear whole or not at all.
+The page templates are shared: anything that wants to look like the report calls `render_page`, most
+easily with ``document.html``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from iscat_analysis.report.posterior import write_posterior
 from iscat_analysis.report.tables import write_tables
 
 if TYPE_CHECKING:
-    from iscat_analysis.draughtsman import Draughtsman
     from iscat_analysis.report.page import render_page as render_page
     from iscat_analysis.report.page import render_report as render_report
 
@@ -51,7 +50,6 @@ def write_report(
     *,
     overwrite: bool = False,
     event_figures: int = EVENT_FIGURES,
-    draughtsman: Draughtsman | None = None,
 ) -> Path:
     """Write everything one analysis found into a folder.
 
@@ -61,24 +59,17 @@ def write_report(
     all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building, event_figures=event_figures, draughtsman=draughtsman)
+        fill_report(analysis, building, event_figures=event_figures)
     return folder
 
 
-def fill_report(
-    analysis: Analysis, folder: Path, *, event_figures: int, draughtsman: Draughtsman | None
-) -> None:
+def fill_report(analysis: Analysis, folder: Path, *, event_figures: int) -> None:
     """Write a report into a folder of its own."""
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
-    if draughtsman is not None:
-        draughtsman.begin(analysis, pictures, event_figures)
-        draughtsman.end(analysis.summary)
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
-    page = None if draughtsman is None else draughtsman.page()
-    if page is None:
-        from iscat_analysis.report.drawing import Drawing
+    from iscat_analysis.report.drawing import draw  # Matplotlib takes long to load
 
-        page = Drawing(analysis, pictures, event_figures, together=False).page(analysis)
+    page = draw(analysis, pictures, event_figures)
     (folder / "report.html").write_text(page, encoding="utf-8")

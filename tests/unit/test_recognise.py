@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 import functools
-import importlib
-import sys
-from concurrent.futures import Future
-from pathlib import Path
 
 import numpy as np
 import pytest
-import tifffile
 from scenes import Stack, make_config
 from scipy.ndimage import shift
 from wanderers import wander
 
-from iscat_analysis import fit_movie, open_stack
+from iscat_analysis import fit_movie
 from iscat_analysis.camera.counts import camera_from_config
-from iscat_analysis.copies import LostError, aside
 from iscat_analysis.diagnosis.changes import Changes, find_changes, spot_of
 from iscat_analysis.diagnosis.recognise import (
     BLOCK,
@@ -31,11 +25,6 @@ from iscat_analysis.diagnosis.recognise import (
 )
 from iscat_analysis.errors import DataError, FloodError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.study.simulate import write_stack
-from iscat_analysis.threads import processors
-
-prepare = importlib.import_module("iscat_analysis.pipeline.prepare")  # a function has its name
 
 SIDE, BLOCKS, RATE_HZ, PIXEL_NM = 72, 30, 331.0, 84.4
 LIGHT_E = 4e5
@@ -246,40 +235,3 @@ def test_pixels_that_blink_are_no_particles_that_move() -> None:
     changes = find_changes(_noisy(blocks, rng), SPOT)
     assert not as_moving(changes, "movie")
     assert changes.number <= 5  # at the border neighbours are missing
-
-
-@pytest.mark.skipif(sys.platform != "linux" or processors() == 1, reason="nothing is copied there")
-@pytest.mark.parametrize(("compression", "copies"), [(None, 1), ("zlib", 0)])
-def test_only_frames_that_lie_in_a_file_as_they_are_are_shared_with_another_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compression: str | None, copies: int
-) -> None:
-    """What decodes others has a place in the file, which two processes would move under it."""
-    path, begun = tmp_path / "movie.tif", []
-    counts = np.random.default_rng(3).poisson(9000, (10 * BLOCK, 32, 32)).astype(np.uint16)
-    tifffile.imwrite(path, counts, compression=compression)
-    monkeypatch.setattr(prepare, "aside", lambda work: begun.append(work) or aside(work))
-    config = make_config(background={"frames": None}, fit={"frames": None})
-    with open_stack(path) as movie:
-        camera = camera_from_config(config.camera, (32, 32), movie.dtype)
-        looking = prepare._looking(movie, config, camera, (0, len(counts)))
-        expected = look_at_changes(movie, config, camera, (0, len(counts)))
-        np.testing.assert_equal(vars(looking.result(20.0)), vars(expected))
-    assert len(begun) == copies
-
-
-def test_where_the_other_process_is_lost_changes_are_found_in_this_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    movers = [{"count": 3, "mass_kda": 900.0, "d_um2_s": 0.15}]
-    config = make_config(
-        background={"frames": None}, fit={"frames": None}, camera={"frame_rate_hz": RATE_HZ},
-        simulation={"shape": [64, 64], "frames": 400, "movers": movers},
-    )  # fmt: skip
-    write_stack(config, tmp_path / "movie.tif", seed=2)
-    expected = fit_stack(tmp_path / "movie.tif", config, out=tmp_path / "one").summary
-    lost: Future[Changes] = Future()
-    lost.set_exception(LostError())
-    monkeypatch.setattr(prepare, "aside", lambda _work: lost)
-    found = fit_stack(tmp_path / "movie.tif", config, out=tmp_path / "two").summary
-    assert found["changes"] == expected["changes"]
-    assert found["changes"]["number"] > 0
