@@ -42,7 +42,7 @@ from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 
@@ -139,7 +139,7 @@ def match(landings: Landings, table: pd.DataFrame) -> Matched:
     return Matched(rows, int(free.sum()))
 
 
-def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Found:
+def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> DetectionResult:
     """Analyse a movie and keep what the user is told."""
     return analyse_landings(
         movie,
@@ -150,7 +150,7 @@ def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Found:
     )
 
 
-def counted(result: Found) -> pd.DataFrame:
+def counted(result: DetectionResult) -> pd.DataFrame:
     """Give the rows of a result that are not side lobes."""
     return result.fits[result.fits["status"] != "sidelobe"].reset_index(drop=True)
 

@@ -27,7 +27,7 @@ from scipy.stats import poisson
 
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.study.simulate import Movie
@@ -58,7 +58,7 @@ class Memory:
         return self.counts[start:stop]
 
 
-def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, Found]:
+def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, DetectionResult]:
     """Simulate a movie and analyse it; its steps, and what was found."""
     movie = Movie(config, seed)
     simulation = config.simulation
@@ -76,7 +76,7 @@ def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, Found]:
     return pd.concat([landing, leaving], ignore_index=True), found
 
 
-def match(steps: pd.DataFrame, result: Found, pixel_nm: float) -> pd.DataFrame:
+def match(steps: pd.DataFrame, result: DetectionResult, pixel_nm: float) -> pd.DataFrame:
     """Add to every step what was found of it; the nearest in space, each row once."""
     window, table = result.summary["window_frames"], result.fits
     taken: set[int] = set()

@@ -129,9 +129,9 @@ def fit(
         changes = _changes(settings, mode, frames, background, posterior, workers)
         resolved = load_config(config, changes)
 
+        from iscat_analysis.executors import open_place
         from iscat_analysis.movie.addresses import MARK, beside
         from iscat_analysis.pipeline import fit_stack
-        from iscat_analysis.places import open_place
 
         if raw is not None:
             stack = Path(f"{stack}{MARK}{raw}")

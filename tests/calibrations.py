@@ -11,7 +11,7 @@ import numpy as np
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.instrument.learner import Sight, build_microscope, settings_of
+from iscat_analysis.instrument.learner import ParticleImage, build_microscope, settings_of
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 
@@ -53,7 +53,7 @@ def make_sights(
     photons: float = PHOTONS,
     masses_kda: tuple[float, ...] = MASSES_KDA,
     leaving: float = 0.1,
-) -> tuple[list[Sight], list[Sight], Build]:
+) -> tuple[list[ParticleImage], list[ParticleImage], Build]:
     """Draw pictures in a microscope that differs from the configured one.
 
     Returns
@@ -75,7 +75,9 @@ def make_sights(
         after = random.poisson(photons * (1 + signal)).astype(float)
         data = conditional(model, GRID, before, after, 1.0).data
         snr = float(np.sqrt(np.sum(signal**2) * photons / 2))
-        sight = Sight(GRID, CONDITIONAL, data, float(x), float(y), 5.0, mass_kda=mass, snr=snr)
+        sight = ParticleImage(
+            GRID, CONDITIONAL, data, float(x), float(y), 5.0, mass_kda=mass, snr=snr
+        )
         truth.append(sight)
         dx, dy = START_NM * random.standard_normal(2)
         sights.append(replace(sight, x_nm=float(x + dx), y_nm=float(y + dy), mass_kda=0.0))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Counts,
@@ -27,7 +28,6 @@ from iscat_analysis._kernels.canvas import (
     square_of,
     stage,
 )
-from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lines import copy_line

@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from iscat_analysis.camera.light_changes import Changes
 from iscat_analysis.records import BoolArray, FloatArray
 
-Seams = tuple[tuple[int, ...], tuple[int, ...]]
+AmplifierBoundaries = tuple[tuple[int, ...], tuple[int, ...]]
 """Rows and columns at which another part begins."""
 
 _MOST = 3  # along an axis
@@ -26,13 +26,17 @@ _NINE_IN_TEN = 0.9
 _NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 
 
-def find_seams(changes: Changes, window: int, known: Seams = ((), ())) -> Seams:
+def find_seams(
+    changes: Changes, window: int, known: AmplifierBoundaries = ((), ())
+) -> AmplifierBoundaries:
     """Look for rows and columns at which the changes of the light have a step."""
     least = changes.least(window) / changes.error
     return _along(changes, 2, least, known[0]), _along(changes, 1, least, known[1])
 
 
-def parts_of(shape: tuple[int, int], seams: Seams) -> tuple[FloatArray, FloatArray, BoolArray]:
+def parts_of(
+    shape: tuple[int, int], seams: AmplifierBoundaries
+) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Tell which rows and columns belong together.
 
     Shapes: `rows, columns` (y, k) and (x, m), `products` (k, m).

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.polynomial.legendre import legvander, legvander2d
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.amplifier_boundaries import Seams, find_seams, parts_of
+from iscat_analysis.camera.amplifier_boundaries import AmplifierBoundaries, find_seams, parts_of
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.fringes import NO_FRINGES, Fringes, find_fringes
 from iscat_analysis.camera.light_changes import Changes
@@ -57,7 +57,7 @@ class Surface:
     degree: int
     rms: float = math.nan
     fringes: Fringes = NO_FRINGES
-    seams: Seams = ((), ())
+    seams: AmplifierBoundaries = ((), ())
     haze: float = 0.0
 
     @property

@@ -15,7 +15,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.pattern_jitter import MOST_EXPLAINED, Shaking, measure_shaking
+from iscat_analysis.camera.pattern_jitter import (
+    MOST_EXPLAINED,
+    PatternJitter,
+    measure_pattern_jitter,
+)
 from iscat_analysis.config import Config, plausible_pixel
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
@@ -98,7 +102,7 @@ class GainDiagnosis:
     n_frames: int
     n_pixels: int
     noise_counts: float = math.inf
-    shaking: Shaking | None = None
+    shaking: PatternJitter | None = None
 
     @property
     def off(self) -> bool:
@@ -235,7 +239,7 @@ def with_shaking(
     """
     if not found.off or found.noise_ratio < 1 or found.shaking is not None:
         return found
-    return replace(found, shaking=measure_shaking(counts, camera, masked=masked))
+    return replace(found, shaking=measure_pattern_jitter(counts, camera, masked=masked))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:

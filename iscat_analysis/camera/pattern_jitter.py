@@ -19,16 +19,16 @@ MOST_EXPLAINED = 0.5
 
 
 @dataclass(frozen=True)
-class Shaking:
+class PatternJitter:
     """How much the fixed pattern moves from frame to frame."""
 
     share: float
     rms_px: float
 
 
-def measure_shaking(
+def measure_pattern_jitter(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
-) -> Shaking | None:
+) -> PatternJitter | None:
     """Compare what differs between neighbouring frames with the gradient of their mean.
 
     A pattern B that moves by δ changes by −δ·∇B: the difference of two frames is fitted with ∂_y B
@@ -48,7 +48,7 @@ def measure_shaking(
         return None
     own = float(np.trace(np.linalg.inv(information))) / 2  # of the light's noise alone
     rms = np.sqrt(max(float(np.mean(moved**2)) - own, 0.0) / 2)
-    return Shaking(explained / beyond, float(rms))
+    return PatternJitter(explained / beyond, float(rms))
 
 
 def without_shaking(

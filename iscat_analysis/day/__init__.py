@@ -25,8 +25,8 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder, hash_of
 from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.executors import THREADS, open_place
 from iscat_analysis.inference.checks import path_in, shown
-from iscat_analysis.places import THREADS, open_place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 from iscat_analysis.units import count

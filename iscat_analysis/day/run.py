@@ -10,10 +10,10 @@ from typing import Any, Literal
 from iscat_analysis.config import Config, with_absolute_paths
 from iscat_analysis.day.state import STATE, Records, key_of, saw, seen
 from iscat_analysis.errors import IscatError, SchedulerError
+from iscat_analysis.executors import Executor
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.stack import not_shared
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.places import Place
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.threads import one_thread_algebra
 
@@ -42,7 +42,7 @@ class Runner:
     progress: Progress
     notify: Notify
     command: str
-    place: Place
+    place: Executor
     retry: bool = True
 
     def job(

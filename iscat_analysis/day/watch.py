@@ -22,10 +22,10 @@ from iscat_analysis.day.equilibria import reaction_of
 from iscat_analysis.day.state import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
 from iscat_analysis.errors import ConfigError, IscatError, SchedulerError
+from iscat_analysis.executors import THREADS
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.folders import files_of, find_movies
-from iscat_analysis.places import THREADS
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 

@@ -17,7 +17,7 @@ from iscat_analysis.camera.unsteady import find_unsteady, unsteady_said
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import least_beside, spot_of
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.movie import Stack
 from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
 from iscat_analysis.threads import over_frames, threads
@@ -79,7 +79,7 @@ def judge_lines(
 ) -> Lines | None:
     """Look for rows, columns and a smooth part of the light that may be divided out."""
     background = config.background
-    way = way_of(config)
+    way = background_mode(config)
     if (
         not background.power_normalization
         or background.method == "known"
@@ -119,7 +119,7 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     at by themselves, and then some of one with some of the other.  Frames in which particles move
     are compared one by one, half the movie apart: what they have in common is their background.
     """
-    total, way, places = movie.shape[0], way_of(config), PAIRS
+    total, way, places = movie.shape[0], background_mode(config), PAIRS
     given = config.background.recorded, config.fit.frames
     together = _TOGETHER
     if way != "fixed":

@@ -198,7 +198,7 @@ def judge_beside(
 
 
 @dataclass(frozen=True)
-class Opening:
+class NoiseSurvey:
     """What the first frames of a landing movie say, and the frames themselves."""
 
     reader: Reader
@@ -207,7 +207,7 @@ class Opening:
     window: int
 
 
-def judge_opening(reader: Reader, config: Config) -> Opening:
+def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     """Judge the noise of a landing movie, and choose how many frames around a step are summed."""
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
@@ -225,7 +225,7 @@ def judge_opening(reader: Reader, config: Config) -> Opening:
             "many bright particles; lower background.window_frames, which helps against all"
         )
         noise = replace(noise, excess=ExcessNoise(ratio, message))
-    return Opening(reader, noise, curve, window)
+    return NoiseSurvey(reader, noise, curve, window)
 
 
 def judge_window(

@@ -10,8 +10,8 @@ from typing import Any
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import Opening
-from iscat_analysis.fitting.background_mode import Way
+from iscat_analysis.diagnosis.noise import NoiseSurvey
+from iscat_analysis.fitting.background_mode import BackgroundMode
 from iscat_analysis.movie import Stack
 
 
@@ -23,9 +23,9 @@ class Prepared:
     steady: Stack
     config: Config
     camera: Camera
-    way: Way
+    way: BackgroundMode
     lines: Lines | None
-    opening: Opening | None
+    opening: NoiseSurvey | None
     other_kind: str
     digest: Future[str]
     summary: Mapping[str, Any]

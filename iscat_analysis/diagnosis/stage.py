@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import Opening
+from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.records import FrameSource
 from iscat_analysis.search.sliding import good_frames, measure_motion
 
@@ -16,7 +16,7 @@ def followed(config: Config, *, moves: bool) -> Config:
     return config.model_copy(update={"background": background})
 
 
-def motion_said(movie: FrameSource, opening: Opening) -> str:
+def motion_said(movie: FrameSource, opening: NoiseSurvey) -> str:
     """Say that the fixed pattern of a landing movie moves."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"

@@ -19,10 +19,10 @@ from typing import Literal
 from iscat_analysis.config import ALL, Config
 from iscat_analysis.errors import ConfigError
 
-Way = Literal["fixed", "sliding", "tracks"]
+BackgroundMode = Literal["fixed", "sliding", "tracks"]
 
 
-def way_of(config: Config) -> Way:
+def background_mode(config: Config) -> BackgroundMode:
     """Tell in which way a movie is analysed."""
     method = config.background.method
     if method == "sliding":
@@ -37,7 +37,7 @@ def way_of(config: Config) -> Way:
     return "tracks" if learnt else "fixed"
 
 
-def way_said(config: Config) -> str:
+def describe_background_mode(config: Config) -> str:
     """Say which frames stand against which."""
     background = config.background
     those = "all of them" if background.frames == ALL else "background.frames"

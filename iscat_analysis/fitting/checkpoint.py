@@ -27,7 +27,7 @@ _NO_TRACE = (0.0,) * 9
 _NO_CLIP = (0,) * 4
 
 
-class Shelf:
+class Checkpoint:
     """Tables and arrays of finished parts on disk."""
 
     def __init__(

@@ -7,7 +7,7 @@ from dataclasses import replace
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.kept import kept
+from iscat_analysis.optics.memoize import memoize
 
 STEP_NM = 5.0
 """Foci of neighbouring models are so far apart: half of it, which is the most that a frame is off,
@@ -33,7 +33,7 @@ class MovingFocus:
             there = config.model_copy(update={"optics": optics, "calibration": None})
             return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
 
-        self._moved = kept(_KEPT, moved)
+        self._moved = memoize(_KEPT, moved)
 
     def at(self, frame: int) -> ForwardModel:
         """Give the model of a frame."""

@@ -57,7 +57,7 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectionResult:
     """What was found in a movie, whichever frames stand against which."""
 
     scene: Scene

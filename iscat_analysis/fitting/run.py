@@ -7,9 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.noise import compile_kernels, parts_of
-from iscat_analysis.places import Place
 from iscat_analysis.records import FREE_PARAMETERS, Progress
 
 Notify = Callable[[str], None]
@@ -40,7 +40,7 @@ class Run:
     notify: Notify
     progress: Progress
     partial: Path | None
-    place: Place
+    place: Executor
     inject: int
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)

@@ -16,7 +16,7 @@ import numpy as np
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import Opening
+from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
@@ -25,8 +25,8 @@ from iscat_analysis.instrument.learner import (
     FREE,
     LEAST_SIGHTS,
     OpticsCalibration,
+    ParticleImage,
     Settings,
-    Sight,
     heights_free,
     settings_of,
 )
@@ -107,7 +107,7 @@ def learn_sign(
     *,
     tell: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
-    opening: Opening | None = None,
+    opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""
     config = wrong.config
@@ -149,10 +149,10 @@ def learn_sign(
 
 def _begun(
     movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
-) -> tuple[Config, list[Sight], list[Sight]]:
+) -> tuple[Config, list[ParticleImage], list[ParticleImage]]:
     """Fit the field with each focus of the right sign, and take what describes most particles."""
     windows = measured_windows(movie, wrong.config, camera, *frame_ranges(movie, wrong.config))
-    best: tuple[float, Config, list[Sight], list[Sight]] | None = None
+    best: tuple[float, Config, list[ParticleImage], list[ParticleImage]] | None = None
     for start in wrong.starts:
         sights, others = seen_in_field(windows, start, pool)
         if len(sights) < LEAST_TESTED:
@@ -166,8 +166,8 @@ def _begun(
 
 def _found(
     movie: Stack,
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     start: Config,
     wrong: WrongSign,
     camera: Camera,

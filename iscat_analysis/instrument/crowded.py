@@ -21,7 +21,7 @@ from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.instrument.learner import (
     LEAST_SIGHTS,
     OpticsCalibration,
-    Sight,
+    ParticleImage,
     heights_free,
     settings_of,
     with_settings,
@@ -45,7 +45,7 @@ fitted with the next ones has a single one."""
 
 def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
-) -> tuple[list[Sight], list[Sight]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Fit the field, and cut out the particles that are farthest from others."""
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})

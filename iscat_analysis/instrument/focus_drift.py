@@ -17,8 +17,8 @@ from iscat_analysis.instrument.learner import (
     FOCUS_DRIFT,
     FREE,
     OpticsCalibration,
+    ParticleImage,
     Settings,
-    Sight,
     first_step,
     maximise,
 )
@@ -67,7 +67,7 @@ STEADY = FocusDrift(0.0, math.inf, (0, 0))
 
 
 def focus_drift(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     config: Config,
     settings: Settings,
     frames: tuple[int, int],
@@ -84,8 +84,8 @@ def focus_drift(
 
 
 def learned_with_drift(
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     config: Config,
     settings: Settings,
     drift: FocusDrift,
@@ -107,8 +107,8 @@ def learned_with_drift(
 
 def with_drift(
     found: OpticsCalibration,
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     config: Config,
     frames: tuple[int, int],
     source: Mapping[str, str],
@@ -123,12 +123,12 @@ def with_drift(
     return moving if moving.accepted or not found.accepted else found
 
 
-def dated(sights: Sequence[Sight], frames: tuple[int, int]) -> list[Sight]:
+def dated(sights: Sequence[ParticleImage], frames: tuple[int, int]) -> list[ParticleImage]:
     """Give pictures the time of the frames that show their particle."""
     part = max((frames[1] - frames[0]) / _FOCI, 1.0)
     middle = _middle(frames)
 
-    def shown(sight: Sight) -> float:
+    def shown(sight: ParticleImage) -> float:
         before, after = sight.frames
         return before if sight.mass_kda < 0 else after
 

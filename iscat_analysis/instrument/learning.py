@@ -15,9 +15,9 @@ from iscat_analysis.camera.counts import Camera, camera_from_config
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
-from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, Opening, judge_counts
+from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_counts
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.checks import number_in
@@ -32,7 +32,7 @@ from iscat_analysis.instrument.learner import (
     FREE,
     LEAST_SIGHTS,
     OpticsCalibration,
-    Sight,
+    ParticleImage,
     free_groups,
     heights_free,
     settings_of,
@@ -64,7 +64,7 @@ def learn_optics(
     *,
     tell: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
-    opening: Opening | None = None,
+    opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Test the configured optics on the brightest particles, and learn them where they fail."""
     optics = config.optics
@@ -79,13 +79,13 @@ def learn_optics(
     ):
         return config, {}
     tested: dict[str, Any] = {}
-    passed, sliding, drift = False, way_of(config) == "sliding", STEADY
+    passed, sliding, drift = False, background_mode(config) == "sliding", STEADY
     frames = fitted_frames(movie, config, config.background.recorded)
     first_tested = optics.calibrate == "auto" and sliding
     with threads(config.compute.workers) as pool:
         sights, others = bright_sights(movie, config, camera, pool, opening, rings=not first_tested)
         alone, source = len(sights), {"movie": movie.name}
-        together = alone < LEAST_TESTED and way_of(config) == "fixed"
+        together = alone < LEAST_TESTED and background_mode(config) == "fixed"
         windows = _summed(movie, config, camera) if together else None
         try:
             if windows is not None:
@@ -138,7 +138,7 @@ def learn_optics(
 
 def why_not(config: Config) -> str:
     """Say of what movies, or with what configuration, no optics are learned."""
-    optics, mode, way = config.optics, config.fit.mode, way_of(config)
+    optics, mode, way = config.optics, config.fit.mode, background_mode(config)
     tracks = mode == "track"
     reasons = (
         (
@@ -226,7 +226,7 @@ def calibrate_movie(
     with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:
-            others: list[Sight] = []
+            others: list[ParticleImage] = []
             sights = scan_sights(movie, config, camera)
         else:
             sights, others = bright_sights(movie, config, camera, pool)
@@ -257,8 +257,8 @@ def _check_step(step_nm: float, frames: int) -> None:
 
 
 def learned_from(
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     movie: Stack,
     config: Config,
     camera: Camera,
@@ -267,7 +267,7 @@ def learned_from(
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
-    way = way_of(config)
+    way = background_mode(config)
     crowded = way == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
@@ -289,8 +289,8 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     first, last = config.background.recorded or config.fit.frames or (0, movie.shape[0])
     counts = movie.read(first, min(last, first + SPECTRUM_FRAMES, movie.shape[0]))
     light, repeats = measure_frames(counts, camera)
-    stuck = way_of(config) != "sliding" and repeats.mean() > _STUCK
-    follows = config.background.follows_pattern if way_of(config) == "sliding" else None
+    stuck = background_mode(config) != "sliding" and repeats.mean() > _STUCK
+    follows = config.background.follows_pattern if background_mode(config) == "sliding" else None
     noise = judge_counts(counts[well_lit(light) & ~repeats], camera, follows=follows)
     return bool(stuck or noise.differs)
 

@@ -16,8 +16,8 @@ from iscat_analysis.instrument.learner import (
     FOCUS_STEP,
     LEAST_SIGHTS,
     OpticsCalibration,
+    ParticleImage,
     Settings,
-    Sight,
     build_microscope,
     make_pictures,
     make_result,
@@ -27,7 +27,7 @@ from iscat_analysis.instrument.learner import (
 )
 from iscat_analysis.instrument.particle_images import RINGS_NM, reach_nm
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.kept import kept
+from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.records import Mapper
 from iscat_analysis.units import count
 
@@ -49,8 +49,8 @@ def refuse_uncalibratable(config: Config) -> None:
 
 
 def calibrate_sights(
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     config: Config,
     groups: Sequence[str],
     source: Mapping[str, str],
@@ -106,16 +106,16 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
         latest.model = found
         return found
 
-    at_hand = kept(_MODELS_KEPT, model)
+    at_hand = memoize(_MODELS_KEPT, model)
     return lambda settings: at_hand(tuple(settings.items()))
 
 
-def rings_of(config: Config, sight: Sight) -> Callable[[Settings], ForwardModel]:
+def rings_of(config: Config, sight: ParticleImage) -> Callable[[Settings], ForwardModel]:
     """Make models as far as rings of neighbours matter."""
     return microscopes(config, RINGS_NM + sight.grid.diagonal_nm)
 
 
-def goodness(sight: Sight, model: ForwardModel) -> tuple[float, float]:
+def goodness(sight: ParticleImage, model: ForwardModel) -> tuple[float, float]:
     """Reduced χ² and p-value of a fitted picture."""
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
     return goodness_of_fit(likelihood, sight.private, sight.free)

@@ -14,8 +14,8 @@ import numpy as np
 
 from iscat_analysis.camera.counts import Camera, check_counts
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import Opening, judge_window
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.diagnosis.noise import NoiseSurvey, judge_window
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.scene import is_counted, variance_of_background
@@ -34,7 +34,7 @@ from iscat_analysis.instrument.learner import (
     FAINTEST,
     MOST_SIGHTS,
     PRIVATE,
-    Sight,
+    ParticleImage,
     build_microscope,
     heights_free,
     settings_of,
@@ -72,22 +72,22 @@ def bright_sights(
     config: Config,
     camera: Camera,
     pool: ThreadPoolExecutor,
-    opening: Opening | None = None,
+    opening: NoiseSurvey | None = None,
     rings: bool = True,
     whole: bool = False,
-) -> tuple[list[Sight], list[Sight]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Find the bright particles of a movie, in the way in which it is analysed.
 
     Particles with heights of their own are known only from fits of the whole field: there are none
     then, where frames before and after are compared.
     """
-    if way_of(config) == "sliding":
+    if background_mode(config) == "sliding":
         if opening is not None:
             return landing_sights(opening.reader, opening.window, config, pool, rings, whole)
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader, config, pool.map)[2]
         return landing_sights(reader, window, config, pool, rings, whole)
-    if heights_free(config) and way_of(config) == "fixed":
+    if heights_free(config) and background_mode(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
     return bright_places(windows, config)
@@ -95,7 +95,7 @@ def bright_sights(
 
 def kind_of(config: Config) -> str:
     """Say what such a movie shows, for the record of a calibration."""
-    return "landing movie" if way_of(config) == "sliding" else "frames before and after"
+    return "landing movie" if background_mode(config) == "sliding" else "frames before and after"
 
 
 def landing_sights(
@@ -105,7 +105,7 @@ def landing_sights(
     pool: ThreadPoolExecutor,
     rings: bool,
     whole: bool,
-) -> tuple[list[Sight], list[Sight]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough."""
     stride = stride_of(window)
     found: list[BrightStep] = []
@@ -183,7 +183,7 @@ def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:
 
 def bright_places(
     windows: Windows, config: Config, alone_nm: float = APART_NM
-) -> tuple[list[Sight], list[Sight]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Find bright particles that bound between two ranges of frames."""
     ratio = windows.power_ratio
     # the noise of a known background is none
@@ -209,7 +209,7 @@ def bright_places(
 
 def known_places(
     windows: Windows, config: Config, known: Sequence[FloatArray], least: int
-) -> tuple[list[Sight], list[Sight]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Cut out particles that are known, those that are farthest from others.
 
     Shapes: `known` (5,).
@@ -217,7 +217,7 @@ def known_places(
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
     heights = config.fit.z_range_nm if heights_free(config) else None
 
-    def cut(chosen: FloatArray, side: int) -> list[Sight]:
+    def cut(chosen: FloatArray, side: int) -> list[ParticleImage]:
         places = np.rint(chosen[:, 1::-1] / pixel).astype(int).tolist()
         return [
             replace(cut_out(row, column, side).moved(theta), heights_nm=heights)
@@ -241,12 +241,12 @@ def known_places(
     return sights, [_among(other, others, 0.0) for other in others]
 
 
-def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight]:
+def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], ParticleImage]:
     """Give what cuts a square out of the field, as far as it goes."""
     model = build_microscope(config, 1000.0, settings_of(config))
     shape, ratio = windows.after_e.shape, windows.power_ratio
 
-    def cut_out(row: int, column: int, side: int) -> Sight:
+    def cut_out(row: int, column: int, side: int) -> ParticleImage:
         (top, bottom), (left, right) = _region(row, column, side)
         rows = max(top, 0), min(bottom, shape[0])
         columns = max(left, 0), min(right, shape[1])
@@ -264,14 +264,14 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Sight
     return cut_out
 
 
-def _among(sight: Sight, others: Sequence[Sight], least_nm: float) -> Sight:
+def _among(sight: ParticleImage, others: Sequence[ParticleImage], least_nm: float) -> ParticleImage:
     """Tell a sight which of the others are near, but not so near that they are the same."""
     apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
     near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
     return replace(sight, neighbours=tuple(near))
 
 
-def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
+def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[ParticleImage]:
     """Cut the particles of a scan of the focus out of its frames.
 
     The particles stay where they are, so that no frame shows the background alone.  It comes from
@@ -302,7 +302,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     )
     model = build_microscope(config, 1000.0, settings_of(config))
     saturated = np.any(camera.saturated(counts), axis=0)
-    sights: list[Sight] = []
+    sights: list[ParticleImage] = []
     per_place = max(1, MOST_SIGHTS // max(len(places), 1))
     taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
     for row, column in places[:MOST_SIGHTS]:
@@ -310,7 +310,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
         masked = np.asarray(saturated)[cut]
-        seen: list[Sight] = []
+        seen: list[ParticleImage] = []
         for index in taken.astype(int):
             frame, ratio = frames[index][cut], float(ratios[index])
             if n_before:
@@ -334,7 +334,7 @@ def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[Sight]:
     return _bright(sights)
 
 
-def _centred(likelihood: Likelihood, config: Config) -> Sight:
+def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     """Make a sight of a picture, from the centre of its energy."""
     grid = likelihood.grid
     information = likelihood.signal_information()
@@ -343,19 +343,19 @@ def _centred(likelihood: Likelihood, config: Config) -> Sight:
     contrast = np.where(used, contrast - np.average(contrast, weights=information), 0.0)
     variance = 1 / np.where(used, information, 1e-6)
     y, x, snr = centre_of_energy(contrast, variance, grid.pixel_nm)
-    return Sight(
+    return ParticleImage(
         grid=grid, kind=likelihood.kind, data=likelihood.data,
         x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
         z_nm=config.particle.height_nm, snr=snr,
     )  # fmt: skip
 
 
-def _bright(sights: Iterable[Sight]) -> list[Sight]:
+def _bright(sights: Iterable[ParticleImage]) -> list[ParticleImage]:
     """Keep the pictures that are bright enough, the brightest first."""
     return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
 
 
-def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> Sight:
+def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> ParticleImage:
     """Make a sight of a step."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
     likelihood = conditional(
@@ -384,6 +384,6 @@ def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[in
     return (first, first + side), (left, left + side)
 
 
-def reach_nm(sight: Sight) -> float:
+def reach_nm(sight: ParticleImage) -> float:
     """Distance from a particle, which may move in its picture, to the farthest pixel."""
     return sight.grid.diagonal_nm / 2 + _SHIFT_NM

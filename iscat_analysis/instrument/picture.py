@@ -13,8 +13,8 @@ from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fitting.background_mode import way_of
-from iscat_analysis.instrument.learner import LEAST_SIGHTS, Judgement, Sight, judge
+from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.instrument.learner import LEAST_SIGHTS, Judgement, ParticleImage, judge
 from iscat_analysis.instrument.learner.measured_picture import (
     PictureFit,
     fit_own,
@@ -161,13 +161,13 @@ def measure_template(
         settings = {
             "roi_nm": max(roi_nm, config.fit.roi_nm),
             "step_nm": step,
-            "level": way_of(config) == "sliding",
+            "level": background_mode(config) == "sliding",
         }
         return _judged(place_sights(alone, nominal), nominal, config, settings, source, pool.map)
 
 
 def _judged(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     nominal: ForwardModel,
     config: Config,
     settings: Mapping[str, float],
@@ -178,14 +178,14 @@ def _judged(
     level = bool(settings["level"])
     options = {"roi_nm": settings["roi_nm"], "step_nm": settings["step_nm"]}
 
-    def fit(some: Sequence[Sight]) -> PictureFit:
+    def fit(some: Sequence[ParticleImage]) -> PictureFit:
         return fit_picture(some, nominal, level=level, mapper=mapper, **options)
 
-    def fitted_with(some: Sequence[Sight], found: PictureFit) -> list[Sight]:
+    def fitted_with(some: Sequence[ParticleImage], found: PictureFit) -> list[ParticleImage]:
         model = with_template(nominal, found.template)
         return list(mapper(lambda s: fit_own(s, model, level=level), some))
 
-    def judged(some: Sequence[Sight], found: PictureFit) -> Judgement:
+    def judged(some: Sequence[ParticleImage], found: PictureFit) -> Judgement:
         model = with_template(nominal, found.template)
         return judge(some, {}, lambda sight, _: goodness(sight, model), mapper)
 
@@ -212,10 +212,10 @@ def _judged(
     )
 
 
-def _alone(sights: Sequence[Sight], others: Sequence[Sight]) -> list[Sight]:
+def _alone(sights: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Leave out pictures into which another particle reaches."""
 
-    def is_alone(sight: Sight) -> bool:
+    def is_alone(sight: ParticleImage) -> bool:
         room = sight.grid.pixel_nm * max(sight.grid.shape) / 2 + _CLEAR_NM
         x, y = float(np.mean(sight.grid.x_nm)), float(np.mean(sight.grid.y_nm))
         near = (others[number] for number, share in sight.neighbours if abs(share) > _NEW)

@@ -11,8 +11,8 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.instrument.learner import (
     Neighbours,
+    ParticleImage,
     Settings,
-    Sight,
     heights_free,
     maximise,
     settings_of,
@@ -35,8 +35,11 @@ _DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others 
 
 
 def median_p(
-    sights: list[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
-) -> tuple[float, Sequence[Sight]]:
+    sights: list[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
+) -> tuple[float, Sequence[ParticleImage]]:
     """Give the median p-value of the brightest particles in the configured microscope.
 
     The rings of neighbours, where any are known, are put into the pictures that fail without.
@@ -44,13 +47,13 @@ def median_p(
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
-    shown: Sequence[Sight] = sights[:TESTED]
+    shown: Sequence[ParticleImage] = sights[:TESTED]
     x, y = 0.0, 0.0
     if not heights_free(config):
         averages, shown = average_sights(shown)
         x, y = _centre(averages[0], model, build, settings)
 
-    def median(pictures: Sequence[Sight]) -> tuple[float, Sequence[Sight]]:
+    def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:
         fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
         return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
 
@@ -64,7 +67,10 @@ def median_p(
 
 
 def not_alone(
-    sights: Sequence[Sight], config: Config, others: Sequence[Sight] = (), mapper: Mapper = map
+    sights: Sequence[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
 ) -> tuple[list[int], float]:
     """Find bright places that the configured microscope describes badly, and others well.
 
@@ -76,7 +82,7 @@ def not_alone(
     build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
 
-    def fitted(sight: Sight) -> Sight:
+    def fitted(sight: ParticleImage) -> ParticleImage:
         x, y = _centre(sight, model, build, settings)
         (placed,) = with_masses([sight.placed(x, y)], build, settings)
         return maximise([placed], build, settings, ()).sights[0]
@@ -100,7 +106,7 @@ def not_alone(
 
 
 def _centre(
-    sight: Sight,
+    sight: ParticleImage,
     model: ForwardModel,
     build: Callable[[Settings], ForwardModel],
     settings: Settings,
@@ -115,7 +121,7 @@ def _centre(
         for y in _STARTS_NM
     ]
 
-    def misfit(one: Sight) -> float:
+    def misfit(one: ParticleImage) -> float:
         return goodness(one, model)[0]
 
     likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]

@@ -18,8 +18,8 @@ from iscat_analysis.instrument.learner import (
     FREE,
     Neighbours,
     OpticsCalibration,
+    ParticleImage,
     Settings,
-    Sight,
     free_names,
     maximise,
     optics_limits,
@@ -41,8 +41,8 @@ _DESCRIBED_CHI2 = 1.2  # of pictures that were not fitted, from which no other i
 
 
 def learn_with_heights(
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     config: Config,
     groups: Sequence[str],
     source: Mapping[str, str],
@@ -72,14 +72,14 @@ class _Begun:
     """A microscope, and all particles at the heights that suit it best."""
 
     settings: Settings
-    sights: list[Sight]
-    others: list[Sight]
+    sights: list[ParticleImage]
+    others: list[ParticleImage]
     misfit: float
 
 
 def _likeliest(
-    sights: Sequence[Sight],
-    others: Sequence[Sight],
+    sights: Sequence[ParticleImage],
+    others: Sequence[ParticleImage],
     config: Config,
     known: Settings,
     groups: Sequence[str],
@@ -101,13 +101,18 @@ def _likeliest(
     clear = 1 + _CLEAR * math.sqrt(2 / math.prod(sights[0].grid.shape))
 
     def placed(
-        settings: Settings, some: Sequence[Sight], around: Sequence[Sight], moved: float = 0.0
+        settings: Settings,
+        some: Sequence[ParticleImage],
+        around: Sequence[ParticleImage],
+        moved: float = 0.0,
     ) -> _Begun:
         model, wide = build(settings), build_wide(settings)
         fringe = model.fringe_nm
         anywhere = [moved + fringe * k for k in (-1.0, -0.5, 0.0, 0.5, 1.0)]
 
-        def best(few: Sequence[Sight], shifts: Sequence[float]) -> list[tuple[float, Sight]]:
+        def best(
+            few: Sequence[ParticleImage], shifts: Sequence[float]
+        ) -> list[tuple[float, ParticleImage]]:
             return _best_heights(few, shifts, model, settings, mapper)
 
         near = [sight for _, sight in best(around, anywhere)] if around else []
@@ -147,12 +152,12 @@ def _likeliest(
 
 
 def _best_heights(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     shifts_nm: Sequence[float],
     model: ForwardModel,
     settings: Settings,
     mapper: Mapper,
-) -> list[tuple[float, Sight]]:
+) -> list[tuple[float, ParticleImage]]:
     """Fit every sight from several heights; give the reduced χ² of the best fit, and that.
 
     Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
@@ -162,7 +167,7 @@ def _best_heights(
     def build(_: Settings) -> ForwardModel:
         return model
 
-    found: list[list[tuple[bool, float, Sight]]] = [[] for _ in sights]
+    found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in sights]
     for shift in shifts_nm:
         moved = [sight.raised(shift) for sight in sights]
         begun = with_masses(moved, build, settings)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from iscat_analysis.camera.drift import Trajectory
-from iscat_analysis.fitting.checkpoint import Shelf, packed_views, unpacked_views
+from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.landing.merging import Done
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.empty import EmptySpread
 
 
-class Store(Shelf):
+class Store(Checkpoint):
     """Finished chunks of a landing movie on disk."""
 
     def load(self, number: int) -> Done | None:

@@ -21,18 +21,18 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.camera.lines import Lines, SteadyFrames
 from iscat_analysis.config import Config, with_absolute_paths
-from iscat_analysis.diagnosis.noise import Opening, judge_opening
+from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import FloodError
+from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.fitting.results import Compared, Found
+from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Notify, Run
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
 from iscat_analysis.landing.merging import Done, Merged
 from iscat_analysis.landing.odd_frames import frame_warnings
-from iscat_analysis.places import Here, Place
 from iscat_analysis.records import CountSource, Progress, Status
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
@@ -42,7 +42,7 @@ POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
 
 
-def find_landings(ready: Prepared, run: Run) -> Found:
+def find_landings(ready: Prepared, run: Run) -> DetectionResult:
     """Find what lands or leaves between windows that slide over a movie."""
     for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
         run.notify(remark)
@@ -81,16 +81,16 @@ def analyse_landings(
     partial: Path | None = None,
     identity: str = "",
     lines: Lines | None = None,
-    place: Place | None = None,
-    opening: Opening | None = None,
-) -> Found:
+    place: Executor | None = None,
+    opening: NoiseSurvey | None = None,
+) -> DetectionResult:
     """Find and fit every particle that lands or leaves."""
-    place = place or Here()
+    place = place or LocalExecutor()
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     if opening is None:
         reader = reader_of(frames, config, camera, (first, last))
-        opening = judge_opening(reader, config)
+        opening = survey_noise(reader, config)
     reader, noise, window = opening.reader, opening.noise, opening.window
     for text in noise.said(movie.name):
         tell(text)
@@ -173,7 +173,7 @@ def analyse_landings(
         **_way(merged.trajectory()),
         "chunks": len(plan),
     }
-    return Found(
+    return DetectionResult(
         scene=scene,
         fits=fits,
         views=views,
@@ -195,7 +195,7 @@ def analyse_landings(
 
 
 def _finished(
-    finish: Callable[[int], Done], count: int, place: Place, merged: Merged, posterior: bool
+    finish: Callable[[int], Done], count: int, place: Executor, merged: Merged, posterior: bool
 ) -> Generator[tuple[int, bool]]:
     """Finish chunks and merge them in their order, whichever comes first.
 

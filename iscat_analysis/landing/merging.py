@@ -29,7 +29,7 @@ class Done:
 
     core: tuple[int, int]
     lines: pd.DataFrame  # of fits.csv, which have no numbers yet
-    repeats: FloatArray  # of every row, from `iscat_analysis.inference.repeats`
+    repeats: FloatArray  # of every row, from `iscat_analysis.inference.split_frames`
     views: tuple[EventView, ...]
     good: BoolArray  # of the core
     light: FloatArray

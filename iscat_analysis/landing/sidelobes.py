@@ -23,7 +23,7 @@ _RINGS = 0.04  # the same for the rest of its region
 
 
 @dataclass(frozen=True)
-class Sieve:
+class SidelobeFilter:
     """Tells steps from side lobes."""
 
     first: int

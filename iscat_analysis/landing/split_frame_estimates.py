@@ -17,7 +17,7 @@ from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
 from iscat_analysis.fitting.regions import Region, photons_scale
 from iscat_analysis.fitting.scene import Scene
-from iscat_analysis.inference.repeats import (
+from iscat_analysis.inference.split_frames import (
     PARTS,
     Response,
     Series,

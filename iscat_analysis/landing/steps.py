@@ -28,7 +28,7 @@ from iscat_analysis.inference.fit import (
     start_theta,
 )
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
-from iscat_analysis.landing.sidelobes import Sieve
+from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
 from iscat_analysis.landing.step_maps import StepMaps
 from iscat_analysis.landing.tasks import Task, TaskBuilder
@@ -95,7 +95,7 @@ class ChunkFitter:
         self._neighbours = Neighbours(scene, chunk, window, pattern)
         self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
-        self._sieve = Sieve(chunk.first, self._stride, window, scene.roi_px)
+        self._sieve = SidelobeFilter(chunk.first, self._stride, window, scene.roi_px)
         self._doubtful: list[Peak] = []
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0

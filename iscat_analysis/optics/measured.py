@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, undo_window, window
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.kept import kept
+from iscat_analysis.optics.memoize import memoize
 
 FloatArray = NDArray[np.float64]
 
@@ -142,7 +142,7 @@ class MeasuredField:
             out[0] = self._coefficients()
             return out
 
-        return kept(_KEPT, with_orders)
+        return memoize(_KEPT, with_orders)
 
     def _coefficients(self) -> FloatArray:
         """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""

@@ -24,9 +24,9 @@ from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, weight_on
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.kept import kept
 from iscat_analysis.optics.materials import Material
 from iscat_analysis.optics.measured import MeasuredField
+from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.sensitivity import (
     check_names,
@@ -106,7 +106,7 @@ class ForwardModel:
 
     @cached_property
     def _height_tables(self) -> Callable[[float], AxialTable]:
-        return kept(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
+        return memoize(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def picture_table(self, pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
         """Picture at `height_nm` on the pixels' own grid; the last few are kept."""
@@ -118,7 +118,7 @@ class ForwardModel:
             lens, samples = sample_picture(self, pixel_nm, half_px)
             return lens, AxialTable(samples.reshape(1, 1, 2, -1), self.height_nm, 1.0, 0.0)
 
-        return kept(_TABLES_KEPT, of)
+        return memoize(_TABLES_KEPT, of)
 
     def image(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
@@ -250,7 +250,7 @@ class ForwardModel:
                 z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
             )  # fmt: skip
 
-        return kept(_TABLES_KEPT, at)
+        return memoize(_TABLES_KEPT, at)
 
     def field(
         self, dx_nm: FloatArray, dy_nm: FloatArray, z_nm: float, mass_kda: float

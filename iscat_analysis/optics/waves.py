@@ -36,8 +36,8 @@ from iscat_analysis._kernels.radial import (
     radial_profile,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.kept import kept
 from iscat_analysis.optics.measured import MeasuredField
+from iscat_analysis.optics.memoize import memoize
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -102,7 +102,7 @@ class RadialField:
 
     @cached_property
     def _profiles(self) -> Callable[[float, int], FloatArray]:
-        return kept(_HEIGHTS_KEPT, lambda z, orders: self._profile(z, orders, 0.0))
+        return memoize(_HEIGHTS_KEPT, lambda z, orders: self._profile(z, orders, 0.0))
 
     def _profile(self, z_nm: float, orders: int, kappa: float) -> FloatArray:
         points = self.table.shape[3]
@@ -193,7 +193,7 @@ class LatticeField:
             check_table("the field around a particle", orders * self.width)
             return self._stack(np.array([z_nm]), orders, 0.0).reshape(-1, side, side)
 
-        return kept(_HEIGHTS_KEPT, at)
+        return memoize(_HEIGHTS_KEPT, at)
 
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
@@ -244,7 +244,7 @@ class LatticeField:
             weights = self._weights(np.array([z_nm]), 1, 0.0)[0, 0]
             return self._waves(weights, self.transverse, self.radial_step_nm)
 
-        return kept(_HEIGHTS_KEPT, at)
+        return memoize(_HEIGHTS_KEPT, at)
 
     def peak(
         self, z_nm: float, amplitude: float, rho: float, profile: FloatArray | None = None
@@ -295,7 +295,7 @@ class LatticeField:
 
     @cached_property
     def _plane(self) -> Callable[[float], tuple[FloatArray, FloatArray]]:
-        return kept(_HEIGHTS_KEPT, lambda z_nm: self._parts(self.profile(z_nm, 3), self._grid))
+        return memoize(_HEIGHTS_KEPT, lambda z_nm: self._parts(self.profile(z_nm, 3), self._grid))
 
     def _parts(self, profile: FloatArray, pixels: Pixels) -> tuple[FloatArray, FloatArray]:
         """Re e_u and |e|² at points, from a profile."""

@@ -19,10 +19,11 @@ from pathlib import Path
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import Way, way_of
+from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
 from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept
 from iscat_analysis.fitting.compilation import compiling
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, unheard
 from iscat_analysis.inference.checks import path_in
 from iscat_analysis.landing.find import find_landings
@@ -31,13 +32,12 @@ from iscat_analysis.pipeline.bound import find_bound
 from iscat_analysis.pipeline.finish import gather
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
-from iscat_analysis.places import Here, Place
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import claim_output
 from iscat_analysis.tracking.find import find_moving
 
-FIND: Mapping[Way, Callable[[Prepared, Run], Found]] = {
+FIND: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
     "fixed": find_bound,
     "sliding": find_landings,
     "tracks": find_moving,
@@ -58,7 +58,7 @@ def fit_stack(
     notify: Notify = unheard,
     command: str = "",
     inject: int = 0,
-    place: Place | None = None,
+    place: Executor | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -102,7 +102,7 @@ def fit_stack(
     stack = path_in("`stack`", stack)
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
-    way = way_of(config)
+    way = background_mode(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
@@ -139,7 +139,7 @@ def analyse(
     command: str = "",
     partial: Path | None = None,
     inject: int = 0,
-    place: Place | None = None,
+    place: Executor | None = None,
 ) -> Analysis:
     """Analyse an open movie."""
     if place is not None and place.distant and not movie.identity:
@@ -149,7 +149,7 @@ def analyse(
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
-        run = Run(notify, progress, partial, place or Here(), inject)
+        run = Run(notify, progress, partial, place or LocalExecutor(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
         with parts_kept(None if ready.way == "fixed" else partial):

@@ -26,7 +26,7 @@ from iscat_analysis.fitting.events import Event, posterior_of
 from iscat_analysis.fitting.field import add_signal, fit_field
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import Region, contrast_image, photons_scale
-from iscat_analysis.fitting.results import Compared, Found, table_of, view_of
+from iscat_analysis.fitting.results import Compared, DetectionResult, table_of, view_of
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.split_frame_estimates import field_repeats
@@ -53,7 +53,7 @@ _LEAST_AWAY = 0.25  # of the field, from which what no particle explains is told
 _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
 
 
-def find_bound(ready: Prepared, run: Run) -> Found:
+def find_bound(ready: Prepared, run: Run) -> DetectionResult:
     """Find particles in the frames after a background, together or, in mode track, one by one."""
     ready, windows = _summed(ready, run)
     scene, noise, summary, doubt = _background(ready, run, windows)
@@ -161,7 +161,7 @@ def _together(
     noise: Noise,
     summary: dict[str, Any],
     pool: ThreadPoolExecutor,
-) -> Found:
+) -> DetectionResult:
     """Find, fit and sample the particles that are there in all frames after the background."""
     events, windows = fit_field(
         scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
@@ -187,7 +187,7 @@ def _together(
     if scene.config.samples_posterior:
         chains, interrupted = _sampled(scene, events, pool, run.progress)
         run.clock.lap("posterior")
-    return Found(
+    return DetectionResult(
         scene=scene,
         fits=table_of(scene, events),
         views=tuple(

@@ -19,12 +19,12 @@ from iscat_analysis.diagnosis.causes import (
     sign_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
-from iscat_analysis.fitting.results import Compared, Found
+from iscat_analysis.executors import versions
+from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.places import versions
 from iscat_analysis.records import Analysis, Film, Provenance, silent
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.tracking.common_motion import warnings_of
@@ -35,7 +35,7 @@ from iscat_analysis.trust.empirical_spread import spread_verdict
 def gather(
     ready: Prepared,
     run: Run,
-    found: Found,
+    found: DetectionResult,
     extra: Mapping[str, Any],
     *,
     command: str,

@@ -24,14 +24,14 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Mover, Trajectory
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run, unheard
 from iscat_analysis.fitting.scene import Scene, reported_steps
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.rows import reported_rows
-from iscat_analysis.places import Place
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
@@ -137,7 +137,7 @@ def _with_particle(
     return changed.astype(counts.dtype)
 
 
-def injected(ready: Prepared, run: Run, found: Found) -> tuple[dict[str, Any], bool]:
+def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[str, Any], bool]:
     """Tell how many known particles are found, and how well they are measured."""
     if not run.inject or found.interrupted:
         return {}, False
@@ -157,11 +157,11 @@ def inject_and_recover(
     movie: CountSource,
     config: Config,
     camera: Camera,
-    result: Found,
+    result: DetectionResult,
     count: int,
     *,
     progress: Progress,
-    place: Place | None = None,
+    place: Executor | None = None,
 ) -> dict[str, Any]:
     """Add known particles to a movie, analyse it again and compare."""
     frames = fitted_frames(movie, config)

@@ -16,14 +16,14 @@ from iscat_analysis.camera.background import measure_windows, start_power
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import judge_background, judge_opening
+from iscat_analysis.diagnosis.noise import judge_background, survey_noise
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.field import search_field
 from iscat_analysis.fitting.pattern import SPAN, corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import contrast_image
 from iscat_analysis.fitting.scene import Scene, make_scene, reported_steps
-from iscat_analysis.landing.sidelobes import Sieve
+from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, silent
 from iscat_analysis.search.sliding import (
@@ -39,7 +39,7 @@ from iscat_analysis.search.sliding import (
 from iscat_analysis.search.sliding.chunks import reader_of
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.moving_field import (
     LEAST_FRAMES,
     load_field,
@@ -132,7 +132,7 @@ class LandingSearch:
         frames = movie if lines is None else SteadyFrames(movie, lines, camera)
         self._config = config
         self._reader = reader_of(frames, config, camera, (first, last))
-        opening = judge_opening(self._reader, config)
+        opening = survey_noise(self._reader, config)
         noise, self.window = opening.noise, opening.window
 
         @lru_cache(_WINDOWS_KEPT)
@@ -182,7 +182,7 @@ class LandingSearch:
         def search(threshold: float) -> pd.DataFrame:
             matched, snr, effective = map_of()
             peaks = find_steps(chunk, matched, snr, effective, threshold)
-            sieve = Sieve(chunk.first, stride, window, scene.roi_px)
+            sieve = SidelobeFilter(chunk.first, stride, window, scene.roi_px)
             sign, scale = reported_steps(scene), scene.model.scale
             return _listed(
                 (p.x_px, p.y_px, p.snr, float(scene.contrasts(np.asarray(p.amplitude))),
@@ -279,7 +279,7 @@ class MovingSearch:
         self._scene = track_scene(config, shape, max(last - first, 1))
 
         @lru_cache(1)
-        def background(span: tuple[int, int]) -> tuple[MovingField, Ground]:
+        def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
             with threads(config.compute.workers) as pool:
                 field = load_field(
                     self._scene, self._movie, camera, span, self._check, pool, silent
@@ -301,7 +301,7 @@ class MovingSearch:
         span = start, start + window
         field, ground = self._background(span)
         nothing = np.zeros(0, dtype=np.int64)
-        rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
+        rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
         here, scene = frame - start, self._scene
         light = ground.level * ground.power[here]
         image = field.residual(ground, rows, here, here + 1)[0] / light

@@ -14,7 +14,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
-from iscat_analysis.diagnosis.noise import Opening, judge_opening
+from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.recognise import (
     as_landing,
@@ -24,7 +24,7 @@ from iscat_analysis.diagnosis.recognise import (
 )
 from iscat_analysis.diagnosis.stage import followed, motion_said
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fitting.background_mode import way_of, way_said
+from iscat_analysis.fitting.background_mode import background_mode, describe_background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, tracked_frames
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
@@ -45,8 +45,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         run.tell(note)
-    way = way_of(config)
-    run.notify(way_said(config))
+    way = background_mode(config)
+    run.notify(describe_background_mode(config))
     span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
     if tracked:
@@ -70,7 +70,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.tell(swapped)
     summary: dict[str, Any] = {}
     looking: Future[Changes] | None = None
-    opened: Opening | None = None
+    opened: NoiseSurvey | None = None
 
     with one_thread_algebra():  # in all threads until the light is judged
         if way == "sliding":
@@ -124,15 +124,15 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
 
 def _landing_light(
     movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
-) -> tuple[JudgedLight, Opening, str]:
+) -> tuple[JudgedLight, NoiseSurvey, str]:
     """Judge the light of a landing movie and, in steady light, noise and motion of some frames.
 
     Motion is looked for where that is left open, and told in words.  The first chunk, which is
     wanted next, is summed while the light is still being judged.
     """
 
-    def opening_of(seen: Stack) -> tuple[Opening, str]:
-        opened = judge_opening(reader_of(seen, config, camera, span), config)
+    def opening_of(seen: Stack) -> tuple[NoiseSurvey, str]:
+        opened = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
         motion = motion_said(seen, opened) if left_open else ""
         if not motion:

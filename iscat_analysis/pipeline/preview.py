@@ -15,7 +15,7 @@ from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import Way, way_of
+from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline.looks import (
@@ -27,7 +27,7 @@ from iscat_analysis.pipeline.looks import (
     positive,
 )
 
-_SEARCHES: Mapping[Way, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
+_SEARCHES: Mapping[BackgroundMode, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
     "fixed": BoundSearch,
     "sliding": LandingSearch,
     "tracks": MovingSearch,
@@ -83,7 +83,9 @@ class Preview:
         camera = camera_from_config(config.camera, shape, movie.dtype)
         refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
         judged = judge_light(movie, config, camera)
-        self._search = _SEARCHES[way_of(config)](judged.movie, config, camera, judged.lines)
+        self._search = _SEARCHES[background_mode(config)](
+            judged.movie, config, camera, judged.lines
+        )
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

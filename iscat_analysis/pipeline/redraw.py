@@ -22,7 +22,7 @@ from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.events import Fitted, PlaceAndMass
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.pattern import corrected
@@ -40,7 +40,7 @@ from iscat_analysis.search.sliding.chunks import HALO, reader_of
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import row_view
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.moving import blurred_rows
 from iscat_analysis.tracking.moving_field import (
     exposure_of,
@@ -67,7 +67,7 @@ def redraw(
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     judged = judge_light(movie, config, camera)
     movie, lines = judged.movie, judged.lines
-    way = way_of(config)
+    way = background_mode(config)
     if way == "sliding":
         window = int(summary["landing"]["window_frames"])
         return _landings(movie, config, camera, lines, table, window)
@@ -212,7 +212,9 @@ def _moving(
     check = checked(movie, camera)
 
     @lru_cache(1)
-    def block(start: int, stop: int) -> tuple[MovingField, Ground, Rows, NDArray[np.int64]]:
+    def block(
+        start: int, stop: int
+    ) -> tuple[MovingField, BackgroundEstimate, Localizations, NDArray[np.int64]]:
         inside = np.flatnonzero(known & table["frame"].between(start, stop - 1))
         part = table.iloc[inside]
         theta = np.zeros((len(part), 5))
@@ -222,7 +224,7 @@ def _moving(
         numbers, track = np.unique(part["track"].to_numpy(int), return_inverse=True)
         frame = part["frame"].to_numpy(np.int64) - start
         order = np.lexsort((track, frame))
-        rows = Rows.of(frame, track.astype(np.int64), theta)
+        rows = Localizations.of(frame, track.astype(np.int64), theta)
         speeds: FloatArray = np.array([[diffusion.get(int(n), 0.0)] for n in numbers])
         rows, variances = blurred_rows(rows, speeds.reshape(-1, 1), exposure_s)
         with threads(config.compute.workers) as pool:
@@ -234,7 +236,7 @@ def _moving(
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level
-                ground = Ground(level, found.power if follows else ground.power)
+                ground = BackgroundEstimate(level, found.power if follows else ground.power)
         return field, ground, rows, inside[order]
 
     def draw(row: int) -> EventView:

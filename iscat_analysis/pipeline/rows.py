@@ -10,15 +10,15 @@ from __future__ import annotations
 
 import pandas as pd
 
-from iscat_analysis.fitting.results import Found
-from iscat_analysis.inference.achieved import Achieved
+from iscat_analysis.fitting.results import DetectionResult
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FloatArray
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.systematic import systematic
 
 
-def reported_rows(found: Found) -> tuple[pd.DataFrame, dict[str, Achieved]]:
+def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread]]:
     """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}

@@ -13,7 +13,7 @@ import pandas as pd
 from iscat_analysis.bounds import holevo_over_quantum
 from iscat_analysis.fitting.results import Compared
 from iscat_analysis.fitting.scene import Scene
-from iscat_analysis.inference.achieved import Achieved
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.species import LEAST_EVENTS, describe
@@ -28,7 +28,7 @@ def summary_of(
     table: pd.DataFrame,
     compared: Compared,
     timings: Mapping[str, float],
-    achieved: Mapping[str, Achieved] = MappingProxyType({}),
+    achieved: Mapping[str, EmpiricalSpread] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
     good = table[table["status"] == Status.OK]
@@ -84,7 +84,7 @@ def species_of(scene: Scene, table: pd.DataFrame) -> dict[str, Any]:
     return {"distribution": distribution, "across_particles": across}
 
 
-def _repeats(found: Achieved) -> dict[str, Any]:
+def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
     """Give what the summary says of a measured spread."""
     return {
         "repeat_over_crb": found.over_crb,

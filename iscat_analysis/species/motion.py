@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
-from iscat_analysis._kernels.well import most_likely_well
+from iscat_analysis._kernels.harmonic_trap import most_likely_well
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.species.diffusion import most_likely

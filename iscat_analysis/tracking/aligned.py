@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import poisson
-from iscat_analysis.instrument.learner import FAINTEST, Sight
+from iscat_analysis.instrument.learner import FAINTEST, ParticleImage
 from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
@@ -87,14 +87,14 @@ class Aligned:
             masked=light <= 0,
         )
 
-    def sight(self, scene: Scene, number: int) -> Sight:
+    def sight(self, scene: Scene, number: int) -> ParticleImage:
         """Give a picture to those who measure the microscope."""
         likelihood = self.likelihood(scene, number)
         theta = self.theta[number]
         fit = scene.config.fit
         x, y, z = (float(v) for v in theta[:3])
         signal = likelihood.signal(theta)
-        return Sight(
+        return ParticleImage(
             grid=likelihood.grid, kind=likelihood.kind, data=likelihood.data,
             x_nm=x, y_nm=y, z_nm=z, mass_kda=float(scene.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),

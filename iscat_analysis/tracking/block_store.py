@@ -15,13 +15,13 @@ from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.diagnosis.causes import smear_warning
 from iscat_analysis.diagnosis.noise import Noise, judge_beside
-from iscat_analysis.fitting.checkpoint import Shelf, packed_views, unpacked_views
+from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
 from iscat_analysis.threads import beside
 from iscat_analysis.tracking.aligned import Aligned, align
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.linking import typical_error
 from iscat_analysis.tracking.moving import follow
 from iscat_analysis.tracking.moving_table import common_masses, moving_table
@@ -32,7 +32,7 @@ class Block:
     """What was found in a block of frames."""
 
     span: tuple[int, int]
-    rows: Rows
+    rows: Localizations
     error: float
     table: pd.DataFrame
     inside: BoolArray
@@ -132,7 +132,9 @@ def analyse_block(
     )
 
 
-def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> EventView:
+def row_view(
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, mine: int
+) -> EventView:
     """Draw a particle in one frame."""
     frame, theta = int(rows.frame[mine]), rows.theta[mine]
     spans = [
@@ -156,7 +158,7 @@ def row_view(field: MovingField, ground: Ground, rows: Rows, mine: int) -> Event
     )
 
 
-class BlockStore(Shelf):
+class BlockStore(Checkpoint):
     """Finished blocks of frames on disk."""
 
     def load(self, number: int, span: tuple[int, int]) -> Block | None:
@@ -172,7 +174,7 @@ class BlockStore(Shelf):
             masses = pd.DataFrame(data["masses"], columns=names)
             return Block(
                 span=span,
-                rows=Rows.of(data["frame"], data["track"], data["theta"], data["group"]),
+                rows=Localizations.of(data["frame"], data["track"], data["theta"], data["group"]),
                 error=float(data["error"]),
                 table=table,
                 inside=data["inside"],

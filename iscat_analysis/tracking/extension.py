@@ -14,7 +14,7 @@ import numpy as np
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 
 LEAST_SNR = 4.0
 """Signal-to-noise ratio, with its neighbours in place, that a predicted particle needs."""
@@ -37,8 +37,13 @@ class _End:
 
 
 def extended(
-    field: MovingField, ground: Ground, rows: Rows, *, resolution_nm: float, reach_nm: float
-) -> tuple[Rows, int]:
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    *,
+    resolution_nm: float,
+    reach_nm: float,
+) -> tuple[Localizations, int]:
     """Let tracks go on from their ends as far as the movie shows them."""
     tracks = int(rows.track.max(initial=-1)) + 1
     if not tracks:
@@ -50,7 +55,7 @@ def extended(
         mine = np.flatnonzero(rows.track == k)
         typical[k] = np.median(rows.theta[mine, 3])
         ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
-    refitted: dict[int, Rows] = {}
+    refitted: dict[int, Localizations] = {}
     added = 0
     meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
     while ends:
@@ -101,16 +106,16 @@ def extended(
     frame = np.array([t for t in changed for _ in frames[t]], dtype=np.int64)
     track = np.array([k for t in changed for k in frames[t]], dtype=np.int64)
     theta = np.array([theta for t in changed for theta in frames[t].values()])
-    longer = Rows.of(frame, track, theta, blur[track]).recalling(rows)
-    longer = longer.recalling(Rows.together([refitted[t] for t in changed]))
+    longer = Localizations.of(frame, track, theta, blur[track]).recalling(rows)
+    longer = longer.recalling(Localizations.together([refitted[t] for t in changed]))
     others = rows.only(~np.isin(rows.frame, changed))
-    return Rows.together([others, longer]).in_order(), added
+    return Localizations.together([others, longer]).in_order(), added
 
 
 class _Frames(dict[int, dict[int, FloatArray]]):
     """θ of every particle by frame and track, made where it is asked for."""
 
-    def __init__(self, rows: Rows, frames: int) -> None:
+    def __init__(self, rows: Localizations, frames: int) -> None:
         super().__init__()
         self._rows, self._starts = rows, rows.starts(frames)
 
@@ -127,7 +132,7 @@ def _starts(
     typical: FloatArray,
     blur: np.ndarray,
     meeting_nm: float,
-) -> Rows:
+) -> Localizations:
     """Give the rows of the frames in question, those that meet at their predictions."""
     frame, track, theta = [], [], []
     for t, new in proposed.items():
@@ -145,4 +150,4 @@ def _starts(
             track.append(k)
             theta.append(value)
     tracks = np.array(track, dtype=np.int64)
-    return Rows.of(np.array(frame, dtype=np.int64), tracks, np.array(theta), blur[tracks])
+    return Localizations.of(np.array(frame, dtype=np.int64), tracks, np.array(theta), blur[tracks])

@@ -32,7 +32,7 @@ from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.ranges import checked, fitted_frames
 from iscat_analysis.fitting.regions import contrast_image
-from iscat_analysis.fitting.results import Compared, Followed, Found, lines_of, view_of
+from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.forward import PixelGrid
@@ -63,7 +63,7 @@ _PATTERN = 6  # places in a frame that are taken for the light's unevenness,
 _NEARLY_ALL = 0.8  # where so many of them are no particles
 
 
-def find_moving(ready: Prepared, run: Run) -> Found:
+def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     """Track particles over backgrounds that are learnt with them."""
     config, camera = ready.config, ready.camera
     additive = config.optics.scheme == "darkfield"
@@ -123,7 +123,7 @@ def find_moving(ready: Prepared, run: Run) -> Found:
     if not len(joined.fits) and not interrupted:
         run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
     run.clock.lap("track")
-    found = Found(
+    found = DetectionResult(
         scene=replace(scene, mode="track", config=config),
         fits=joined.fits,
         views=joined.views,
@@ -252,7 +252,7 @@ def track_frames(
     progress: Progress,
     doubt: str = "",
     tell: Callable[[str], None],
-) -> Found:
+) -> DetectionResult:
     """Fit each frame after the background, starting from the frame before, and link."""
     first, last = windows.frames_after
     lines: list[dict[str, Any]] = []
@@ -294,7 +294,7 @@ def track_frames(
     for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
         if number not in seen:
             seen[number] = replace(view, event=number)
-    return Found(
+    return DetectionResult(
         scene=scene,
         fits=fits,
         views=tuple(seen[number] for number in sorted(seen)),

@@ -8,10 +8,7 @@ is not theirs alone yet: the sign of the contrast is the model's.
 
 from __future__ import annotations
 
-import gc
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -39,7 +36,7 @@ _FIELDS = 32  # of frames and templates that are filtered at a time
 
 
 @dataclass(frozen=True)
-class Sightings:
+class FrameCandidates:
     """Candidates in frames, in the order of the frames."""
 
     frame: IntArray
@@ -90,7 +87,7 @@ class FrameFilter:
         power: FloatArray,
         first: int,
         known: list[FloatArray],
-    ) -> Sightings:
+    ) -> FrameCandidates:
         """Find candidates in a block of frames.
 
         Shapes: `residual_e` (n, y, x), `power` (n,), `known` (k, 3).
@@ -121,7 +118,7 @@ class FrameFilter:
             z = self._templates.z_nm[self._layers[layer]]
             parts.append(np.stack([first + frames, x, y, z, strength, heights]))
         frames, *others = np.concatenate(parts, axis=1)
-        return Sightings(frames.astype(np.int64), *others)
+        return FrameCandidates(frames.astype(np.int64), *others)
 
     def _alone(
         self,
@@ -216,22 +213,19 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
     starts = np.searchsorted(frame, np.arange(frame[0], frame[-1] + 2)).astype(np.int64)
     taken, waiting, doubtful = np.zeros(n, dtype=bool), track.copy(), track.copy()
     state, t = np.zeros(4, dtype=np.int64), 0
-    with _uncollected():
-        while True:
-            t = link_surely(
-                places, starts, t, reach_nm, memory, track, taken, waiting, state, doubtful
-            )
-            if t == starts.size - 1:
-                break
-            _, number, some, others = state.tolist()
-            old, new = doubtful[:some], doubtful[some : some + others]
-            before = _chosen(places[old], places[new], reach_nm)
-            begun = before < 0
-            track[new[begun]] = number + np.arange(np.count_nonzero(begun))
-            last = old[before[~begun]]
-            track[new[~begun]], taken[last] = track[last], True
-            state[1] += np.count_nonzero(begun)
-            t += 1
+    while True:
+        t = link_surely(places, starts, t, reach_nm, memory, track, taken, waiting, state, doubtful)
+        if t == starts.size - 1:
+            break
+        _, number, some, others = state.tolist()
+        old, new = doubtful[:some], doubtful[some : some + others]
+        before = _chosen(places[old], places[new], reach_nm)
+        begun = before < 0
+        track[new[begun]] = number + np.arange(np.count_nonzero(begun))
+        last = old[before[~begun]]
+        track[new[~begun]], taken[last] = track[last], True
+        state[1] += np.count_nonzero(begun)
+        t += 1
     _, first, numbers = np.unique(track, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[numbers]
 
@@ -265,18 +259,6 @@ def load_linker() -> Any:
     if compiled is not None:
         compiled.enable_caching()
     return trackpy
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Look for no garbage among many small objects, all of which are needed until the end."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:

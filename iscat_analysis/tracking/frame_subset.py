@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.fitting.results import Compared, Found
+from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.kept import KeptFrames
+from iscat_analysis.movie.selected_frames import SelectedFrames
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata, Windows
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed
@@ -30,7 +30,7 @@ _NAMED = 4
 IntArray = NDArray[np.int64]
 
 
-class _Frames(KeptFrames[Stack]):
+class _Frames(SelectedFrames[Stack]):
     """Attributes as those of `iscat_analysis.camera.lines.SteadyFrames`."""
 
     notes: ClassVar[tuple[str, ...]] = ()
@@ -54,7 +54,7 @@ class Kept:
     numbers: IntArray | None = None
     message: str = ""
 
-    def put_back(self, found: Found) -> Found:
+    def put_back(self, found: DetectionResult) -> DetectionResult:
         """Give frames the numbers that they have in the movie."""
         if self.numbers is None or found.followed is None:
             return found

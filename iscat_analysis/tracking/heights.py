@@ -14,7 +14,7 @@ import numpy as np
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.linking import typical
 
 _BLOCK = 64  # frames at a time
@@ -23,12 +23,12 @@ _LEAST_STEP = 0.05  # fringes: no particle is taken to move less between two fra
 
 def decide_heights(
     field: MovingField,
-    ground: Ground,
-    rows: Rows,
+    ground: BackgroundEstimate,
+    rows: Localizations,
     *,
     fringe_nm: float,
     z_range_nm: tuple[float, float],
-) -> Rows:
+) -> Localizations:
     """Put every row into the fringe that its track says."""
     if not len(rows.frame):
         return rows
@@ -64,8 +64,8 @@ def decide_heights(
 
 def _ladder(
     field: MovingField,
-    ground: Ground,
-    rows: Rows,
+    ground: BackgroundEstimate,
+    rows: Localizations,
     climbs: BoolArray,
     fringe_nm: float,
     z_range_nm: tuple[float, float],
@@ -102,7 +102,7 @@ def _ladder(
     return np.stack(thetas, axis=1), np.stack(gains, axis=1)
 
 
-def _values(field: MovingField, ground: Ground, rows: Rows) -> FloatArray:
+def _values(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> FloatArray:
     """Log-likelihood of the whole frame of each row, but for a constant of the frame.
 
     Squares around fits in two fringes do not hold the same pixels, and one more column of rings

@@ -31,7 +31,7 @@ import scipy
 from numpy.typing import NDArray
 
 from iscat_analysis.records import FloatArray
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import mean_square
 
 LEAST_GAIN = 8.0
@@ -50,7 +50,7 @@ _MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
 IntArray = NDArray[np.int64]
 
 
-def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
+def identified(rows: Localizations, *, near_nm: float, error: float) -> Localizations:
     """Exchange what comes after meetings between tracks where that is far more likely."""
     track = rows.track.copy()
     typical = _Typical.of(rows, near_nm, error)
@@ -65,7 +65,7 @@ def identified(rows: Rows, *, near_nm: float, error: float) -> Rows:
             _follow(rows, track, path, met)
     kept = track >= 0
     group = _groups(rows, track)
-    return Rows.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
+    return Localizations.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class _Typical:
     error: float
 
     @classmethod
-    def of(cls, rows: Rows, near_nm: float, error: float) -> _Typical:
+    def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
         """Gather it from all rows."""
         order = np.lexsort((rows.frame, rows.track))
         next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
@@ -100,7 +100,7 @@ class _Typical:
         least = (1e-3 * near_nm) ** 2  # of what does not move at all
         return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
 
-    def part(self, rows: Rows, mine: IntArray) -> _Part | None:
+    def part(self, rows: Localizations, mine: IntArray) -> _Part | None:
         """Gather what some of the rows say; None if there are none."""
         if not mine.size:
             return None
@@ -169,7 +169,12 @@ class _Side:
 
 
 def _side(
-    rows: Rows, track: IntArray, one: int, met: _Meeting, later: IntArray, typical: _Typical
+    rows: Localizations,
+    track: IntArray,
+    one: int,
+    met: _Meeting,
+    later: IntArray,
+    typical: _Typical,
 ) -> _Side:
     """Gather what a track does; `later` are the rows of the meetings to come."""
     mine = np.flatnonzero(track == one)
@@ -206,7 +211,7 @@ def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
         yield path
 
 
-def _follow(rows: Rows, track: IntArray, path: list[_Side], met: _Meeting) -> None:
+def _follow(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
     """Let each of a path go on as the next one did, all from one frame on."""
     numbers = [side.track for side in path]
     mine = [np.flatnonzero(track == k) for k in numbers]
@@ -238,7 +243,7 @@ class _Pair(NamedTuple):
     rows: IntArray
 
 
-def _meetings(rows: Rows, near_nm: float) -> list[_Meeting]:
+def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
     """Give the meetings in order."""
     pairs = sorted(_pairs(rows, near_nm))
     number = np.arange(len(pairs))
@@ -252,7 +257,7 @@ def _meetings(rows: Rows, near_nm: float) -> list[_Meeting]:
     return sorted(out, key=lambda met: int(met.rows[0]))
 
 
-def _of_one(rows: Rows, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
+def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
     """Give those that are of one meeting: a track is in both, at once or soon after one another.
 
     What ends beside another meets it until, beside that, something begins.
@@ -284,7 +289,7 @@ def _of_one(rows: Rows, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
             reach, held = max(reach, last), k
 
 
-def _pairs(rows: Rows, near_nm: float) -> Iterator[_Pair]:
+def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
     """Give the meetings of every pair of tracks."""
     one, two = rows.pairs_within(near_nm).T
     swapped = rows.track[one] > rows.track[two]
@@ -300,7 +305,7 @@ def _pairs(rows: Rows, near_nm: float) -> Iterator[_Pair]:
             yield _Pair(first, last, of, np.stack([one[together], two[together]], axis=1))
 
 
-def _groups(rows: Rows, track: IntArray) -> IntArray:
+def _groups(rows: Localizations, track: IntArray) -> IntArray:
     """Give every row the blur that most rows of its track have."""
     group = rows.group.copy()
     for k in np.unique(track[track != rows.track]):

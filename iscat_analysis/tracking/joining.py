@@ -23,7 +23,7 @@ from iscat_analysis.fitting.results import Followed
 from iscat_analysis.records import EventView, FloatArray, Windows
 from iscat_analysis.tracking.block_store import Block
 from iscat_analysis.tracking.frame_search import link
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import OUTLYING, bridge, numbered, typical, with_mass
 from iscat_analysis.tracking.moving_table import table_of_tracks
 
@@ -106,7 +106,7 @@ def _met(config: Config, one: Block, two: Block) -> list[tuple[int, int]]:
     return pairs
 
 
-def _ends(rows: Rows, which: int) -> Rows:
+def _ends(rows: Localizations, which: int) -> Localizations:
     """First (0) or last (−1) row of every track, with the median mass of the track."""
     order = np.lexsort((rows.frame, rows.track))
     edges = np.flatnonzero(np.diff(rows.track[order], prepend=-1, append=-1))
@@ -114,7 +114,7 @@ def _ends(rows: Rows, which: int) -> Rows:
     return typical(rows).only(chosen)
 
 
-def _both(one: Rows, two: Rows) -> Rows:
+def _both(one: Localizations, two: Localizations) -> Localizations:
     """Join rows, the ones before the others."""
     return one.joined(two.frame, two.track, two.theta, two.group)
 

@@ -16,7 +16,7 @@ from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.extension import LEAST_SHARE
 from iscat_analysis.tracking.frame_search import gaps, link
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Judged, Rows
+from iscat_analysis.tracking.joint.localizations import Judged, Localizations
 
 OUTLYING = 5.0
 """Standard deviations from its track's mass beyond which a row is not of that particle alone."""
@@ -35,12 +35,12 @@ IntArray = NDArray[np.int64]
 
 def linked(
     config: Config,
-    rows: Rows,
+    rows: Localizations,
     places: FloatArray,
     *,
     bridged: bool = False,
     inner: tuple[int, int] | None = None,
-) -> Rows:
+) -> Localizations:
     """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place.
 
     Shapes: `places` (n, axes).
@@ -65,7 +65,7 @@ def linked(
     return numbered(rows.joined(missed, rows.track[before], between, rows.group[before]))
 
 
-def _least(config: Config, rows: Rows, inner: tuple[int, int] | None) -> IntArray:
+def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -> IntArray:
     """Frames that each track must have: one that may go on elsewhere, no more than it has here."""
     counts = np.bincount(rows.track, minlength=1)
     least = np.full(counts.size, config.track.min_frames)
@@ -76,7 +76,7 @@ def _least(config: Config, rows: Rows, inner: tuple[int, int] | None) -> IntArra
     return least
 
 
-def mass_places(config: Config, rows: Rows) -> FloatArray:
+def mass_places(config: Config, rows: Localizations) -> FloatArray:
     """Places by which rows are linked: x, y, and the mass as a length.
 
     A step of the mass by its own error counts as much as one of `_STEP` of the farthest that a
@@ -89,7 +89,7 @@ def mass_places(config: Config, rows: Rows) -> FloatArray:
     return with_mass(config, rows, typical_error(rows.fisher))
 
 
-def with_mass(config: Config, rows: Rows, error: float) -> FloatArray:
+def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
     """Add the mass to the places, as a length.
 
     Shapes: result (n, 3).
@@ -98,7 +98,7 @@ def with_mass(config: Config, rows: Rows, error: float) -> FloatArray:
     return np.column_stack([rows.theta[:, :2], rows.theta[:, 3] * length])
 
 
-def mass_error(config: Config, rows: Rows, error: float) -> float:
+def mass_error(config: Config, rows: Localizations, error: float) -> float:
     """Say by how much the amplitude of one particle may change from frame to frame."""
     if config.track.free == "joint" and len(rows.frame):
         return max(error, _UNSURE * float(np.median(rows.theta[:, 3])))
@@ -113,7 +113,7 @@ def typical_error(fisher: FloatArray) -> float:
     return 1 / math.sqrt(max(float(np.nanmedian(fisher[:, 3, 3])), 1e-300))
 
 
-def typical(rows: Rows) -> Rows:
+def typical(rows: Localizations) -> Localizations:
     """Give every row the median amplitude of its track."""
     theta = rows.theta.copy()
     for k in np.unique(rows.track):
@@ -124,10 +124,10 @@ def typical(rows: Rows) -> Rows:
 
 def alone(
     scene: Scene,
-    rows: Rows,
+    rows: Localizations,
     *,
     inner: tuple[int, int] | None = None,
-) -> Rows:
+) -> Localizations:
     """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
     config = scene.config
     if not len(rows.frame):
@@ -139,7 +139,7 @@ def alone(
     return numbered(rows.only(kept[rows.track]))
 
 
-def seen(scene: Scene, rows: Rows) -> BoolArray:
+def seen(scene: Scene, rows: Localizations) -> BoolArray:
     """Tell which tracks are seen in most of the frames in which they are fitted.
 
     Shapes: result (tracks,).
@@ -152,7 +152,7 @@ def seen(scene: Scene, rows: Rows) -> BoolArray:
     return np.asarray(2 * sights > fits)
 
 
-def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
+def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Localizations, int]:
     """Let slow particles stay where they were before and after they were seen, to be tried."""
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
@@ -175,7 +175,7 @@ def held(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, int]:
     return rows.joined(frames, tracks, np.array(theta), groups), len(frame)
 
 
-def trimmed(rows: Rows) -> Rows:
+def trimmed(rows: Localizations) -> Localizations:
     """Cut tracks where they begin and end with frames that hold too little of their mass."""
     kept = np.ones(len(rows.frame), dtype=bool)
     for k in np.unique(rows.track):
@@ -187,7 +187,7 @@ def trimmed(rows: Rows) -> Rows:
     return rows.only(kept)
 
 
-def shares_mass(rows: Rows, judged: Judged) -> BoolArray:
+def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
     """Tell which rows differ so much from their track's mass that they hold part of another's.
 
     Shapes: result (n,).
@@ -210,7 +210,7 @@ def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
     return out
 
 
-def crowded(rows: Rows, limit_nm: float) -> BoolArray:
+def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
     """Tell which rows have another particle of their frame nearer than a limit.
 
     Shapes: result (n,).
@@ -220,7 +220,7 @@ def crowded(rows: Rows, limit_nm: float) -> BoolArray:
     return out
 
 
-def meeting(rows: Rows, limit_nm: float) -> BoolArray:
+def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
     """Tell which rows are of particles that meet: crowded, or shortly before or after that.
 
     While two are so near that one fit takes the light of both, the other has no row beside it.
@@ -239,7 +239,7 @@ def meeting(rows: Rows, limit_nm: float) -> BoolArray:
     return np.asarray(gap <= _MEETING)
 
 
-def bridge(config: Config, rows: Rows) -> IntArray:
+def bridge(config: Config, rows: Localizations) -> IntArray:
     """Join tracks of a particle that hardly moved while it was not seen.
 
     What moves slowly hides in the first background, which is that of most of the frames; it is seen
@@ -265,7 +265,7 @@ def bridge(config: Config, rows: Rows) -> IntArray:
     return track
 
 
-def _step_nm2(rows: Rows, mine: IntArray) -> float:
+def _step_nm2(rows: Localizations, mine: IntArray) -> float:
     """Return the mean square of a track's steps from frame to frame, from its median."""
     next_ = np.diff(rows.frame[mine]) == 1
     steps = np.diff(rows.theta[mine, :2], axis=0)[next_]
@@ -280,7 +280,7 @@ def mean_square(steps: FloatArray) -> float:
     return float(np.median((steps**2).sum(axis=1)) / np.log(2))
 
 
-def numbered(rows: Rows) -> Rows:
+def numbered(rows: Localizations) -> Localizations:
     """Give tracks numbers by their first frame and place."""
     _, first = np.unique(rows.track, return_index=True)
     numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)

@@ -23,7 +23,7 @@ from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.species.diffusion import estimate_diffusion
 from iscat_analysis.threads import beside
 from iscat_analysis.tracking.extension import extended
-from iscat_analysis.tracking.frame_search import Sightings, load_linker
+from iscat_analysis.tracking.frame_search import FrameCandidates, load_linker
 from iscat_analysis.tracking.heights import decide_heights
 from iscat_analysis.tracking.identity import identified
 from iscat_analysis.tracking.joint.common import (
@@ -34,7 +34,7 @@ from iscat_analysis.tracking.joint.common import (
 )
 from iscat_analysis.tracking.joint.joint_fit import MOST_TURNS, settle
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.linking import (
     AS_FOUND,
     alone,
@@ -58,7 +58,7 @@ from iscat_analysis.tracking.moving_field import (
     opening_ground,
     search_frames,
 )
-from iscat_analysis.tracking.outlier_positions import brought_back
+from iscat_analysis.tracking.outlier_positions import without_outliers
 
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
@@ -85,8 +85,8 @@ IntArray = NDArray[np.int64]
 class Moving:
     """What was found in a movie."""
 
-    rows: Rows
-    ground: Ground
+    rows: Localizations
+    ground: BackgroundEstimate
     judged: Judged
     converged: BoolArray
     close: BoolArray
@@ -121,7 +121,7 @@ def follow(
     follow_level = config.background.method == "tracks"
     ground = opening_ground(config, field)
     nothing = np.zeros(0, dtype=np.int64)
-    rows = Rows.of(nothing, nothing, np.zeros((0, 5)))
+    rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
     total = ROUNDS + 3
     for number in range(ROUNDS):
         progress("track", number, total)
@@ -189,7 +189,7 @@ def follow(
         if scene.mode == "joint":
             rows = _in_their_fringes(scene, field, ground, rows)
         rows, ground, done = settle(
-            field, ground, brought_back(rows), follow_power=follow_power,
+            field, ground, without_outliers(rows), follow_power=follow_power,
             follow_level=follow_level, turns=MOST_TURNS if stage else 1, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
@@ -217,7 +217,7 @@ def follow(
     return Moving(rows, ground, judged, done, close, variances, diffusion, field, shared, common)
 
 
-def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:
+def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> None:
     """Refuse a frame with more rows than particles that could be told apart."""
     side_um = field.pixel_nm / 1e3
     area = side_um**2 * float(field.used.sum())
@@ -232,7 +232,9 @@ def _refuse_flood(config: Config, field: MovingField, rows: Rows) -> None:
         )
 
 
-def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Rows) -> Rows:
+def _in_their_fringes(
+    scene: Scene, field: MovingField, ground: BackgroundEstimate, rows: Localizations
+) -> Localizations:
     """Put every row into the fringe that its track says."""
     return decide_heights(
         field, ground, rows,
@@ -240,7 +242,7 @@ def _in_their_fringes(scene: Scene, field: MovingField, ground: Ground, rows: Ro
     )  # fmt: skip
 
 
-def _told_apart(config: Config, rows: Rows) -> Rows:
+def _told_apart(config: Config, rows: Localizations) -> Localizations:
     """Give particles that met their own numbers again."""
     if not len(rows.frame):
         return rows
@@ -250,7 +252,7 @@ def _told_apart(config: Config, rows: Rows) -> Rows:
     return numbered(told)
 
 
-def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
+def _joined(scene: Scene, rows: Localizations, found: FrameCandidates) -> Localizations:
     """Add candidates to the rows."""
     n = len(found.frame)
     pixel = scene.pixel_nm
@@ -262,7 +264,9 @@ def _joined(scene: Scene, rows: Rows, found: Sightings) -> Rows:
     return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
 
 
-def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> Rows:
+def _credible(
+    scene: Scene, field: MovingField, rows: Localizations, done: BoolArray
+) -> Localizations:
     """Keep the rows that a particle explains, each particle once."""
     # of light that is no picture a fit may be lost
     known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
@@ -280,14 +284,16 @@ def _credible(scene: Scene, field: MovingField, rows: Rows, done: BoolArray) -> 
     return rows.only(kept)
 
 
-def _moved(config: Config, field: MovingField, rows: Rows) -> tuple[Rows, FloatArray, FloatArray]:
+def _moved(
+    config: Config, field: MovingField, rows: Localizations
+) -> tuple[Localizations, FloatArray, FloatArray]:
     """Give tracks their blurs, with the variances that these number and the D they are made of."""
     diffusion = diffusion_of(config, field.free, rows)
     _, exposure = exposure_of(config)
     return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
-def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
+def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatArray:
     """Fit D to the places of every track, where it is alone.
 
     Places in a meeting are off by more than their errors say, and would count as steps.
@@ -315,7 +321,9 @@ def diffusion_of(config: Config, free: BoolArray, rows: Rows) -> FloatArray:
     return out
 
 
-def blurred_rows(rows: Rows, diffusion: FloatArray, exposure_s: float) -> tuple[Rows, FloatArray]:
+def blurred_rows(
+    rows: Localizations, diffusion: FloatArray, exposure_s: float
+) -> tuple[Localizations, FloatArray]:
     """Give the blurs of tracks numbers, those that hardly differ the same.
 
     Shapes: `diffusion` (tracks, 1 or more), `variances_nm2` (groups,).

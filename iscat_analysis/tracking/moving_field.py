@@ -19,11 +19,11 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
-from iscat_analysis.tracking.frame_search import FrameFilter, Sightings
+from iscat_analysis.tracking.frame_search import FrameCandidates, FrameFilter
 from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import first_ground
+from iscat_analysis.tracking.joint.joint_fit import first_background
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.units import count
 
 LEAST_FRAMES = 20
@@ -58,9 +58,9 @@ def track_scene(
     return make_scene(tracked, field_px, searches=frames, lines=lines)
 
 
-def opening_ground(config: Config, field: MovingField) -> Ground:
+def opening_ground(config: Config, field: MovingField) -> BackgroundEstimate:
     """Give the background before there are tracks; of all frames together, it remains so."""
-    ground = first_ground(field, follow_power=config.background.power_normalization)
+    ground = first_background(field, follow_power=config.background.power_normalization)
     if config.background.method == "fixed":
         ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
     return ground
@@ -122,8 +122,8 @@ def give_back(
     movie: CountSource,
     camera: Camera,
     first: int,
-    ground: Ground,
-    rows: Rows,
+    ground: BackgroundEstimate,
+    rows: Localizations,
 ) -> None:
     """Give frames back what of particles was divided out with the light.
 
@@ -175,14 +175,14 @@ def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -
 def search_frames(
     scene: Scene,
     field: MovingField,
-    ground: Ground,
-    rows: Rows,
+    ground: BackgroundEstimate,
+    rows: Localizations,
     pool: ThreadPoolExecutor,
     frames: tuple[int, int] | None = None,
     *,
     enough: int = 0,
     cautious: bool = False,
-) -> Sightings:
+) -> FrameCandidates:
     """Find candidates in what the rows leave over."""
     side = scene.roi_px
     if scene.mode == "joint":
@@ -197,7 +197,7 @@ def search_frames(
     pixel = field.pixel_nm
     places = np.column_stack([rows.theta[:, :2] / pixel, rows.snr])
 
-    def block(first: int) -> Sightings:
+    def block(first: int) -> FrameCandidates:
         last = min(first + _BLOCK, end)
         known = [places[starts[t] : starts[t + 1]] for t in range(first, last)]
         return search.find(
@@ -212,7 +212,7 @@ def search_frames(
         others = [first for first in blocks if first not in parts]
         parts |= zip(others, pool.map(block, others), strict=True)
     found = [parts[first] for first in sorted(parts)]
-    return Sightings(
+    return FrameCandidates(
         *(np.concatenate([getattr(part, name) for part in found])
           for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))
     )  # fmt: skip

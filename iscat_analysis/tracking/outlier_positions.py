@@ -12,14 +12,14 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import median_filter
 
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import mean_square
 
 _AROUND = 5  # rows of a track, to whose median each is compared
 _LEAP = 5.0  # root mean squares of the distance from there; further are 1 in 10¹¹ of normal ones
 
 
-def brought_back(rows: Rows) -> Rows:
+def without_outliers(rows: Localizations) -> Localizations:
     """Put rows that leap aside among those before and after them."""
     theta = rows.theta.copy()
     for k in np.unique(rows.track):

@@ -16,7 +16,7 @@ from iscat_analysis.camera.background import add_frames, start_power
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.regions import Region, region_likelihood
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
@@ -79,13 +79,13 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
             f"{1e3 / rate:.4g} ms from frame to frame: if it is in seconds, write "
             f"{1e3 * exposure:g}, since motion during the exposure blurs pictures and changes D"
         )
-    if way_of(config) == "tracks" and frames < config.track.min_frames:
+    if background_mode(config) == "tracks" and frames < config.track.min_frames:
         raise ConfigError(
             f"track.min_frames = {config.track.min_frames} is more than the {frames} frames of "
             f"{name} that are tracked, so that no track is long enough: lower it"
         )
     # A movie without any is refused, as is one of few frames whose background is learnt.
-    if 0 < frames < SHORT_MOVIE and way_of(config) != "tracks":
+    if 0 < frames < SHORT_MOVIE and background_mode(config) != "tracks":
         best = 100 / np.sqrt(max(frames - 1, 1))
         text = f"{name}: {frames} frames tell no diffusion coefficient better than to {best:.0f} %"
         if frames < config.track.min_frames:
@@ -150,7 +150,7 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
         index=None if absorbs else float(np.sqrt(matter.permittivity.real)),
         density_kg_m3=matter.density_kg_m3,
         n_medium=config.optics.n_sample,
-        hidden_nm=resolution_nm if way_of(config) == "tracks" else 0.0,
+        hidden_nm=resolution_nm if background_mode(config) == "tracks" else 0.0,
     )
 
 
@@ -164,7 +164,9 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     """
     config = scene.config
     before = fits["n_before"].median() if len(fits) else 0
-    known = config.background.method == "known" or scene.additive or way_of(config) == "tracks"
+    known = (
+        config.background.method == "known" or scene.additive or background_mode(config) == "tracks"
+    )
     if known or not before > 0:
         return None
     share = scene.background_variance / (scene.background_variance + before)
@@ -278,7 +280,7 @@ def make_films(
 def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
     """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
-    if way_of(scene.config) != "tracks":
+    if background_mode(scene.config) != "tracks":
         known[:] = 0.0
     _, exposure_s = exposure_of(scene.config)
     upwards = scene.config.track.free == "joint"
@@ -366,7 +368,7 @@ def _single(
     single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
     if not scene.config.background.power_normalization:
         return single
-    if way_of(scene.config) != "tracks":
+    if background_mode(scene.config) != "tracks":
         return start_power(single)
     before, after = np.split(here.power, [here.n_before])
     return replace(single, power_ratio=float(after[frame - here.frames_after[0]] / before.sum()))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.inference.achieved import Achieved, pooled
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
 from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status
 from iscat_analysis.search.empty import EmptySpread
 
@@ -21,7 +21,7 @@ _SHARE = 0.3  # of an excess that is worth naming
 
 def measure_spread(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray], empty: EmptySpread | None
-) -> dict[str, Achieved]:
+) -> dict[str, EmpiricalSpread]:
     """Pool the repeats of all events that are ok or whose only fault is a poor fit."""
     kept = [
         repeat
@@ -31,7 +31,7 @@ def measure_spread(
     if not kept:
         return {}
     own = np.stack(kept)
-    found: dict[str, Achieved] = {}
+    found: dict[str, EmpiricalSpread] = {}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
         if empty is None:
             one = pooled(own[:, :, [k, -1]], None, None)
@@ -58,13 +58,13 @@ def repeat_columns(
     return columns
 
 
-def measured_scale(found: Mapping[str, Achieved]) -> dict[str, float]:
+def measured_scale(found: Mapping[str, EmpiricalSpread]) -> dict[str, float]:
     """Give what σ is multiplied by with ``fit.sigma = "measured"``: the spread over the bound."""
     return {f"sigma_{name}": max(a.over_crb, 1.0) for name, a in found.items()}
 
 
 def spread_verdict(
-    found: Mapping[str, Achieved],
+    found: Mapping[str, EmpiricalSpread],
     noise: Mapping[str, Any],
     *,
     scaled: bool,
@@ -99,7 +99,7 @@ def spread_verdict(
 
 
 def likely_noise(
-    found: Achieved,
+    found: EmpiricalSpread,
     noise: Mapping[str, Any],
     *,
     rejected: bool = False,
@@ -144,7 +144,7 @@ def likely_noise(
     return doubt + ("; ".join(said) or "its kind is not clear")
 
 
-def _slow(found: Achieved, sliding: bool) -> str:
+def _slow(found: EmpiricalSpread, sliding: bool) -> str:
     name = "a drift of the fixed pattern (speckle)" if found.drifts else "flicker (1/f noise)"
     if found.single:
         return (
@@ -161,7 +161,7 @@ def _slow(found: Achieved, sliding: bool) -> str:
     return f"it grows with the frames that are averaged, as {name}{remedy}"
 
 
-def _ratios(found: Mapping[str, Achieved]) -> str:
+def _ratios(found: Mapping[str, EmpiricalSpread]) -> str:
     names = {"x_nm": "x", "y_nm": "y", "z_nm": "z", "mass_kda": "mass"}
     parts = [
         f"{a.over_crb:.2f} ({a.ci95[0]:.2f} to {a.ci95[1]:.2f}) in {names[name]}"

@@ -17,7 +17,7 @@ from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.likelihood import LEVEL
-from iscat_analysis.inference.repeats import LENGTHS
+from iscat_analysis.inference.split_frames import LENGTHS
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
     FREE_PARAMETERS,

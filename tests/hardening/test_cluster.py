@@ -22,7 +22,7 @@ from cluster_worker import busy
 from distributed import Client
 
 import iscat_analysis as ia
-from iscat_analysis import places
+from iscat_analysis import executors as places
 from iscat_analysis.errors import SchedulerError
 from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.pipeline import fit_stack

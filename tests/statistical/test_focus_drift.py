@@ -15,7 +15,7 @@ from instruments import Instrument, InstrumentMovie, draw_landings
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
@@ -51,12 +51,12 @@ def _learned(movie: InstrumentMovie, config: Config) -> tuple[Config, list[str]]
     return learned, said
 
 
-def _analysed(movie: InstrumentMovie, config: Config) -> Found:
+def _analysed(movie: InstrumentMovie, config: Config) -> DetectionResult:
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
     return analyse_landings(movie, config, camera, tell=lambda _: None, progress=lambda *_: None)
 
 
-def _poor(found: Found) -> int:
+def _poor(found: DetectionResult) -> int:
     heavy = found.fits["mass_kda"].abs() > 300
     return int((heavy & (found.fits["status"] == "poor_fit")).sum())
 

@@ -14,7 +14,7 @@ from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.results import Found
+from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
@@ -49,7 +49,7 @@ def _configured(*settings: str, gain: float = 4.0) -> Config:
     )
 
 
-def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[Found, list[str]]:
+def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[DetectionResult, list[str]]:
     movie = InstrumentMovie(instrument, SHAPE, LANDINGS, seed=SEED)
     config = _configured("background.method=sliding", gain=gain)
     said: list[str] = []

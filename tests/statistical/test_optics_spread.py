@@ -9,7 +9,7 @@ from instruments import Instrument, Pictures
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.instrument.learner import Sight, build_microscope, maximise, settings_of
+from iscat_analysis.instrument.learner import ParticleImage, build_microscope, maximise, settings_of
 from iscat_analysis.instrument.learner.starts import with_masses
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray
@@ -35,7 +35,7 @@ TRUE = {
 }  # fmt: skip
 
 
-def _movie(pictures: Pictures, random: np.random.Generator) -> list[Sight]:
+def _movie(pictures: Pictures, random: np.random.Generator) -> list[ParticleImage]:
     """Draw a movie's worth of pictures, made by the quadrature, which shares nothing."""
     model = build_microscope(configuration(), 2600.0, settings_of(configuration()))
     sights = []
@@ -47,7 +47,7 @@ def _movie(pictures: Pictures, random: np.random.Generator) -> list[Sight]:
         before = random.poisson(PHOTONS, GRID.shape).astype(float)
         after = random.poisson(PHOTONS * (1 + contrast)).astype(float)
         data = conditional(model, GRID, before, after, 1.0).data
-        sights.append(Sight(GRID, CONDITIONAL, data, float(x), float(y), 5.0))
+        sights.append(ParticleImage(GRID, CONDITIONAL, data, float(x), float(y), 5.0))
     return sights
 
 

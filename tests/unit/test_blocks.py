@@ -37,7 +37,7 @@ from iscat_analysis.tracking.blocks import (
     plan_blocks,
 )
 from iscat_analysis.tracking.joining import combine_masses, join_tracks
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import unlike
 from iscat_analysis.tracking.moving import follow
 from iscat_analysis.tracking.moving_field import load_field, track_scene
@@ -206,7 +206,7 @@ def _block(span: tuple[int, int], tracks: list[tuple[range, float, float, float]
     theta = np.array([[*tracks[k][1:3], 5.0, tracks[k][3], 0.0] for k in track])
     nothing = np.zeros((4, 4))
     return Block(
-        span=span, rows=Rows.of(frame, track, theta), error=1.0, table=pd.DataFrame(),
+        span=span, rows=Localizations.of(frame, track, theta), error=1.0, table=pd.DataFrame(),
         inside=np.ones(len(frame), dtype=bool), masses=pd.DataFrame(), views=(),
         level=nothing, power=np.ones(span[1] - span[0]), total_e=nothing, used=nothing == 0,
         saturated=nothing > 0,
@@ -249,7 +249,7 @@ def test_particles_of_unlike_mass_keep_their_numbers_where_they_cross() -> None:
 
 
 def test_an_empty_block_is_passed_over() -> None:
-    nothing = Rows.of(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 5)))
+    nothing = Localizations.of(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 5)))
     one, two = (_block(s, [(range(*s), 0.0, 0.0, 40.0)]) for s in ((0, 30), (60, 90)))
     between = _block((30, 60), [(range(30, 60), 0.0, 0.0, 40.0)])
     between = Block(**{**vars(between), "rows": nothing})

@@ -18,7 +18,7 @@ from iscat_analysis.tracking.joint.common import common_amplitudes, shared_error
 from iscat_analysis.tracking.joint.exposures import Exposures
 from iscat_analysis.tracking.joint.joint_fit import settle
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.joint.track_coupling import Coupling
 
 SHAPE, FRAMES, LEVEL_E, ROI, MASS = (30, 30), 40, 4e5, 20, 400.0
@@ -41,7 +41,7 @@ def _level() -> np.ndarray:
     return LEVEL_E * (1 + 0.1 * np.random.default_rng(2).standard_normal(SHAPE))
 
 
-def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]:
+def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Localizations]:
     """Mean counts of particles on paths (tracks, frames, 2), NaN where they are not, and rows."""
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     signal = np.zeros((FRAMES, *SHAPE))
@@ -54,7 +54,7 @@ def _expected(model: ForwardModel, paths: np.ndarray) -> tuple[np.ndarray, Rows]
                 frame.append(t)
                 track.append(k)
                 theta.append([*place, model.height_nm, amplitude, 0.0])
-    rows = Rows.of(np.array(frame), np.array(track), np.array(theta))
+    rows = Localizations.of(np.array(frame), np.array(track), np.array(theta))
     return _level() * (1 + signal), rows
 
 
@@ -73,9 +73,9 @@ def test_information_lost_is_that_of_all_parameters(
     path = np.random.default_rng(4).normal(1250.0, 40.0, (1, FRAMES, 2))
     counts, rows = _expected(model, path)
     field = _field(model, counts, pool)
-    ground = Ground(counts.mean(axis=0), np.ones(FRAMES))
+    ground = BackgroundEstimate(counts.mean(axis=0), np.ones(FRAMES))
     _, ground, _ = field.fit(ground, rows, sweeps=0)
-    ground = Ground(ground.level, np.ones(FRAMES))
+    ground = BackgroundEstimate(ground.level, np.ones(FRAMES))
     judged = field.judge(ground, rows)
     one = np.array([0.0, 0.0, 1.0])
     coupling = Coupling(field, ground, judged.slopes, np.arange(FRAMES))
@@ -105,7 +105,7 @@ def test_common_mass_and_shared_errors_are_right(
     amplitude, variance, errors = [], [], []
     for _ in range(TRIALS):
         field = _field(model, rng.poisson(mean), pool)
-        start = Ground(mean.mean(axis=0), np.ones(FRAMES))
+        start = BackgroundEstimate(mean.mean(axis=0), np.ones(FRAMES))
         rows, ground, done = settle(field, start, truth, follow_power=False)
         judged = field.judge(ground, rows)
         shared = shared_errors(field, ground, rows, judged)
@@ -127,7 +127,11 @@ def test_common_mass_and_shared_errors_are_right(
 
 
 def _whole(
-    model: ForwardModel, field: MovingField, ground: Ground, rows: Rows, judged: Judged
+    model: ForwardModel,
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    judged: Judged,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give what its background adds to the rows of a track, and the covariance of all amplitudes.
 
@@ -163,7 +167,7 @@ def test_shared_errors_are_those_of_all_pixels(
     path = np.cumsum(np.random.default_rng(4).normal(0.0, step, (1, FRAMES, 2)), axis=1) + 1250.0
     path[:, frames:] = np.nan
     mean, rows = _expected(model, path)
-    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    field, ground = _field(model, mean, pool), BackgroundEstimate(_level(), np.ones(FRAMES))
     judged = field.judge(ground, rows)
     added, amplitudes = _whole(model, field, ground, rows, judged)
     index = np.array([0, 1, 3])
@@ -189,7 +193,7 @@ def test_a_particle_that_hardly_moves_is_worked_out_to_the_last_digit(
     """Its background leaves less than 1e-5 of the information on its mass, a small difference."""
     path = np.random.default_rng(4).normal(0.0, 0.05 * PIXEL_NM, (1, FRAMES, 2)) + 1250.0
     mean, rows = _expected(model, path)
-    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    field, ground = _field(model, mean, pool), BackgroundEstimate(_level(), np.ones(FRAMES))
     judged = field.judge(ground, rows)
     every = np.ones(FRAMES, dtype=bool)
     index = np.array([0, 1, 3])
@@ -214,7 +218,7 @@ def test_weights_of_a_common_mass_do_not_go_with_the_noise(pool: ThreadPoolExecu
     model = forward_model(make_config(calibrated=False, optics={"scheme": "darkfield"}), 1e4)
     path = np.cumsum(np.random.default_rng(4).normal(0.0, 60.0, (1, FRAMES, 2)), axis=1) + 1250.0
     mean, same = _expected(model, path)
-    field, ground = _field(model, mean, pool), Ground(_level(), np.ones(FRAMES))
+    field, ground = _field(model, mean, pool), BackgroundEstimate(_level(), np.ones(FRAMES))
     theta = same.theta * np.array([1.0, 1.0, 1.0, 1.1, 1.0])
     theta[::2, 3] *= 0.9 / 1.1
     noisy = replace(same, theta=theta)
@@ -244,7 +248,7 @@ def test_tracks_go_on_through_a_meeting(model: ForwardModel, pool: ThreadPoolExe
     near = np.hypot(*(paths[0] - paths[1]).T) < 400.0
     seen = ~((truth.track == 1) & near[truth.frame] & (truth.frame >= 5))
     seen &= ~((truth.track == 1) & (truth.frame > 20))
-    start = Ground(mean.mean(axis=0), np.ones(FRAMES))
+    start = BackgroundEstimate(mean.mean(axis=0), np.ones(FRAMES))
     _, ground, _ = field.fit(start, truth, sweeps=0)
     merged = truth.only(seen)
     rows, added = extended(field, ground, merged, resolution_nm=370.0, reach_nm=600.0)
@@ -264,7 +268,7 @@ def test_a_track_that_ends_is_not_made_longer(
     path[0, 25:] = np.nan
     mean, truth = _expected(model, path)
     field = _field(model, np.random.default_rng(8).poisson(mean), pool)
-    ground = Ground(mean[-1], np.ones(FRAMES))
+    ground = BackgroundEstimate(mean[-1], np.ones(FRAMES))
     _, added = extended(field, ground, truth, resolution_nm=370.0, reach_nm=600.0)
     assert added == 0
 

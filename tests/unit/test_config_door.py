@@ -24,7 +24,7 @@ from iscat_analysis.config import (
     read_optics_file,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import make_scene
 
@@ -160,7 +160,7 @@ def test_the_method_is_explicit_after_resolution(settings: list[str], method: st
     config = configure(settings=settings)
     assert config.background.method == method
     assert f'method = "{method}"' in config_to_toml(config, comments=False)
-    assert (way_of(config) == "sliding") is (method == "sliding")
+    assert (background_mode(config) == "sliding") is (method == "sliding")
 
 
 def test_the_method_follows_frames_that_are_added_or_taken_away() -> None:

@@ -18,7 +18,7 @@ from scipy.stats import multivariate_normal, norm
 
 import iscat_analysis as ia
 from iscat_analysis._kernels.diffusion import displacement_likelihoods
-from iscat_analysis._kernels.well import harmonic_likelihoods, most_likely_well
+from iscat_analysis._kernels.harmonic_trap import harmonic_likelihoods, most_likely_well
 from iscat_analysis.species import diffusion, fractional, motion
 from iscat_analysis.species.displacements import Displacements, gather
 

@@ -9,8 +9,8 @@ import pytest
 from report_factory import make_analysis
 from scenes import PIXEL_NM, make_config
 
-from iscat_analysis.inference.achieved import Achieved, pooled
-from iscat_analysis.inference.repeats import LENGTHS
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
+from iscat_analysis.inference.split_frames import LENGTHS
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse
@@ -133,10 +133,10 @@ def test_single_frames_without_empty_places_say_nothing() -> None:
 # ---- naming ------------------------------------------------------------------------------------
 
 
-def _single(fast2: float, slow2: np.ndarray) -> Achieved:
+def _single(fast2: float, slow2: np.ndarray) -> EmpiricalSpread:
     """Give what noise does whose slow part has this variance at `DISTANCES`."""
     ratio = float(np.sqrt(fast2 + slow2.mean()))
-    return Achieved(
+    return EmpiricalSpread(
         ratio, (ratio - 0.02, ratio + 0.02), 100, True, 30.0,
         DISTANCES, tuple(np.sqrt(fast2 + slow2)), (0.01,) * 3, (np.sqrt(fast2), ratio), True,
     )  # fmt: skip

@@ -8,7 +8,7 @@ from scenes import PIXEL_NM, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.tracking.frame_search import FrameFilter, Sightings
+from iscat_analysis.tracking.frame_search import FrameCandidates, FrameFilter
 from iscat_analysis.tracking.moving_field import track_scene
 
 SIDE, ROI, LEVEL_E = 96, 32, 4e5
@@ -27,7 +27,7 @@ def _config(**aberrations_nm: float) -> Config:
 
 def _found(
     config: Config, particles: list[tuple[float, float, float]], *, seen_through: Config
-) -> Sightings:
+) -> FrameCandidates:
     """Search a frame with particles (x, y [pixels], mass), made through some optics."""
     scene = track_scene(config, (SIDE, SIDE), 1000)
     picture = track_scene(seen_through, (SIDE, SIDE), 1000).wide

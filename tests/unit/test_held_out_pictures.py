@@ -12,19 +12,19 @@ import pytest
 from iscat_analysis._kernels.scoring import POISSON
 from iscat_analysis.instrument.learner.estimate import Estimate
 from iscat_analysis.instrument.learner.measure import _Search
-from iscat_analysis.instrument.learner.particle_images import Settings, Sight
+from iscat_analysis.instrument.learner.particle_images import ParticleImage, Settings
 from iscat_analysis.optics.grid import PixelGrid
 
 HEIGHTS_NM = (0.0, 1000.0)
 
 
-def _sights(count: int, mass_kda: float) -> tuple[Sight, ...]:
+def _sights(count: int, mass_kda: float) -> tuple[ParticleImage, ...]:
     grid = PixelGrid.centred(5, 84.0)
-    one = Sight(grid, POISSON, np.ones((4, 5, 5)), 0.0, 0.0, 100.0, heights_nm=HEIGHTS_NM)
+    one = ParticleImage(grid, POISSON, np.ones((4, 5, 5)), 0.0, 0.0, 100.0, heights_nm=HEIGHTS_NM)
     return tuple(replace(one, mass_kda=mass_kda, z_nm=100.0 + 50 * k) for k in range(count))
 
 
-def _estimate(sights: Sequence[Sight], values: Settings) -> Estimate:
+def _estimate(sights: Sequence[ParticleImage], values: Settings) -> Estimate:
     return Estimate(
         ("reference_phase_deg",), values, tuple(sights), np.eye(1), np.eye(1), 0.0, True, 1
     )
@@ -34,7 +34,11 @@ class _Moving(_Search):
     """Every fit of optics moves all heights by a fringe."""
 
     def _fit(
-        self, sights: Sequence[Sight], start: Settings, names: Sequence[str], passes: int = 40
+        self,
+        sights: Sequence[ParticleImage],
+        start: Settings,
+        names: Sequence[str],
+        passes: int = 40,
     ) -> Estimate:
         del passes
         moved = [s.raised(200.0) for s in sights] if names else sights

@@ -7,7 +7,7 @@ import pytest
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.tracking.identity import identified
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 from iscat_analysis.tracking.linking import bridge, meeting
 
 FRAMES, MEET, AROUND = 200, 100, 25
@@ -27,20 +27,20 @@ def _pair(rng: np.random.Generator, steps_nm: tuple[float, float], mass: tuple[f
         )
     frame = np.tile(np.arange(FRAMES), 2)
     track = np.repeat([0, 1], FRAMES)
-    return Rows.of(frame, track, np.concatenate(tables), track)
+    return Localizations.of(frame, track, np.concatenate(tables), track)
 
 
-def _exchanged(rows: Rows, after: int) -> Rows:
+def _exchanged(rows: Localizations, after: int) -> Localizations:
     track = np.where(rows.frame > after, 1 - rows.track, rows.track)
-    return Rows.of(rows.frame, track, rows.theta, rows.group)
+    return Localizations.of(rows.frame, track, rows.theta, rows.group)
 
 
-def _same(one: Rows, two: Rows) -> bool:
+def _same(one: Localizations, two: Localizations) -> bool:
     """Whether all places are in the same tracks, by which the rows of a frame are in order."""
     return np.array_equal(one.track, two.track) and np.array_equal(one.theta, two.theta)
 
 
-def _outside(rows: Rows) -> dict[tuple[int, int], tuple[float, ...]]:
+def _outside(rows: Localizations) -> dict[tuple[int, int], tuple[float, ...]]:
     """Who is where, but for the frames around a meeting, in which it cannot be told."""
     rows = rows.only(np.abs(rows.frame % FRAMES - MEET) > AROUND)
     pairs = zip(rows.frame.tolist(), rows.track.tolist(), strict=True)
@@ -79,7 +79,7 @@ def test_what_ends_beside_another_goes_on_where_that_parts(
     if crossed:
         track = np.where(later, np.where(rest.track == 0, 1, 2), rest.track)
     found = identified(
-        Rows.of(rest.frame, track, rest.theta, rest.group), near_nm=NEAR_NM, error=ERROR
+        Localizations.of(rest.frame, track, rest.theta, rest.group), near_nm=NEAR_NM, error=ERROR
     )
     assert _outside(found) == _outside(true)
 
@@ -88,7 +88,7 @@ def test_what_ends_and_begins_far_from_others_stays_apart() -> None:
     true = _pair(np.random.default_rng(0), (30.0, 70.0), (20.0, 20.0))
     away = np.where(true.track[:, None] == 1, [0.0, 5000.0, 0.0, 0.0, 0.0], 0.0)
     track = np.where((true.frame > MEET) & (true.track == 0), 2, true.track)
-    given = Rows.of(true.frame, track, true.theta + away, true.group)
+    given = Localizations.of(true.frame, track, true.theta + away, true.group)
     found = identified(given, near_nm=NEAR_NM, error=ERROR)
     assert _same(found, given)
 
@@ -98,7 +98,7 @@ def test_a_particle_of_another_mass_is_a_new_one() -> None:
     later = (true.frame > MEET) & (true.track == 0)
     track = np.where(later, 2, true.track)
     heavier = np.where(later[:, None], [0.0, 0.0, 0.0, 20.0, 0.0], 0.0)
-    given = Rows.of(true.frame, track, true.theta + heavier, true.group)
+    given = Localizations.of(true.frame, track, true.theta + heavier, true.group)
     found = identified(given, near_nm=NEAR_NM, error=ERROR)
     assert _same(found, given)
 
@@ -121,18 +121,18 @@ def test_particles_that_never_meet_are_left_alone() -> None:
 def test_of_two_meetings_each_is_judged_by_what_lies_between() -> None:
     rng = np.random.default_rng(3)
     one, two = _pair(rng, (30.0, 70.0), (20.0, 20.0)), _pair(rng, (30.0, 70.0), (20.0, 20.0))
-    true = Rows.of(
+    true = Localizations.of(
         np.append(one.frame, two.frame + FRAMES), np.append(one.track, two.track),
         np.concatenate([one.theta, two.theta]), np.append(one.group, two.group),
     )  # fmt: skip
     between = (true.frame > MEET) & (true.frame <= MEET + FRAMES)
     track = np.where(between, 1 - true.track, true.track)
-    given = Rows.of(true.frame, track, true.theta, true.group)
+    given = Localizations.of(true.frame, track, true.theta, true.group)
     found = identified(given, near_nm=NEAR_NM, error=ERROR)
     assert _outside(found) == _outside(true)
 
 
-def _three(rng: np.random.Generator, frames: int = FRAMES) -> Rows:
+def _three(rng: np.random.Generator, frames: int = FRAMES) -> Localizations:
     """Three particles that meet in the middle: two of one speed, and two of one mass."""
     tables = []
     for k, (step, mass) in enumerate(((30.0, 20.0), (30.0, 40.0), (70.0, 40.0))):
@@ -143,7 +143,7 @@ def _three(rng: np.random.Generator, frames: int = FRAMES) -> Rows:
         amplitude = mass + ERROR * rng.standard_normal(frames)
         tables.append(np.column_stack([there, np.zeros(frames), amplitude, np.zeros(frames)]))
     track = np.repeat(np.arange(3), frames)
-    return Rows.of(np.tile(np.arange(frames), 3), track, np.concatenate(tables), track)
+    return Localizations.of(np.tile(np.arange(frames), 3), track, np.concatenate(tables), track)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -151,7 +151,7 @@ def _three(rng: np.random.Generator, frames: int = FRAMES) -> Rows:
 def test_three_that_meet_are_told_apart(seed: int, later: tuple[int, int, int]) -> None:
     true = _three(np.random.default_rng(seed))
     track = np.where(true.frame > MEET, np.array(later)[true.track], true.track)
-    given = Rows.of(true.frame, track, true.theta, true.group)
+    given = Localizations.of(true.frame, track, true.theta, true.group)
     assert _outside(identified(given, near_nm=NEAR_NM, error=ERROR)) == _outside(true)
 
 
@@ -170,7 +170,7 @@ def test_a_track_that_ends_among_others_goes_on_though_another_had_begun(
     track = np.append(track, np.full(len(extra.frame), 3))
     frame = np.append(true.frame, extra.frame)
     theta[(np.abs(frame - MEET) <= 3) & (track == faint), 3] = 1.0
-    given = Rows.of(frame, track, theta, np.append(true.group, extra.group))
+    given = Localizations.of(frame, track, theta, np.append(true.group, extra.group))
     found = identified(given, near_nm=NEAR_NM, error=ERROR)
     assert _outside(found) == _outside(true)
     assert len(found.frame) == len(true.frame)
@@ -199,7 +199,7 @@ def test_two_may_be_one_picture_for_long(seed: int) -> None:
     between = np.arange(MEET + 1, MEET + 41)
     theta = np.repeat(rest.theta[(rest.frame == MEET) & (rest.track == 1)], 40, axis=0)
     theta[:, 3] = 40.0
-    given = Rows.of(
+    given = Localizations.of(
         np.append(rest.frame + late, between), np.append(track, np.full(40, 1)),
         np.concatenate([rest.theta, theta]), np.append(rest.group, np.full(40, 1)),
     )  # fmt: skip
@@ -221,13 +221,13 @@ def test_a_meeting_after_an_exchange_is_judged_by_who_is_there(seed: int) -> Non
     theta[:, :2] = here + np.cumsum(rng.normal(0.0, 70.0, (FRAMES, 2)), axis=0)
     theta[:, :2] += here - theta[second, :2] + [50.0, 0.0]
     theta[:, 0] += 40.0 * np.abs(np.arange(FRAMES) - second)
-    true = Rows.of(
+    true = Localizations.of(
         np.append(true.frame, third.frame), np.append(true.track, np.full(FRAMES, 2)),
         np.concatenate([true.theta, theta]), np.append(true.group, np.full(FRAMES, 2)),
     )  # fmt: skip
     track = np.where(true.frame > MEET, np.array([1, 0, 2])[true.track], true.track)
     track = np.where(true.frame > second, np.array([1, 2, 0])[true.track], track)
-    given = Rows.of(true.frame, track, true.theta, true.group)
+    given = Localizations.of(true.frame, track, true.theta, true.group)
     found = identified(given, near_nm=NEAR_NM, error=ERROR)
     plain = np.abs(found.frame - second) > AROUND
     assert _outside(found.only(plain)) == _outside(true.only(np.abs(true.frame - second) > AROUND))
@@ -248,11 +248,13 @@ def test_who_passes_neighbours_is_told_from_them(seed: int) -> None:
         amplitude = mass + ERROR * rng.standard_normal(frames)
         tables.append(np.column_stack([xy, np.zeros(frames), amplitude, np.zeros(frames)]))
     track = np.repeat(np.arange(3), frames)
-    true = Rows.of(np.tile(np.arange(frames), 3), track, np.concatenate(tables), track)
+    true = Localizations.of(np.tile(np.arange(frames), 3), track, np.concatenate(tables), track)
     wrong = np.where(true.frame > met, np.array([2, 1, 0])[true.track], true.track)
     for given in (true.track, wrong):
         found = identified(
-            Rows.of(true.frame, given, true.theta, true.group), near_nm=NEAR_NM, error=ERROR
+            Localizations.of(true.frame, given, true.theta, true.group),
+            near_nm=NEAR_NM,
+            error=ERROR,
         )
         late = found.frame > met + AROUND
         assert found.theta[late & (found.track == 2), 3].mean() == pytest.approx(40.0, abs=0.5)
@@ -267,13 +269,13 @@ def test_masses_that_neighbours_change_a_little_exchange_nobody() -> None:
         part = 2 * true.track + (true.frame > MEET)
         theta = true.theta.copy()
         theta[:, 3] *= 1 + 0.02 * rng.standard_normal(4)[part]
-        given = Rows.of(true.frame, true.track, theta, true.group)
+        given = Localizations.of(true.frame, true.track, theta, true.group)
         assert _same(identified(given, near_nm=NEAR_NM, error=ERROR), given)
 
 
 def test_no_rows_and_one_track_stay_as_they_are() -> None:
     nothing = np.zeros(0, dtype=np.int64)
-    empty = Rows.of(nothing, nothing, np.zeros((0, 5)))
+    empty = Localizations.of(nothing, nothing, np.zeros((0, 5)))
     assert len(identified(empty, near_nm=NEAR_NM, error=ERROR).frame) == 0
     single = _pair(np.random.default_rng(2), (30.0, 70.0), (20.0, 20.0))
     single = single.only(single.track == 0)
@@ -286,13 +288,13 @@ def test_rows_shortly_before_and_after_a_meeting_are_of_it() -> None:
     track = np.array([0, 1, 0, 0, 0, 0, 1, 1, 2])
     theta = np.zeros((9, 5))
     theta[1, 0], theta[6, 0], theta[8, 1] = 300.0, 3000.0, 100.0  # close, far, and of another time
-    rows = Rows.of(frame, track, theta, track)
+    rows = Localizations.of(frame, track, theta, track)
     assert meeting(rows, 500.0).tolist() == [True] * 5 + [False] * 4
     assert not meeting(rows, 200.0).any()
     assert not meeting(rows.only(np.zeros(9, dtype=bool)), 500.0).size
 
 
-def _still(*parts: tuple[range, float, float]) -> Rows:
+def _still(*parts: tuple[range, float, float]) -> Localizations:
     """Rows of particles at places x [nm], whose steps are so long along y [nm]."""
     tables = []
     for track, (frames, x, step) in enumerate(parts):
@@ -301,10 +303,10 @@ def _still(*parts: tuple[range, float, float]) -> Rows:
     frame, track, x, y = np.array(sorted(tables)).T
     theta = np.zeros((len(frame), 5))
     theta[:, 0], theta[:, 1] = x, y
-    return Rows.of(frame.astype(np.int64), track.astype(np.int64), theta)
+    return Localizations.of(frame.astype(np.int64), track.astype(np.int64), theta)
 
 
-def _bridged(rows: Rows) -> list[int]:
+def _bridged(rows: Localizations) -> list[int]:
     """Give the track that each of the given ones is part of then."""
     track = bridge(_config(), rows)
     return [int(track[rows.track == k][0]) for k in np.unique(rows.track)]

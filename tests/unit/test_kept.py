@@ -7,7 +7,7 @@ from threading import Barrier, Event
 
 import pytest
 
-from iscat_analysis.optics.kept import kept
+from iscat_analysis.optics.memoize import memoize
 
 
 def test_threads_that_want_the_same_wait_for_one() -> None:
@@ -18,7 +18,7 @@ def test_threads_that_want_the_same_wait_for_one() -> None:
         begun.wait(0.2)  # long enough for the others to ask
         return [key]
 
-    get = kept(2, make)
+    get = memoize(2, make)
 
     def ask(_: int) -> list[int]:
         together.wait(10)
@@ -32,7 +32,7 @@ def test_threads_that_want_the_same_wait_for_one() -> None:
 
 def test_the_last_few_are_kept() -> None:
     made: list[int] = []
-    get = kept(2, made.append)
+    get = memoize(2, made.append)
     for key in (1, 2, 1, 3, 1, 2):
         get(key)
     assert made == [1, 2, 3, 2]
@@ -47,7 +47,7 @@ def test_a_failure_is_tried_again() -> None:
             raise ValueError("not yet")
         return key
 
-    get = kept(2, make)
+    get = memoize(2, make)
     with pytest.raises(ValueError, match="not yet"):
         get(5)
     assert get(5) == 5

@@ -20,7 +20,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting import events as events_module
-from iscat_analysis.fitting.background_mode import way_of
+from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.landing import chunk_work, merging
 from iscat_analysis.landing import find as landing_module
@@ -566,13 +566,13 @@ def test_rings_of_neighbours_are_those_of_their_height(mode: str) -> None:
     ],
 )
 def test_the_method_says_which_frames_stand_against_which(settings: list[str], way: str) -> None:
-    assert way_of(load_config(None, settings)) == way
+    assert background_mode(load_config(None, settings)) == way
 
 
 def test_windows_that_slide_measure_a_background_that_poisson_takes_for_known() -> None:
     config = load_config(None, ["fit.likelihood=poisson"])
     with pytest.raises(ConfigError, match=r'fit.likelihood = "poisson".*"sliding" measures it'):
-        way_of(config)
+        background_mode(config)
 
 
 # ---- on disk ---------------------------------------------------------------------------------

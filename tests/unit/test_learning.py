@@ -20,7 +20,7 @@ from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.instrument import learning
-from iscat_analysis.instrument.learner import Sight
+from iscat_analysis.instrument.learner import ParticleImage
 from iscat_analysis.instrument.learning import LEAST_TESTED, learn_optics
 from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
 from iscat_analysis.optics.forward import PixelGrid, forward_model
@@ -74,7 +74,7 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
         assert (median_p(moved, config)[0] > REJECTED_P) == fits
 
 
-def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[Sight]:
+def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage]:
     """Draw pictures of two particles that landed at once, 0.3 to 1 µm apart."""
     config = configuration()
     model = microscope(config, changes)
@@ -87,7 +87,9 @@ def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[Sight]:
         both = (1 + first) * (1 + model.image(GRID, x, y, 5.0, 2000.0))
         before, after = rng.poisson(PHOTONS, GRID.shape), rng.poisson(PHOTONS * both)
         data = conditional(model, GRID, before.astype(float), after.astype(float), 1.0).data
-        sights.append(Sight(GRID, CONDITIONAL, data, x / 2, y / 2, 5.0, mass_kda=0.0, snr=1e3))
+        sights.append(
+            ParticleImage(GRID, CONDITIONAL, data, x / 2, y / 2, 5.0, mass_kda=0.0, snr=1e3)
+        )
     return sights
 
 

@@ -13,7 +13,7 @@ from iscat_analysis.config import Config, config_to_toml, configure, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.instrument.learner import Sight
+from iscat_analysis.instrument.learner import ParticleImage
 from iscat_analysis.instrument.learner.measured_picture import fit_own, fit_picture, place_sights
 from iscat_analysis.instrument.microscope import goodness
 from iscat_analysis.optics.forward import (
@@ -83,7 +83,7 @@ def test_the_scattered_light_is_the_least_that_the_interference_allows() -> None
     assert np.all((exact[0] + exact[1]) / 2 >= light - 1e-6)
 
 
-def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> list[Sight]:
+def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> list[ParticleImage]:
     rng = np.random.default_rng(seed)
     sights = []
     for mass in masses:
@@ -93,7 +93,7 @@ def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> lis
         before, after = rng.poisson(LIGHT, grid.shape), rng.poisson(LIGHT * (1 + signal))
         data = conditional(truth, grid, before.astype(float), after.astype(float), 1.0)
         sights.append(
-            Sight(
+            ParticleImage(
                 grid=grid, kind=data.kind, data=data.data,
                 x_nm=float(x + rng.normal(0, 20)), y_nm=float(y + rng.normal(0, 20)),
                 z_nm=truth.height_nm, snr=20.0,

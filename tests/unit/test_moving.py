@@ -16,9 +16,9 @@ import tifffile
 import trackpy
 from scenes import PIXEL_NM, make_config
 
+from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import Light
 from iscat_analysis._kernels.curvature import first_order_bias
-from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.stamp import add_stamp
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -32,11 +32,11 @@ from iscat_analysis.tracking.extension import extended
 from iscat_analysis.tracking.frame_search import gaps, link
 from iscat_analysis.tracking.joint import frame_fits
 from iscat_analysis.tracking.joint import joint_fit as settling
-from iscat_analysis.tracking.joint.climbing import climb, log_likelihood
+from iscat_analysis.tracking.joint.ascent import climb, log_likelihood
 from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import first_ground, settle
+from iscat_analysis.tracking.joint.joint_fit import first_background, settle
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.joint.newton import Response
 from iscat_analysis.tracking.moving import diffusion_of
 
@@ -74,7 +74,9 @@ def _paths(step_nm: float) -> np.ndarray:
     return walk + np.array([[1200.0, 1500.0], [2500.0, 1900.0]])[:, None]
 
 
-def _movie(paths: np.ndarray, *, noise: bool) -> tuple[np.ndarray, Ground, Rows]:
+def _movie(
+    paths: np.ndarray, *, noise: bool
+) -> tuple[np.ndarray, BackgroundEstimate, Localizations]:
     """Make counts (t, y, x), the light that made them, and the truth."""
     rng = np.random.default_rng(5)
     model = forward_model(_config(), 1e4)
@@ -93,7 +95,11 @@ def _movie(paths: np.ndarray, *, noise: bool) -> tuple[np.ndarray, Ground, Rows]
         expected[t] = power[t] * level * (1 + signal)
     counts = rng.poisson(expected) + rng.normal(0, math.sqrt(READ_E2), expected.shape)
     frame, track = np.divmod(np.arange(2 * FRAMES), 2)
-    return counts if noise else expected, Ground(level, power), Rows.of(frame, track, theta)
+    return (
+        counts if noise else expected,
+        BackgroundEstimate(level, power),
+        Localizations.of(frame, track, theta),
+    )
 
 
 def _field(
@@ -119,7 +125,7 @@ def _square(theta: np.ndarray) -> tuple[slice, slice]:
     return spans[0], spans[1]
 
 
-def _multinomial(counts: np.ndarray, power: np.ndarray, rows: Rows) -> float:
+def _multinomial(counts: np.ndarray, power: np.ndarray, rows: Localizations) -> float:
     """Log-likelihood of counts given their sums over the frames, from exact pictures."""
     model = forward_model(_config(), 1e4)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
@@ -130,7 +136,7 @@ def _multinomial(counts: np.ndarray, power: np.ndarray, rows: Rows) -> float:
     return float(np.sum(counts * np.log(share / share.sum(axis=0))))
 
 
-def _stretched(rows: Rows, by: float) -> Rows:
+def _stretched(rows: Localizations, by: float) -> Localizations:
     """Places farther from the middle of each track, and masses smaller, so that products stay."""
     theta = rows.theta.copy()
     for k in range(len(MASSES)):
@@ -185,7 +191,7 @@ def test_background_takes_nothing_of_particles(
     """
     counts, ground, truth = _movie(_paths(step_nm), noise=False)
     field = _field(counts, pool)
-    start = first_ground(field, follow_power=True)
+    start = first_background(field, follow_power=True)
     over_median, _, _ = field.fit(start, truth)
     rows, found, done = settle(field, start, truth, follow_power=True)
     taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
@@ -200,11 +206,11 @@ def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor)
     """Its gradient on a row's square, by differences, vanishes within the tolerance of a fit."""
     counts, _, truth = _movie(_paths(40.0), noise=True)
     field = _field(counts, pool)
-    start = first_ground(field, follow_power=True)
+    start = first_background(field, follow_power=True)
     rows, ground, _ = settle(field, start, truth, follow_power=True)
     for _ in range(3):  # beyond what is asked of it
         rows, found, _ = field.fit(ground, rows)
-        ground = Ground(found.level, ground.power)
+        ground = BackgroundEstimate(found.level, ground.power)
     model = forward_model(_config(), 1e4)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     kept = counts.astype(np.float32).astype(float)
@@ -322,7 +328,7 @@ def test_only_rows_that_are_the_same_recall_their_fits(pool: ThreadPoolExecutor)
     theta = fitted.theta.copy()
     theta[7, 0] += 1e-9
     track = np.where(np.arange(len(theta)) == 4, 2, fitted.track)
-    again = Rows.of(fitted.frame, track, theta).joined(
+    again = Localizations.of(fitted.frame, track, theta).joined(
         np.array([5]), np.array([3]), theta[:1], np.array([0])
     )
     recalled = again.recalling(fitted)
@@ -473,8 +479,8 @@ def test_counts_are_fitted_as_the_photoelectrons_that_they_stand_for(
     np.testing.assert_allclose(other.theta, one.theta, rtol=1e-6)
     np.testing.assert_allclose(same.level, light.level, rtol=1e-6)
     np.testing.assert_allclose(same.power, light.power, rtol=1e-6)
-    first = first_ground(converted, follow_power=True)
-    np.testing.assert_allclose(first_ground(stored, follow_power=True).level, first.level, 1e-6)
+    first = first_background(converted, follow_power=True)
+    np.testing.assert_allclose(first_background(stored, follow_power=True).level, first.level, 1e-6)
     left, over = (f.residual(ground, rows, 3, 9) for f in (converted, stored))
     np.testing.assert_allclose(over, left, atol=0.1)  # e, of noise 630
 
@@ -497,13 +503,13 @@ def test_rows_that_move_are_redrawn_as_if_all_were(
     pool: ThreadPoolExecutor, rows_moved: list[int]
 ) -> None:
     field = _field(np.ones((1, *SHAPE)), pool)
-    ground = Ground(np.ones(SHAPE), np.ones(1))
+    ground = BackgroundEstimate(np.ones(SHAPE), np.ones(1))
     size = forward_model(_config(), 1e4).scale.amplitude(400.0)
     z = forward_model(_config(), 1e4).height_nm
     theta = np.array(
         [[x, y, z, size, 0.0] for x in (700.0, 1800.0, 2900.0) for y in (600.0, 1600.0, 2600.0)]
     )
-    rows = Rows.of(np.zeros(9, dtype=int), np.arange(9), theta)
+    rows = Localizations.of(np.zeros(9, dtype=int), np.arange(9), theta)
     for change in ([0.0, 0.0, 0.0, 0.3 * size, 0.0], [170.0, -90.0, 0.0, -0.4 * size, 0.0]):
         before = field.fit(ground, rows, sweeps=0, coarse=True)[0]
         there = before.theta.copy()
@@ -597,7 +603,7 @@ def test_blur_is_of_places_where_a_particle_is_alone() -> None:
     theta[:, 3] = 1.0
     frame, track = np.divmod(np.arange(2 * frames), 2)
     fisher = np.broadcast_to(np.diag([sigma_nm**-2, sigma_nm**-2, 0.0, 1.0]), (2 * frames, 4, 4))
-    rows = replace(Rows.of(frame, track, theta), fisher=fisher)
+    rows = replace(Localizations.of(frame, track, theta), fisher=fisher)
     free = np.array([True, True, False, True, False])
     found, error = diffusion_of(config, free, rows).T
     assert np.all(np.abs(found - d) < SIGMAS * error)
@@ -629,9 +635,9 @@ def test_fast_particles_weigh_what_they_weigh(pool: ThreadPoolExecutor) -> None:
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
     place, mass = (1712.0, 1655.0), 20.0
     average, normal = _along_paths(model, grid, place, variance, mass)
-    ground = Ground(np.full(SHAPE, LEVEL_E), np.ones(3))
+    ground = BackgroundEstimate(np.full(SHAPE, LEVEL_E), np.ones(3))
     amplitude = model.scale.amplitude(mass)
-    truth = Rows.of(
+    truth = Localizations.of(
         np.arange(3), np.zeros(3, dtype=int),
         np.tile([*place, model.height_nm, amplitude, 0.0], (3, 1)),
     )  # fmt: skip

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter, shift
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.metadata import diagnose_gain
-from iscat_analysis.camera.pattern_jitter import measure_shaking
+from iscat_analysis.camera.pattern_jitter import measure_pattern_jitter
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
@@ -44,7 +44,7 @@ def _movie(shaking_px: float, *, noise: float = 0.0, seed: int = 1) -> np.ndarra
 @pytest.mark.parametrize("rms_px", [0.05, 0.1])
 def test_a_pattern_that_shakes_is_no_wrong_gain(rms_px: float) -> None:
     counts, camera = _movie(rms_px), Camera(well_depth_e=1e9)
-    found = measure_shaking(counts, camera)
+    found = measure_pattern_jitter(counts, camera)
     assert found is not None
     assert found.share > 0.9
     assert found.rms_px == pytest.approx(rms_px, rel=0.25)  # 78 numbers: 8 %
@@ -57,7 +57,7 @@ def test_a_pattern_that_shakes_is_no_wrong_gain(rms_px: float) -> None:
 def test_noise_of_single_pixels_is_no_shaking() -> None:
     """The control: twice the variance, in every pixel on its own."""
     counts, camera = _movie(0.0, noise=1.0), Camera(well_depth_e=1e9)
-    found = measure_shaking(counts, camera)
+    found = measure_pattern_jitter(counts, camera)
     assert found is not None
     assert abs(found.share) < 0.05
     message = diagnose_gain(counts, camera).message
@@ -68,9 +68,9 @@ def test_noise_of_single_pixels_is_no_shaking() -> None:
 def test_without_noise_beyond_the_light_nothing_shakes() -> None:
     rng = np.random.default_rng(3)
     camera = Camera(gain_e_per_adu=0.5, well_depth_e=1e9)
-    assert measure_shaking(rng.poisson(1e4, (20, *SHAPE)), camera) is None
-    assert measure_shaking(np.full((20, *SHAPE), 1000), camera) is None
-    assert measure_shaking(np.zeros((20, *SHAPE)), camera) is None
+    assert measure_pattern_jitter(rng.poisson(1e4, (20, *SHAPE)), camera) is None
+    assert measure_pattern_jitter(np.full((20, *SHAPE), 1000), camera) is None
+    assert measure_pattern_jitter(np.zeros((20, *SHAPE)), camera) is None
 
 
 @pytest.mark.parametrize("gain", [1024.0, 4.0])

@@ -15,7 +15,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.pixels import pixel_terms
 from iscat_analysis.instrument.learner import (
     PRIVATE,
-    Sight,
+    ParticleImage,
     free_groups,
     maximise,
     optics_limits,
@@ -171,5 +171,5 @@ def test_limits_hold() -> None:
     limits = {**optics_limits(1.515, 1.515), "na": (1.3, 1.43)}
     found = maximise(truth, build, settings_of(configuration()), ("na",), limits=limits, passes=15)
     assert found.values["na"] == 1.43
-    assert isinstance(sights[0], Sight)
+    assert isinstance(sights[0], ParticleImage)
     assert microscope(configuration(), {}) is not None

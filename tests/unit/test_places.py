@@ -14,8 +14,8 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
+from iscat_analysis.executors import LocalExecutor, open_place
 from iscat_analysis.movie import open_stack
-from iscat_analysis.places import Here, open_place
 from iscat_analysis.search.sliding.chunks import Reader
 from iscat_analysis.threads import allotted, threads
 from iscat_cli import main, main_fit
@@ -28,7 +28,7 @@ def _job(number: int, *, progress: object = None) -> int:
 
 def test_here_is_one_after_the_other() -> None:
     with open_place() as place:
-        assert isinstance(place, Here)
+        assert isinstance(place, LocalExecutor)
         assert not place.distant
         assert list(place.each(lambda n: place.call(_job, n), [3, 4])) == [(0, 6), (1, 8)]
         assert place.remarks(1000) == []
@@ -45,7 +45,7 @@ def nobody() -> str:
 def test_wrong_places_are_refused_in_one_line(
     nobody: str, tmp_path: Path, capsys, monkeypatch
 ) -> None:
-    monkeypatch.setattr("iscat_analysis.places._CONNECT_S", 0.3)
+    monkeypatch.setattr("iscat_analysis.executors._CONNECT_S", 0.3)
     empty = tmp_path / "empty.json"
     empty.write_text("{}")
     (tmp_path / "samples.csv").write_text("path\nmovie.npy\n")

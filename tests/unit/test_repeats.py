@@ -13,10 +13,10 @@ from scenes import PIXEL_NM, make_config
 from scipy.stats import norm
 
 from iscat_analysis.inference import noise
-from iscat_analysis.inference.achieved import Achieved, pooled
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.repeats import (
+from iscat_analysis.inference.split_frames import (
     LENGTHS,
     PARTS,
     Series,
@@ -260,8 +260,10 @@ def test_no_event_has_no_spread() -> None:
 # ---- verdict -----------------------------------------------------------------------------------
 
 
-def _achieved(ratio: float, single: float = 1.0, empty: tuple[float, ...] = (1.0,) * 5) -> Achieved:
-    return Achieved(
+def _achieved(
+    ratio: float, single: float = 1.0, empty: tuple[float, ...] = (1.0,) * 5
+) -> EmpiricalSpread:
+    return EmpiricalSpread(
         ratio, (ratio - 0.03, ratio + 0.03), 100, bool(empty), (ratio - 1) / 0.015,
         (1, 10), (single, single), (0.01, 0.03), empty,
     )  # fmt: skip
@@ -277,7 +279,7 @@ def _achieved(ratio: float, single: float = 1.0, empty: tuple[float, ...] = (1.0
         (_achieved(1.50, 1.0, (1.0,) * 5), 1.0, "at the particles"),
     ],
 )
-def test_the_noise_is_named(found: Achieved, pixels: float, word: str) -> None:
+def test_the_noise_is_named(found: EmpiricalSpread, pixels: float, word: str) -> None:
     assert word in likely_noise(found, {"noise_variance_over_shot": [pixels]})
     verdict = spread_verdict({"mass_kda": found}, {}, scaled=False)
     assert verdict["understated"]

@@ -13,7 +13,7 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.tracking.heights import decide_heights
 from iscat_analysis.tracking.joint.exposures import Exposures
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.moving_table import _areas, _quantum
 
 SHAPE, FRAMES, LEVEL_E, ROI = (28, 28), 40, 4e5, 24
@@ -53,8 +53,8 @@ def test_rows_come_into_their_fringe(
             np.ones(SHAPE, dtype=bool), near, model, pixel_nm=PIXEL_NM, roi_px=ROI,
             z_range_nm=span, largest=1e9, pool=pool,
         )  # fmt: skip
-        ground = Ground(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
-        rows = Rows.of(frames, track, start)
+        ground = BackgroundEstimate(np.full(SHAPE, LEVEL_E), np.ones(FRAMES))
+        rows = Localizations.of(frames, track, start)
         alone, _, _ = field.fit(ground, rows)
         found = decide_heights(field, ground, rows, fringe_nm=model.fringe_nm, z_range_nm=span)
     jumped = np.abs(alone.theta[:, 2] - path[:, 2]) > model.fringe_nm / 2

@@ -14,7 +14,11 @@ from scenes import PIXEL_NM, Stack
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fitting.background_mode import Way, way_of, way_said
+from iscat_analysis.fitting.background_mode import (
+    BackgroundMode,
+    background_mode,
+    describe_background_mode,
+)
 from iscat_analysis.fitting.events import Event, remarks, standing_out
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.scene import Scene, make_scene
@@ -41,7 +45,7 @@ def _bound(frame: int) -> dict[str, object]:
     return {"events": [{"frame": frame, "x_px": x, "y_px": y} for x, y in PLACES]}
 
 
-MOVIES: dict[Way, tuple[list[str], dict[str, object]]] = {
+MOVIES: dict[BackgroundMode, tuple[list[str], dict[str, object]]] = {
     "fixed": (["background.frames=[0, 40]", "simulation.frames=80"], _bound(40)),
     "sliding": (["background.window_frames=30", "simulation.frames=120"], _bound(60)),
     "tracks": (
@@ -51,13 +55,13 @@ MOVIES: dict[Way, tuple[list[str], dict[str, object]]] = {
 }
 
 
-def _config(way: Way) -> Config:
+def _config(way: BackgroundMode) -> Config:
     settings, simulated = MOVIES[way]
     return configure({"simulation": simulated}, settings=[*BASE, *settings])
 
 
 @pytest.fixture(scope="module")
-def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[Way, Analysis]:
+def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[BackgroundMode, Analysis]:
     """Analyse a movie in each way."""
     folder, found = tmp_path_factory.mktemp("ways"), {}
     for way in MOVIES:
@@ -69,12 +73,14 @@ def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[Way, Analysis]:
 
 
 def test_every_way_is_found() -> None:
-    assert set(FIND) == set(get_args(Way)) == set(MOVIES)
-    assert [way_of(_config(way)) for way in MOVIES] == list(MOVIES)
+    assert set(FIND) == set(get_args(BackgroundMode)) == set(MOVIES)
+    assert [background_mode(_config(way)) for way in MOVIES] == list(MOVIES)
 
 
 @pytest.mark.parametrize("way", list(MOVIES))
-def test_every_way_gives_the_same_record(analyses: dict[Way, Analysis], way: Way) -> None:
+def test_every_way_gives_the_same_record(
+    analyses: dict[BackgroundMode, Analysis], way: BackgroundMode
+) -> None:
     found = analyses[way]
     table = found.table
     assert tuple(table.columns[: len(EVENT_COLUMNS)]) == EVENT_COLUMNS
@@ -96,7 +102,9 @@ def test_every_way_gives_the_same_record(analyses: dict[Way, Analysis], way: Way
 
 
 @pytest.mark.parametrize("way", list(MOVIES))
-def test_every_way_weighs_the_particles_alike(analyses: dict[Way, Analysis], way: Way) -> None:
+def test_every_way_weighs_the_particles_alike(
+    analyses: dict[BackgroundMode, Analysis], way: BackgroundMode
+) -> None:
     """Each particle once: the rows of a track share the error of their background."""
     found = analyses[way]
     table = found.table if found.tracks is None else found.tracks
@@ -106,7 +114,7 @@ def test_every_way_weighs_the_particles_alike(analyses: dict[Way, Analysis], way
 
 
 @pytest.mark.parametrize("way", list(MOVIES))
-def test_frames_that_are_not_there_are_refused_alike(way: Way, tmp_path: Path) -> None:
+def test_frames_that_are_not_there_are_refused_alike(way: BackgroundMode, tmp_path: Path) -> None:
     config = configure(_config(way), settings={"fit.frames": [50, 900]})
     np.save(tmp_path / "movie.npy", np.full((100, SIDE, SIDE), 1000, dtype=np.uint16))
     for job in (analyse, Preview):
@@ -187,7 +195,7 @@ def test_the_sums_of_a_region_are_views() -> None:
     ],
 )
 def test_the_method_is_said_whether_it_was_written_or_not(settings: list[str], words: str) -> None:
-    assert words in way_said(configure(settings=settings))
+    assert words in describe_background_mode(configure(settings=settings))
 
 
 @pytest.mark.parametrize("method", ["fixed", "median"])
@@ -242,5 +250,5 @@ def test_a_run_says_its_method_first() -> None:
     counts = np.array(list(Movie(config, 1).frames(1)))
     with open_stack(counts) as movie:
         analyse(movie, config, notify=told.append)
-    said = way_said(config)
+    said = describe_background_mode(config)
     assert [text for text in told if "background.method" in text] == [said]

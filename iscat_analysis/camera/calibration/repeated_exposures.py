@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.calibration.moments import blocks
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.kept import KeptFrames
+from iscat_analysis.movie.selected_frames import SelectedFrames
 from iscat_analysis.records import FrameSource
 from iscat_analysis.units import listed
 
@@ -39,4 +39,4 @@ def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSo
         f"{'are' if lost.size > 1 else 'is'} zero throughout or the same as the frame before "
         "(dropped or stuck in the camera); left out"
     )
-    return KeptFrames(stack, kept)
+    return SelectedFrames(stack, kept)

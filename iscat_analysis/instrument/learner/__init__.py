@@ -26,8 +26,8 @@ from iscat_analysis.instrument.learner.particle_images import (
     FOCUS_DRIFT,
     FOCUS_STEP,
     PRIVATE,
+    ParticleImage,
     Settings,
-    Sight,
 )
 from iscat_analysis.instrument.learner.pictures import Pictures, make_pictures
 from iscat_analysis.instrument.learner.result import OpticsCalibration, make_result
@@ -57,9 +57,9 @@ __all__ = [
     "Neighbours",
     "OpticsCalibration",
     "OpticsForecast",
+    "ParticleImage",
     "Pictures",
     "Settings",
-    "Sight",
     "Twin",
     "build_microscope",
     "first_step",

@@ -26,8 +26,8 @@ from iscat_analysis.instrument.learner.particle_images import (
     ROAM_NM,
     Build,
     Microscope,
+    ParticleImage,
     Settings,
-    Sight,
 )
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -75,7 +75,7 @@ class Estimate:
 
     names: tuple[str, ...]
     values: Settings
-    sights: tuple[Sight, ...]
+    sights: tuple[ParticleImage, ...]
     information: FloatArray
     scatter: FloatArray
     log_likelihood: float
@@ -106,7 +106,7 @@ def prior_range(name: str) -> float:
 
 
 def maximise(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     build: Build,
     start: Settings,
     names: Sequence[str],
@@ -150,7 +150,7 @@ def maximise(
 
 
 def first_step(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     build: Build,
     settings: Settings,
     names: Sequence[str],
@@ -167,7 +167,7 @@ def first_step(
     return bound @ score, bound @ at.scatter([sight.owner for sight in sights]) @ bound
 
 
-def _walls(sights: Sequence[Sight]) -> FloatArray:
+def _walls(sights: Sequence[ParticleImage]) -> FloatArray:
     """Bounds of what is a sight's own, shape (2, n, 5): a particle stays in its picture."""
     centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
     walls = np.full((2, len(sights), PRIVATE), np.inf)
@@ -215,7 +215,7 @@ class _Point:
     @classmethod
     def evaluate(
         cls,
-        sights: Sequence[Sight],
+        sights: Sequence[ParticleImage],
         build: Build,
         values: Settings,
         names: tuple[str, ...],
@@ -340,7 +340,7 @@ def _solve(
 
 
 def _scores(
-    sight: Sight, model: Microscope, names: tuple[str, ...], private: FloatArray
+    sight: ParticleImage, model: Microscope, names: tuple[str, ...], private: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood, score, expected information and its observed squares, shared ones first."""
     x, y, z, mass, level = (float(v) for v in private)

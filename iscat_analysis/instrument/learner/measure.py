@@ -17,7 +17,7 @@ import numpy as np
 from iscat_analysis.instrument.learner.estimate import Estimate, maximise
 from iscat_analysis.instrument.learner.neighbours import Neighbours
 from iscat_analysis.instrument.learner.null_directions import find_hidden
-from iscat_analysis.instrument.learner.particle_images import RISES, Build, Settings, Sight
+from iscat_analysis.instrument.learner.particle_images import RISES, Build, ParticleImage, Settings
 from iscat_analysis.instrument.learner.settings import (
     FREE,
     HIGHER,
@@ -60,7 +60,7 @@ _TRIAL_PASSES = 12  # of a second microscope on all pictures
 _TWIN_PASSES = 4  # after which a twin is far nearer than _CLOSE
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
 
-Judge = Callable[[Sight, Settings], tuple[float, float]]
+Judge = Callable[[ParticleImage, Settings], tuple[float, float]]
 """Goodness of fit of a sight in a microscope: reduced χ² and p-value."""
 
 
@@ -97,14 +97,14 @@ class Measured:
     undecided: tuple[str, ...]
     judgement: Judgement
     configured: Judgement
-    held_out: tuple[Sight, ...]
+    held_out: tuple[ParticleImage, ...]
     twin: Twin | None
     contaminated: int
     refusals: tuple[str, ...]
 
 
 def judge(
-    sights: Sequence[Sight], settings: Settings, judge_one: Judge, mapper: Mapper = map
+    sights: Sequence[ParticleImage], settings: Settings, judge_one: Judge, mapper: Mapper = map
 ) -> Judgement:
     """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
@@ -116,7 +116,7 @@ def judge(
 
 @one_thread_algebra()
 def measure_microscope(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     configured: Settings,
     build: Build,
     judge_one: Judge,
@@ -125,7 +125,7 @@ def measure_microscope(
     limits: Mapping[str, tuple[float, float]],
     side: int = 0,
     landing: int = 0,
-    others: Sequence[Sight] = (),
+    others: Sequence[ParticleImage] = (),
     build_wide: Build | None = None,
     known: Settings | None = None,
     mapper: Mapper = map,
@@ -138,12 +138,12 @@ def measure_microscope(
     return search.run(sorted(sights, key=lambda sight: -sight.snr))
 
 
-def _fitted(sights: Sequence[Sight]) -> list[Sight]:
+def _fitted(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are fitted."""
     return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
 
 
-def _held_out(sights: Sequence[Sight]) -> list[Sight]:
+def _held_out(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are not."""
     return list(sights[1::HELD_OUT])
 
@@ -160,11 +160,11 @@ class _Search:
     side: int
     landing: int
     mapper: Mapper = map
-    others: tuple[Sight, ...] = ()
+    others: tuple[ParticleImage, ...] = ()
     build_wide: Build | None = None
     known: Settings | None = None
 
-    def run(self, sights: Sequence[Sight]) -> Measured:
+    def run(self, sights: Sequence[ParticleImage]) -> Measured:
         if self.known is None:
             best, held_out = self._best_state(*average_sights(sights))
         else:
@@ -194,15 +194,19 @@ class _Search:
         )  # fmt: skip
 
     def _fit(
-        self, sights: Sequence[Sight], start: Settings, names: Sequence[str], passes: int = 40
+        self,
+        sights: Sequence[ParticleImage],
+        start: Settings,
+        names: Sequence[str],
+        passes: int = 40,
     ) -> Estimate:
         return maximise(
             sights, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
         )
 
     def _cleared(
-        self, best: Estimate, held_out: Sequence[Sight]
-    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        self, best: Estimate, held_out: Sequence[ParticleImage]
+    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Put the rings of all neighbours into what is expected of every picture."""
         if not self.others or self.build_wide is None:
             return best, tuple(held_out)
@@ -213,13 +217,15 @@ class _Search:
         judged = self._own(judged, best.values) if judged else ()
         return self._fit(fitted, best.values, best.names), judged
 
-    def _own(self, sights: Sequence[Sight], settings: Settings) -> tuple[Sight, ...]:
+    def _own(
+        self, sights: Sequence[ParticleImage], settings: Settings
+    ) -> tuple[ParticleImage, ...]:
         """Fit what is a sight's own."""
         return self._fit(sights, settings, ()).sights
 
     def _best_state(
-        self, averages: Sequence[Sight], placed: Sequence[Sight]
-    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        self, averages: Sequence[ParticleImage], placed: Sequence[ParticleImage]
+    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Try every state on the average picture, the best ones on the pictures to be fitted.
 
         A mask of which the configuration knows nothing must earn its two parameters.
@@ -228,7 +234,7 @@ class _Search:
         states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
         refined = states.run(averages)
         top = refined[0].log_likelihood
-        joint: list[tuple[float, Estimate, tuple[Sight, ...]]] = []
+        joint: list[tuple[float, Estimate, tuple[ParticleImage, ...]]] = []
         tried: list[Estimate] = []
         for rough in refined:
             far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
@@ -253,8 +259,8 @@ class _Search:
         return best, held_out
 
     def _of_known_kind(
-        self, sights: Sequence[Sight], known: Settings
-    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        self, sights: Sequence[ParticleImage], known: Settings
+    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
         fitted = _fitted(sights)
@@ -276,8 +282,8 @@ class _Search:
         return best, held
 
     def _uncontaminated(
-        self, best: Estimate, held_out: Sequence[Sight]
-    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        self, best: Estimate, held_out: Sequence[ParticleImage]
+    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Leave out the few pictures in which something else happened, if the others are fine."""
         good = [
             judge(sights, best.values, self.judge_one, self.mapper).p_values > CONTAMINATED_P
@@ -291,7 +297,7 @@ class _Search:
         return self._fit(kept, best.values, best.names), rest
 
     def _worthwhile(
-        self, best: Estimate, held_out: Sequence[Sight]
+        self, best: Estimate, held_out: Sequence[ParticleImage]
     ) -> tuple[Estimate, tuple[str, ...]]:
         """Keep as many aberrations as improve the pictures that were not fitted."""
         terms = tuple(n for n in best.names if is_term(n))
@@ -350,8 +356,8 @@ class _Search:
         return best, Twin(other.values, gap)
 
     def _signed(
-        self, best: Estimate, held_out: Sequence[Sight]
-    ) -> tuple[Estimate, tuple[Sight, ...]]:
+        self, best: Estimate, held_out: Sequence[ParticleImage]
+    ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Choose between a phase and its opposite, which a particle that leaves has."""
         if "reference_phase_deg" not in best.names:
             return best, tuple(held_out)

@@ -22,7 +22,7 @@ import numpy as np
 from scipy import ndimage
 
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.learner.particle_images import Sight
+from iscat_analysis.instrument.learner.particle_images import ParticleImage
 from iscat_analysis.instrument.learner.starts import average_sights
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude, with_template
 from iscat_analysis.optics.measured import Template
@@ -90,13 +90,13 @@ class PictureFit:
     """A template and the pictures that made it."""
 
     template: Template
-    sights: tuple[Sight, ...]
+    sights: tuple[ParticleImage, ...]
     effective: float
     rounds: int
 
 
 def fit_picture(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     nominal: ForwardModel,
     *,
     roi_nm: float,
@@ -134,7 +134,7 @@ def fit_picture(
     return PictureFit(template, tuple(own), effective, used)
 
 
-def fit_own(sight: Sight, model: ForwardModel, *, level: bool) -> Sight:
+def fit_own(sight: ParticleImage, model: ForwardModel, *, level: bool) -> ParticleImage:
     """Fit what is a picture's own."""
     likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
     start = np.array([sight.x_nm, sight.y_nm, model.height_nm, sight.mass_kda, sight.level])
@@ -149,7 +149,7 @@ def fit_own(sight: Sight, model: ForwardModel, *, level: bool) -> Sight:
     return sight.moved(found)
 
 
-def place_sights(sights: Sequence[Sight], nominal: ForwardModel) -> list[Sight]:
+def place_sights(sights: Sequence[ParticleImage], nominal: ForwardModel) -> list[ParticleImage]:
     """Register pictures on their average, and say how much of it each shows."""
     (average,), placed = average_sights(sights)
     scale = peak_per_amplitude(nominal)
@@ -173,14 +173,16 @@ def place_sights(sights: Sequence[Sight], nominal: ForwardModel) -> list[Sight]:
     return out
 
 
-def _seen(sight: Sight, nominal: ForwardModel, signal: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _seen(
+    sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Measured signal of a picture and its information, 0 where masked; the model takes no part."""
     likelihood = Likelihood(nominal, sight.grid, sight.kind, sight.data)
     return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
 
 
 def _solve(
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     nominal: ForwardModel,
     waves: _Waves,
     coefficients: FloatArray,
@@ -198,7 +200,7 @@ def _solve(
     began = bool(np.any(coefficients))
     along, up = waves.slopes(coefficients)
 
-    def one(sight: Sight) -> tuple[FloatArray, FloatArray]:
+    def one(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
         grid, strength, gain = sight.grid, sight.mass_kda * scale, math.exp(sight.level)
         basis = waves.on(grid.x_nm - sight.x_nm, grid.y_nm - sight.y_nm, blur)
         shown = strength * (basis @ coefficients)
@@ -258,7 +260,7 @@ def _gauge(
     coefficients: FloatArray,
     half_nm: float,
     step_nm: float,
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
 ) -> tuple[FloatArray, tuple[float, float], float]:
     """Centre the energy, make the peak 1 and landings positive; give the shift and the factor."""
     axis = np.arange(-half_nm, half_nm + step_nm / 2, step_nm)
@@ -280,7 +282,7 @@ def _template(
     waves: _Waves,
     coefficients: FloatArray,
     covariance: FloatArray,
-    sights: Sequence[Sight],
+    sights: Sequence[ParticleImage],
     *,
     roi_nm: float,
     side_nm: float,

@@ -8,7 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from iscat_analysis.instrument.learner.estimate import maximise
-from iscat_analysis.instrument.learner.particle_images import Build, Microscope, Settings, Sight
+from iscat_analysis.instrument.learner.particle_images import (
+    Build,
+    Microscope,
+    ParticleImage,
+    Settings,
+)
 from iscat_analysis.instrument.learner.starts import with_masses
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -19,13 +24,13 @@ _PASSES = 6
 class Neighbours:
     """Particles with the rings that they make in one microscope."""
 
-    particles: tuple[Sight, ...]
+    particles: tuple[ParticleImage, ...]
     wide: Microscope
 
     @classmethod
     def fitted(
         cls,
-        others: Sequence[Sight],
+        others: Sequence[ParticleImage],
         build: Build,
         build_wide: Build,
         settings: Settings,
@@ -33,13 +38,15 @@ class Neighbours:
     ) -> Neighbours:
         """Fit them, and once more among each other's rings."""
 
-        def own(sights: Sequence[Sight]) -> tuple[Sight, ...]:
+        def own(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, ...]:
             return maximise(sights, build, settings, (), passes=_PASSES, mapper=mapper).sights
 
         first = cls(own(with_masses(others, build, settings)), build_wide(settings))
         return cls(own(first.around(first.particles, mapper)), first.wide)
 
-    def around(self, sights: Sequence[Sight], mapper: Mapper = map) -> tuple[Sight, ...]:
+    def around(
+        self, sights: Sequence[ParticleImage], mapper: Mapper = map
+    ) -> tuple[ParticleImage, ...]:
         """Put their rings into what is expected of pictures.
 
         Every particle is drawn into all pictures at once: its field at its height takes longest.

@@ -63,7 +63,7 @@ Build = Callable[[Settings], Microscope]
 
 
 @dataclass(frozen=True)
-class Sight:
+class ParticleImage:
     """The picture of one particle: counts of a region, and where the search begins."""
 
     grid: PixelGrid
@@ -93,7 +93,7 @@ class Sight:
         """Which of its own unknowns are, shape (5,)."""
         return np.array([True, True, self.heights_nm is not None, True, True])
 
-    def among(self, contrast: FloatArray) -> Sight:
+    def among(self, contrast: FloatArray) -> ParticleImage:
         """Return the sight with the contrast of its neighbours in its expectation."""
         rings = 1 + contrast
         data = self.data.copy()
@@ -118,12 +118,12 @@ class Sight:
         own["focus_nm"] += self.focus_steps * sum(settings.get(key, 0.0) for key in RISES)
         return own
 
-    def moved(self, private: FloatArray) -> Sight:
+    def moved(self, private: FloatArray) -> ParticleImage:
         """Return the same pictures with another start."""
         x, y, z, mass, level = (float(v) for v in private)
         return replace(self, x_nm=x, y_nm=y, z_nm=z, mass_kda=mass, level=level)
 
-    def placed(self, x_nm: float, y_nm: float) -> Sight:
+    def placed(self, x_nm: float, y_nm: float) -> ParticleImage:
         """Return the same picture with another place, or the nearest where it may be."""
         (low, high), (left, right) = (
             (float(np.mean(axis)) - ROAM_NM, float(np.mean(axis)) + ROAM_NM)
@@ -132,7 +132,7 @@ class Sight:
         x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
         return replace(self, x_nm=x, y_nm=y)
 
-    def raised(self, shift_nm: float) -> Sight:
+    def raised(self, shift_nm: float) -> ParticleImage:
         """Return the same picture with another height, or the nearest that is possible."""
         low, high = self.heights_nm or (self.z_nm, self.z_nm)
         return replace(self, z_nm=min(max(self.z_nm + shift_nm, low), high))

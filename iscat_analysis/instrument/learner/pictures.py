@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.instrument.learner.particle_images import Build, Settings, Sight
+from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage, Settings
 from iscat_analysis.instrument.learner.settings import is_term
 from iscat_analysis.instrument.learner.starts import contrast_of
 from iscat_analysis.records import FloatArray
@@ -35,7 +35,7 @@ class Pictures:
     na: float
 
 
-def make_pictures(sights: Sequence[Sight], build: Build, settings: Settings) -> Pictures:
+def make_pictures(sights: Sequence[ParticleImage], build: Build, settings: Settings) -> Pictures:
     """Average the pictures and what the microscope makes of them.
 
     Data and model are moved by the same interpolation, so that it shows in neither residual.

@@ -20,7 +20,7 @@ from scipy import fft, ndimage
 
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.inference.pixels import pixel_terms
-from iscat_analysis.instrument.learner.particle_images import Build, Sight
+from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray
 
@@ -50,7 +50,9 @@ class Start:
     explained: float
 
 
-def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Sight, ...]]:
+def average_sights(
+    sights: Sequence[ParticleImage],
+) -> tuple[tuple[ParticleImage, ...], tuple[ParticleImage, ...]]:
     """Average the pictures of each focus, registered on each other, with the sign of each."""
     placed = list(sights)
     averages = {}
@@ -64,7 +66,7 @@ def average_sights(sights: Sequence[Sight]) -> tuple[tuple[Sight, ...], tuple[Si
     return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
 
 
-def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
+def _average(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, list[ParticleImage]]:
     """Average pictures of one focus; their places are those of the average's centre."""
     contrasts, variances = zip(*(contrast_of(sight) for sight in sights), strict=True)
     pixel = sights[0].grid.pixel_nm
@@ -92,7 +94,7 @@ def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
     data[0], data[2], data[3] = counts * (1 + template), 1.0, 1.0
     data[1] = counts + data[0]
     grid = PixelGrid.centred(template.shape[0], pixel)
-    average = Sight(
+    average = ParticleImage(
         grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
         focus_steps=sights[0].focus_steps,
     )  # fmt: skip
@@ -107,7 +109,7 @@ def _average(sights: Sequence[Sight]) -> tuple[Sight, list[Sight]]:
     return average, placed
 
 
-def contrast_of(sight: Sight) -> tuple[FloatArray, FloatArray]:
+def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
     """Measured contrast of a sight and the variance of its noise.
 
     Shapes: `contrast, variance` (ny, nx).
@@ -144,8 +146,8 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
 
 
 def with_masses(
-    sights: Sequence[Sight], build: Build, settings: Mapping[str, Any]
-) -> tuple[Sight, ...]:
+    sights: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
+) -> tuple[ParticleImage, ...]:
     """Give every sight the mass that fits it best where it stands."""
     models: dict[float, Any] = {}
     out = []
@@ -163,14 +165,16 @@ def with_masses(
     return tuple(out)
 
 
-def _parts(model: Any, sight: Sight, place: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+def _parts(
+    model: Any, sight: ParticleImage, place: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
     """Contrast per mass, and per square of the mass: interference, and the scattered light."""
     signal, slopes = model.gradient(sight.grid, *place, sight.z_nm, _UNIT_KDA)
     slope = slopes[3]
     return (2 * signal - _UNIT_KDA * slope) / _UNIT_KDA, (_UNIT_KDA * slope - signal) / _UNIT_KDA**2
 
 
-def _quadratures(model: Any, sight: Sight) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _quadratures(model: Any, sight: ParticleImage) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Contrast per mass at reference phases 0 and 90°, and scattered light per squared mass.
 
     The particle is in the centre.
@@ -216,7 +220,7 @@ def _strengths(
 
 
 def search_starts(
-    averages: Sequence[Sight],
+    averages: Sequence[ParticleImage],
     build: Build,
     candidates: Sequence[Mapping[str, Any]],
     *,
@@ -295,7 +299,7 @@ def _best_phase(
 
 
 def turned_starts(
-    averages: Sequence[Sight], build: Build, starts: Sequence[Start]
+    averages: Sequence[ParticleImage], build: Build, starts: Sequence[Start]
 ) -> tuple[Start, ...]:
     """Turn the linear light of every start to the direction that explains most."""
     out = []

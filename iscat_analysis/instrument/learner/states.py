@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from iscat_analysis.instrument.learner.estimate import Estimate, maximise
-from iscat_analysis.instrument.learner.particle_images import Build, Settings, Sight
+from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage, Settings
 from iscat_analysis.instrument.learner.settings import PRIMARY, SECONDARY, free_names
 from iscat_analysis.instrument.learner.starts import (
     FOCUS_RANGE_NM,
@@ -55,7 +55,7 @@ class StateSearch:
     limits: Mapping[str, tuple[float, float]]
     mapper: Mapper = map
 
-    def run(self, averages: Sequence[Sight]) -> list[Estimate]:
+    def run(self, averages: Sequence[ParticleImage]) -> list[Estimate]:
         """Refine the most promising microscopes."""
         found = list(self.mapper(lambda state: self._begin(averages, state), self.states()))
         begun = [start for starts in found for start in starts if self._promising(start, found)]
@@ -92,7 +92,7 @@ class StateSearch:
 
     def _begin(
         self,
-        averages: Sequence[Sight],
+        averages: Sequence[ParticleImage],
         candidates: Sequence[Mapping[str, Any]],
         most: int = _STARTS,
     ) -> tuple[Start, ...]:
@@ -122,7 +122,10 @@ class StateSearch:
         return replace(start, values={**start.values, "reference_phase_deg": phase}, mass_kda=mass)
 
     def _refine(
-        self, averages: Sequence[Sight], begun: Sequence[Start], known: Sequence[Estimate] = ()
+        self,
+        averages: Sequence[ParticleImage],
+        begun: Sequence[Start],
+        known: Sequence[Estimate] = (),
     ) -> list[Estimate]:
         """Fit the averages from every start, and go on with those that lead after a few passes.
 
@@ -160,13 +163,15 @@ class StateSearch:
         ]
         return list(self.mapper(more, leading))
 
-    def _fit(self, sights: Sequence[Sight], start: Settings, passes: int) -> Estimate:
+    def _fit(self, sights: Sequence[ParticleImage], start: Settings, passes: int) -> Estimate:
         names = free_names(self.free, start, PRIMARY + SECONDARY)
         return maximise(
             sights, self.build, start, names, limits=self.limits, tolerance=_ROUGH, passes=passes
         )
 
-    def _hidden_masks(self, averages: Sequence[Sight], refined: Sequence[Estimate]) -> list[Start]:
+    def _hidden_masks(
+        self, averages: Sequence[ParticleImage], refined: Sequence[Estimate]
+    ) -> list[Start]:
         """Begin with a mask in every refined pupil that has none."""
         if "mask" not in self.free:
             return []

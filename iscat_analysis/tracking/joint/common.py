@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.joint.track_coupling import Coupling
 
 IntArray = NDArray[np.int64]
@@ -57,7 +57,9 @@ class CommonAmplitudes:
     frames: FloatArray
 
 
-def shared_errors(field: MovingField, ground: Ground, rows: Rows, judged: Judged) -> FloatArray:
+def shared_errors(
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, judged: Judged
+) -> FloatArray:
     """Say what the background adds to the errors of the rows.
 
     Shapes: result (n, 4, 4).
@@ -162,7 +164,7 @@ def _inverse(fisher: FloatArray, index: IntArray) -> FloatArray:
     return np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
 
 
-def _tracks(rows: Rows, judged: Judged, index: IntArray) -> list[IntArray]:
+def _tracks(rows: Localizations, judged: Judged, index: IntArray) -> list[IntArray]:
     """Give the rows of each track whose own information is no singular matrix."""
     known = np.linalg.det(_scaled(judged.fisher, index)[0]) > _SINGULAR
     order = np.argsort(rows.track, kind="stable")
@@ -171,7 +173,11 @@ def _tracks(rows: Rows, judged: Judged, index: IntArray) -> list[IntArray]:
 
 
 def common_amplitudes(
-    field: MovingField, ground: Ground, rows: Rows, judged: Judged, counted: BoolArray
+    field: MovingField,
+    ground: BackgroundEstimate,
+    rows: Localizations,
+    judged: Judged,
+    counted: BoolArray,
 ) -> CommonAmplitudes:
     """Fit one amplitude to all frames of each track, with the background that is most likely then.
 

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.background_response import Slopes
 from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, draw_frames
-from iscat_analysis._kernels.following import Slopes
 from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
 from iscat_analysis._kernels.moving import Room, Search, fit_frames
 from iscat_analysis._kernels.radial import POWERS

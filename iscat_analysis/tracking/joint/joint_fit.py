@@ -8,9 +8,9 @@ import numpy as np
 
 from iscat_analysis.medians import middle
 from iscat_analysis.records import BoolArray
-from iscat_analysis.tracking.joint.climbing import AMPLIFIED, climb
+from iscat_analysis.tracking.joint.ascent import AMPLIFIED, climb
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 
 MOST_TURNS = 12
 """Steps at most."""
@@ -30,7 +30,7 @@ _POWER_TURNS = 3  # over a background that stays
 _POWER_SETTLED = 1e-7
 
 
-def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
+def first_background(field: MovingField, *, follow_power: bool) -> BackgroundEstimate:
     """Median of frames, each over its power; of a long movie, of some that are spread over it."""
     power = np.ones(field.frames)
     if follow_power:
@@ -44,19 +44,19 @@ def first_ground(field: MovingField, *, follow_power: bool) -> Ground:
         level[row] = middle(np.ascontiguousarray(each.T))
 
     field.share(median, len(level))
-    return Ground(np.maximum(level, 1e-3), power)
+    return BackgroundEstimate(np.maximum(level, 1e-3), power)
 
 
 def settle(
     field: MovingField,
-    ground: Ground,
-    rows: Rows,
+    ground: BackgroundEstimate,
+    rows: Localizations,
     *,
     follow_power: bool,
     follow_level: bool = True,
     turns: int = MOST_TURNS,
     coarse: bool = False,
-) -> tuple[Rows, Ground, BoolArray]:
+) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
     """Fit rows and background in turn, to the maximum of their likelihood."""
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
     settled, foreseen, roughly = _SETTLED, _FORESEEN, _ROUGHLY
@@ -81,7 +81,7 @@ def settle(
             return climb(field, ground, rows, follow_power=follow_power)
         before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
-        ground = Ground(level, power)
+        ground = BackgroundEstimate(level, power)
         largest = max(largest, change)
         if change < _NEAR and largest > _FAR and not coarse:
             field.draw_anew()

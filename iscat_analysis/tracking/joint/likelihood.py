@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.background_response import Slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
@@ -33,19 +34,18 @@ from iscat_analysis._kernels.canvas import (
     add_squares,
     leave_over,
 )
-from iscat_analysis._kernels.following import Slopes
-from iscat_analysis._kernels.judging import judge_frames
 from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.scoring import CONVERGED
+from iscat_analysis._kernels.track_precision import judge_frames
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.exposures import Exposures
 from iscat_analysis.tracking.joint.frame_fits import draw_rows, fit_rows, room_for
-from iscat_analysis.tracking.joint.localizations import Ground, Judged, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.joint.newton import Response
 from iscat_analysis.tracking.joint.pictures import PictureBook
-from iscat_analysis.tracking.joint.render_plan import Sheet, blank
+from iscat_analysis.tracking.joint.render_plan import RenderPlan, blank
 
 IntArray = NDArray[np.int64]
 
@@ -105,7 +105,7 @@ class MovingField:
         self._coarse = Field(pixels, pixel_nm, roi_px // COARSE, roi_px, slack, True)
         if along_z:  # the rings tell one fringe from the next, and reach far
             self._coarse = self._whole
-        self._canvas: Sheet | None = None
+        self._canvas: RenderPlan | None = None
         self._room_of_slopes = np.empty(0, dtype=np.int16)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
@@ -179,7 +179,7 @@ class MovingField:
         self.draw_anew()
 
     def set_blurs(self, variances_nm2: FloatArray) -> None:
-        """Make the pictures that `Rows.group` numbers.
+        """Make the pictures that `Localizations.group` numbers.
 
         Shapes: `variances_nm2` (groups,).
         """
@@ -187,8 +187,13 @@ class MovingField:
         self._canvas = None
 
     def fit(
-        self, ground: Ground, rows: Rows, *, sweeps: int = 1, coarse: bool = False
-    ) -> tuple[Rows, Ground, BoolArray]:
+        self,
+        ground: BackgroundEstimate,
+        rows: Localizations,
+        *,
+        sweeps: int = 1,
+        coarse: bool = False,
+    ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
         """Fit every row over a background, and give the background under the rows.
 
         Rows that overlap follow one another in the end, but those of smaller squares, some of which
@@ -220,7 +225,7 @@ class MovingField:
 
         stretch = ground.power.sum() + self.sum_of(block)
         fitted = rows.fitted(theta, fisher, gain) if sweeps else rows
-        self._canvas = Sheet(fitted, canvas, coarse)
+        self._canvas = RenderPlan(fitted, canvas, coarse)
         if sweeps:
             own = np.ascontiguousarray(fisher[:, self.free[:4]][:, :, self.free[:4]])
             self._response = Response(
@@ -233,7 +238,11 @@ class MovingField:
         totals = self.frame_totals
         expected += light.background.sum()
         power = np.where(expected > 0, totals / np.where(expected > 0, expected, 1.0), 1.0)
-        return fitted, Ground(np.maximum(level, 1e-3), power / power.mean()), outcome == CONVERGED
+        return (
+            fitted,
+            BackgroundEstimate(np.maximum(level, 1e-3), power / power.mean()),
+            outcome == CONVERGED,
+        )
 
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
         """Give the step of the background whose first turn, with the last fit, is `move`.
@@ -242,7 +251,7 @@ class MovingField:
         """
         return self._response.step(move, self.total_e, self.used, damping)
 
-    def followed(self, rows: Rows, step: FloatArray) -> Rows:
+    def followed(self, rows: Localizations, step: FloatArray) -> Localizations:
         """Let the rows of the last fit follow a step of the background, to first order.
 
         Shapes: `step` (y, x).
@@ -256,7 +265,9 @@ class MovingField:
         """Draw all rings where their particles are, at the next pass."""
         self._canvas = None
 
-    def draw(self, ground: Ground, rows: Rows, *, coarse: bool = True) -> NDArray[np.float32]:
+    def draw(
+        self, ground: BackgroundEstimate, rows: Localizations, *, coarse: bool = True
+    ) -> NDArray[np.float32]:
         """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
 
         Shapes: result (t, y, x).
@@ -265,7 +276,9 @@ class MovingField:
         self.fit(ground, rows, sweeps=0, coarse=coarse)
         return self._room
 
-    def residual(self, ground: Ground, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+    def residual(
+        self, ground: BackgroundEstimate, rows: Localizations, first: int, last: int
+    ) -> NDArray[np.float32]:
         """Give the counts of some frames minus what is expected.
 
         Shapes: result (last - first, y, x).
@@ -279,7 +292,8 @@ class MovingField:
         return left
 
     def add_squares(
-        self, ground: Ground, rows: Rows, which: IntArray, corner: IntArray, owner: IntArray,
+        self, ground: BackgroundEstimate, rows: Localizations,
+        which: IntArray, corner: IntArray, owner: IntArray,
         out: FloatArray,
     ) -> None:  # fmt: skip
         """Put squares around rows on top of each other, with all rows taken off.
@@ -294,7 +308,7 @@ class MovingField:
 
         self.share(add, len(out))
 
-    def _signal(self, rows: Rows, first: int, last: int) -> NDArray[np.float32]:
+    def _signal(self, rows: Localizations, first: int, last: int) -> NDArray[np.float32]:
         """Draw the rows of some frames alone."""
         within = rows.only((rows.frame >= first) & (rows.frame < last))
         canvas = blank(np.empty((last - first, *self.used.shape), dtype=np.float32), within)
@@ -305,7 +319,7 @@ class MovingField:
         )
         return canvas.total
 
-    def judge(self, ground: Ground, rows: Rows) -> Judged:
+    def judge(self, ground: BackgroundEstimate, rows: Localizations) -> Judged:
         """Say what the likelihood knows of every row."""
         n = len(rows.frame)
         light = self._light(ground)
@@ -351,7 +365,9 @@ class MovingField:
         within = (places >= -0.5) & (places < np.array([columns, rows]) - 0.5)
         return np.asarray(within.all(axis=-1))
 
-    def refit(self, ground: Ground, rows: Rows, *, sweeps: int) -> tuple[Rows, BoolArray]:
+    def refit(
+        self, ground: BackgroundEstimate, rows: Localizations, *, sweeps: int
+    ) -> tuple[Localizations, BoolArray]:
         """Fit all particles of a few frames, the smaller square of each.
 
         Shapes: `converged` (n,).
@@ -379,7 +395,7 @@ class MovingField:
         self.share(block, -(-times.size // _SWEPT))
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
-    def on_wall(self, rows: Rows) -> BoolArray:
+    def on_wall(self, rows: Localizations) -> BoolArray:
         """Tell which rows ended on a wall of the search.
 
         Shapes: result (n,).
@@ -394,19 +410,19 @@ class MovingField:
         near, far = self._pictures
         return near, near if coarse and not self.free[2] else far
 
-    def _light(self, ground: Ground) -> Light:
+    def _light(self, ground: BackgroundEstimate) -> Light:
         level, read = (np.where(self.used, part, 0.0) for part in (ground.level, self.read_e2))
         shot = self.exposures
         return Light(shot.counts, shot.gain, shot.offset, ground.power, level, read)
 
-    def _canvas_for(self, rows: Rows, *, coarse: bool) -> Canvas:
+    def _canvas_for(self, rows: Localizations, *, coarse: bool) -> Canvas:
         """Give the canvas, with the frames marked in which it holds other rows than these."""
         last = self._canvas
         if last is None or last.coarse != coarse:
             canvas = blank(self._room, rows)
         else:
             canvas = last.moved(rows, self.frames)
-        self._canvas = Sheet(rows, canvas, coarse)
+        self._canvas = RenderPlan(rows, canvas, coarse)
         return canvas
 
     def _slopes_of(self, rows: int, side: int) -> Slopes:

@@ -9,14 +9,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.following import Slopes
+from iscat_analysis._kernels.background_response import Slopes
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Rows:
+class Localizations:
     """Particles in frames, in the order of the frames."""
 
     frame: IntArray
@@ -29,7 +29,7 @@ class Rows:
     @classmethod
     def of(
         cls, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray | None = None
-    ) -> Rows:
+    ) -> Localizations:
         """Put rows, none of them fitted yet, into the order of their frames."""
         n = len(frame)
         blur = np.zeros(n, dtype=np.int64) if group is None else group
@@ -37,24 +37,28 @@ class Rows:
         return cls(frame, track, theta, blur, *unknown).in_order()
 
     @classmethod
-    def together(cls, parts: Sequence[Rows]) -> Rows:
+    def together(cls, parts: Sequence[Localizations]) -> Localizations:
         """Take rows of several, one after the other."""
         every = ([getattr(rows, part.name) for rows in parts] for part in fields(cls))
         return cls(*map(np.concatenate, every))
 
-    def in_order(self) -> Rows:
+    def in_order(self) -> Localizations:
         """Put them into the order of their frames, and in a frame of their tracks."""
         return self.only(np.lexsort((self.track, self.frame)))
 
-    def joined(self, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray) -> Rows:
+    def joined(
+        self, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray
+    ) -> Localizations:
         """Add rows that are not fitted yet."""
-        return Rows.together([self, Rows.of(frame, track, theta, group)]).in_order()
+        return Localizations.together(
+            [self, Localizations.of(frame, track, theta, group)]
+        ).in_order()
 
-    def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Rows:
+    def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Localizations:
         """Put rows at their estimates, with their informations and gains in log-likelihood."""
         return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
 
-    def recalling(self, old: Rows) -> Rows:
+    def recalling(self, old: Localizations) -> Localizations:
         """Give rows that are the same in others what these know of their fits."""
         many = int(max(self.track.max(initial=0), old.track.max(initial=0))) + 1
         keys, sought = old.frame * many + old.track, self.frame * many + self.track
@@ -69,9 +73,9 @@ class Rows:
         first: IntArray = np.searchsorted(self.frame, np.arange(frames + 1)).astype(np.int64)
         return first
 
-    def only(self, kept: BoolArray | IntArray) -> Rows:
+    def only(self, kept: BoolArray | IntArray) -> Localizations:
         """Take some of the rows."""
-        return Rows(*(getattr(self, part.name)[kept] for part in fields(self)))
+        return Localizations(*(getattr(self, part.name)[kept] for part in fields(self)))
 
     def pairs_within(self, limit_nm: float) -> IntArray:
         """Give the pairs of rows of a frame that are no farther apart than a limit.
@@ -85,7 +89,7 @@ class Rows:
 
 
 @dataclass(frozen=True)
-class Ground:
+class BackgroundEstimate:
     """The light without the particles."""
 
     level: FloatArray
@@ -119,7 +123,7 @@ class Judged:
         *,
         free: BoolArray,
     ) -> Judged:
-        """Make it of what `iscat_analysis._kernels.judging.judge_frames` fills.
+        """Make it of what `iscat_analysis._kernels.track_precision.judge_frames` fills.
 
         Shapes: `free` (4,).
         """

@@ -11,14 +11,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.canvas import Light
-from iscat_analysis._kernels.following import (
+from iscat_analysis._kernels.background_response import (
     Clusters,
     Slopes,
     find_clusters,
     follow_rows,
     join_rows,
 )
+from iscat_analysis._kernels.canvas import Light
 from iscat_analysis.records import BoolArray, FloatArray
 
 _PARTS = 8  # of the clusters, that threads take in turn

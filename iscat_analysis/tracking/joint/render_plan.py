@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import Canvas
-from iscat_analysis.tracking.joint.localizations import Rows
+from iscat_analysis.tracking.joint.localizations import Localizations
 
 
 @dataclass(frozen=True)
-class Sheet:
+class RenderPlan:
     """A canvas and the rows that are on it."""
 
-    rows: Rows
+    rows: Localizations
     canvas: Canvas
     coarse: bool
 
-    def moved(self, rows: Rows, frames: int) -> Canvas:
+    def moved(self, rows: Localizations, frames: int) -> Canvas:
         """Turn to other rows; frames in which they are not the same ones are marked."""
         old, canvas = self.rows, self.canvas
         here, there = rows.starts(frames), old.starts(frames)
@@ -33,7 +33,7 @@ class Sheet:
         return Canvas(canvas.total, rings, squares, canvas.drawn & same)
 
 
-def blank(room: NDArray[np.float32], rows: Rows) -> Canvas:
+def blank(room: NDArray[np.float32], rows: Localizations) -> Canvas:
     """Make a canvas with nothing drawn on it yet.
 
     Shapes: `room` (t, y, x).

@@ -10,18 +10,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.following import Slopes
-from iscat_analysis._kernels.sharing import follow, own_shares, send
+from iscat_analysis._kernels.background_response import Slopes
+from iscat_analysis._kernels.track_background_operator import follow, own_shares, send
 from iscat_analysis.records import FloatArray
 from iscat_analysis.tracking.joint.likelihood import MovingField
-from iscat_analysis.tracking.joint.localizations import Ground
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate
 
 
 class Coupling:
     """Some rows and the pixels of their squares."""
 
     def __init__(
-        self, field: MovingField, ground: Ground, slopes: Slopes, rows: NDArray[np.int64]
+        self,
+        field: MovingField,
+        ground: BackgroundEstimate,
+        slopes: Slopes,
+        rows: NDArray[np.int64],
     ) -> None:
         self._slopes, self._rows = slopes, rows
         squares = slopes.squares[rows]

@@ -1,6 +1,6 @@
 """What the rows of one track send to the pixels of their background, and feel of it.
 
-A row knows its pixels by its slopes G = w B ∂C (see `iscat_analysis._kernels.following`).  All is
+A row knows its pixels by its slopes G = w B ∂C (see `background_response`).  All is
 done row by row, for several images at once, so that the slopes are read from memory once.
 """
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.following import Slopes, look, mix, product, put
+from iscat_analysis._kernels.background_response import Slopes, look, mix, product, put
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]

@@ -14,7 +14,7 @@ import numpy as np
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.likelihood import BLOCK, MovingField
-from iscat_analysis.tracking.joint.localizations import Ground, Rows
+from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 
 AMPLIFIED = 5.0
 """Newton's step over the move of one turn, from which it is not trusted."""
@@ -28,14 +28,14 @@ _DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
 
 
 def climb(
-    field: MovingField, ground: Ground, rows: Rows, *, follow_power: bool
-) -> tuple[Rows, Ground, BoolArray]:
+    field: MovingField, ground: BackgroundEstimate, rows: Localizations, *, follow_power: bool
+) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
     """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""
     counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
     damping, best, kept = _DAMPING, -np.inf, (rows, ground)
     for _ in range(_MOST_STEPS):
         rows, found, done = field.fit(ground, rows)
-        found = Ground(found.level, found.power if follow_power else ground.power)
+        found = BackgroundEstimate(found.level, found.power if follow_power else ground.power)
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
         value = log_likelihood(field, found, rows)
         if value < best - _NOISE:
@@ -45,7 +45,7 @@ def climb(
         best, kept = max(best, value), (rows, found)
         damping = max(_SOFTER * damping, _DAMPING)
         step, gain = _uphill(field, move, counts, damping)
-        ground = Ground(found.level * np.exp(step - move), found.power)
+        ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
         if gain < _ENOUGH:
             return field.followed(rows, step), ground, done
     return *kept, done
@@ -63,7 +63,7 @@ def _uphill(
         damping *= _STIFFER
 
 
-def log_likelihood(field: MovingField, ground: Ground, rows: Rows) -> float:
+def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> float:
     """Give the log-likelihood of rows over the background that is most likely under them."""
     total, power = field.draw(ground, rows, coarse=False), ground.power
 

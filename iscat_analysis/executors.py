@@ -58,7 +58,7 @@ def versions() -> dict[str, str]:
     }
 
 
-class Place(Protocol):
+class Executor(Protocol):
     """Where jobs run."""
 
     @property
@@ -78,31 +78,31 @@ class Place(Protocol):
         """Say what a user should know before work begins."""
 
 
-class Here:
+class LocalExecutor:
     """The process that asks: one job after the other."""
 
     distant = False
 
     def threads(self, wanted: int) -> int:
-        """Use as many as are wanted; see `Place`."""
+        """Use as many as are wanted; see `Executor`."""
         return wanted
 
     def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
-        """Do a job; see `Place`."""
+        """Do a job; see `Executor`."""
         return job(*arguments, progress=progress)
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, in order; see `Place`."""
+        """Do something with every item, in order; see `Executor`."""
         for number, item in enumerate(items):
             yield number, work(item)
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
-        """Say nothing; see `Place`."""
+        """Say nothing; see `Executor`."""
         del memory_limit_mb
         return []
 
 
-class Cluster:
+class DaskExecutor:
     """The workers of a Dask cluster; `open_place` connects to one."""
 
     distant = True
@@ -118,7 +118,7 @@ class Cluster:
 
         def look(dask_worker: Any) -> dict[str, Any]:  # sent by value: all may be missing there
             try:
-                from iscat_analysis.places import versions
+                from iscat_analysis.executors import versions
 
                 found = versions()
             except ImportError:
@@ -131,11 +131,11 @@ class Cluster:
             self._memory[worker] = found["memory"]
 
     def threads(self, wanted: int) -> int:
-        """Use as many as are wanted; see `Place`."""
+        """Use as many as are wanted; see `Executor`."""
         return wanted
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
-        """Say which workers are missing or have too little memory; see `Place`."""
+        """Say which workers are missing or have too little memory; see `Executor`."""
         if not self._memory:
             return [f"{self._address} has no workers yet; the work begins with the first"]
         needed = memory_limit_mb + _BASE_MB
@@ -150,7 +150,7 @@ class Cluster:
         ]
 
     def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
-        """Do a job on a worker; see `Place`."""
+        """Do a job on a worker; see `Executor`."""
         from distributed import KilledWorker
 
         del progress
@@ -183,7 +183,7 @@ class Cluster:
         return received
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, one for each worker at a time; see `Place`."""
+        """Do something with every item, one for each worker at a time; see `Executor`."""
         waiting = deque(enumerate(items))
         running: dict[Future[R], int] = {}
         pool = ThreadPoolExecutor(_MOST_AT_ONCE, thread_name_prefix="job")
@@ -262,7 +262,7 @@ def _work(expected: dict[str, str], sent: bytes) -> bytes:
 @contextmanager
 def open_place(
     scheduler: str = THREADS, scheduler_file: str | Path | None = None
-) -> Iterator[Place]:
+) -> Iterator[Executor]:
     """Connect to where work shall run."""
     for name, value in (("scheduler", scheduler), ("scheduler_file", scheduler_file)):
         if value is not None and not isinstance(value, (str, Path)):
@@ -275,7 +275,7 @@ def open_place(
             )
         scheduler = _address_in(Path(scheduler_file))
     elif scheduler == THREADS:
-        yield Here()
+        yield LocalExecutor()
         return
     elif ":" not in scheduler:
         raise ConfigError(
@@ -287,7 +287,7 @@ def open_place(
     client = _connected(scheduler)
     try:
         logger.setLevel(logging.CRITICAL)
-        yield Cluster(client, scheduler)
+        yield DaskExecutor(client, scheduler)
     finally:
         client.close()
         logger.setLevel(level)

@@ -11,7 +11,7 @@ Key = TypeVarTuple("Key")
 T = TypeVar("T")
 
 
-def kept(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
+def memoize(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
     """Keep the last few results of a function.
 
     Threads that ask for the same at the same time wait for the one that makes it; with

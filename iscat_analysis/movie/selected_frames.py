@@ -14,7 +14,7 @@ S = TypeVar("S", bound=FrameSource)
 
 
 @dataclass(frozen=True, eq=False)
-class KeptFrames(Generic[S]):
+class SelectedFrames(Generic[S]):
     """Some frames of a stack."""
 
     source: S

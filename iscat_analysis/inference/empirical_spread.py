@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri, stdtr, stdtrit
 
-from iscat_analysis.inference.repeats import LENGTHS
+from iscat_analysis.inference.split_frames import LENGTHS
 
 FloatArray = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ _FEWEST_COUNTS = 200
 
 
 @dataclass(frozen=True)
-class Achieved:
+class EmpiricalSpread:
     """Measured spread of one parameter over its bound."""
 
     over_crb: float
@@ -91,7 +91,7 @@ def pooled(
     *,
     shared: float = 1.0,
     distances: tuple[float, ...] | None = None,
-) -> Achieved | None:
+) -> EmpiricalSpread | None:
     """Pool the repeats of one parameter.
 
     Notes
@@ -119,7 +119,7 @@ def pooled(
     # what Student's law makes of the error, in normal standard errors
     chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
     significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))
-    return Achieved(
+    return EmpiricalSpread(
         over_crb=ratio,
         ci95=(ratio * math.exp(-reach), ratio * math.exp(reach)),
         events=len(own),

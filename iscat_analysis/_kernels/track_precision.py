@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.background_response import Slopes, keep_slopes
 from iscat_analysis._kernels.canvas import (
     Canvas,
     Field,
@@ -20,7 +21,6 @@ from iscat_analysis._kernels.canvas import (
     stage,
 )
 from iscat_analysis._kernels.dense import factorise
-from iscat_analysis._kernels.following import Slopes, keep_slopes
 from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
