@@ -114,11 +114,6 @@ def over_frames(pool: ThreadPoolExecutor, shape: tuple[int, ...]) -> Mapper:
     return pool.map if math.prod(shape) >= _LARGE_PX else map
 
 
-def is_allotted() -> bool:
-    """Tell whether work in this thread has the threads of a place, and no more."""
-    return _ALLOTTED.get() is not None
-
-
 @contextmanager
 def allotted(count: int, stop: Callable[[], None]) -> Iterator[None]:
     """Let `threads` start as many threads as a place has, whatever number it is asked for."""

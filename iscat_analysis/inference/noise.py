@@ -160,9 +160,7 @@ def parts_of(free: Collection[str], *, posteriors: bool) -> tuple[str, ...]:
     return tuple(part for part, is_needed in needed.items() if is_needed)
 
 
-def compile_kernels(
-    model: ForwardModel, parts: Collection[str], *, backwards: bool = False
-) -> None:
+def compile_kernels(model: ForwardModel, parts: Collection[str]) -> None:
     """Run the kernels of fits once on a few pixels, so that later calls find them compiled."""
     grid = PixelGrid.region((0, 3), (0, 3), 10.0)
     counts = np.full(grid.shape, 100.0)
@@ -190,5 +188,5 @@ def compile_kernels(
         calls = [maximise, differentiate, *calls]
     if "posteriors" in parts:
         calls.append(lambda: likelihood.values(theta[None]))
-    for call in reversed(calls) if backwards else calls:
+    for call in calls:
         call()
