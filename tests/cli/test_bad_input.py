@@ -441,9 +441,9 @@ if sys.argv[1] == "simulate":
     from iscat_analysis.study import simulate
     simulate._counted = counted
 else:
-    from iscat_analysis import pipeline
+    from iscat_analysis import report
     from iscat_cli import ending
-    pipeline.fill_report = fill_report
+    report.fill_report = fill_report
     ending.WRITING_GRACE_S = 0.5
 sys.exit(iscat_cli.main())
 """

@@ -485,7 +485,7 @@ def test_tracks_are_kept_where_their_report_is_interrupted(
 
     config, out = _config(), tmp_path / "cut.iscat"
     with monkeypatch.context() as patch:
-        where = (finish_module, "summary_of") if late == "tracks" else (pipeline, "fill_report")
+        where = (finish_module, "summary_of") if late == "tracks" else (pipeline, "write_report")
         patch.setattr(*where, stop)
         with pytest.raises(KeyboardInterrupt) as stopped:
             fit_stack(movie, config, out=out)
