@@ -37,6 +37,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: is not a text file in UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not valid TOML: {_explain(text, str(error))}") from None
+    except ValueError:  # a NUL in the name
+        raise ConfigError(f"{str(path)!r}: is no name of a file; check the path") from None
     _anchor_paths(values, path.parent)
     return values
 

@@ -217,3 +217,8 @@ def test_errors_of_the_library_say_one_line() -> None:
     with pytest.raises(IscatError) as caught:
         load_config(None, ["optics.nas=1", "camera.pixel_size_nm=-1"])
     one_line(caught.value)
+
+
+def test_a_name_that_no_file_can_have_is_refused() -> None:
+    with pytest.raises(ConfigError, match="is no name of a file"):
+        load_config(None, ["optics.file=\0"])

@@ -45,7 +45,7 @@ def test_every_non_python_file_is_package_data(repo_root: Path, project: dict) -
     found = {
         path
         for path in (repo_root / "iscat_analysis").rglob("*")
-        if path.is_file() and path.suffix not in {".py", ".pyc", ".nbi", ".nbc"}
+        if path.is_file() and path.suffix != ".py" and path.parent.name != "__pycache__"
     }
     assert found <= covered
 
