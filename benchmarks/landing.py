@@ -45,7 +45,7 @@ from iscat_analysis.study.simulate import write_stack
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"
 CONFIG = ROOT.parent / "sample_configs" / "landing.toml"
-JOB_MB_PER_S, GROWTH_MB_PER_S, RATIO, MEMORY_MB = 150.0, 300.0, 5.0, 1000.0
+JOB_MB_PER_S, GROWTH_MB_PER_S, RATIO, MEMORY_MB = 90.0, 300.0, 5.0, 1000.0
 WINDOW = 100
 LOOK_S = 0.1
 """Between two looks at how much memory a job has."""
