@@ -140,15 +140,33 @@ class Result:
         return draw_event(self.analysis, event)
 
     def overview(self) -> Figure:
-        """Draw the field of view, its events numbered."""
+        """Draw the field of view, its events numbered.
+
+        Returns
+        -------
+        Figure
+            Image with a ring for each event.
+        """
         return draw(self.analysis, "overview")
 
     def histogram(self) -> Figure:
-        """Draw the histogram of the masses [kDa]; of the heights [nm] where the mass is fixed."""
+        """Draw the histogram of the masses [kDa]; of the heights [nm] where the mass is fixed.
+
+        Returns
+        -------
+        Figure
+            Histogram of all events that are ok.
+        """
         return draw(self.analysis, "histogram")
 
     def precision(self) -> Figure:
-        """Draw each event's σ and QCRB against its CRB, for every free parameter."""
+        """Draw each event's σ and QCRB against its CRB, for every free parameter.
+
+        Returns
+        -------
+        Figure
+            One panel for each free parameter.
+        """
         return draw(self.analysis, "precision")
 
     def corner(self, event: int) -> Figure:
@@ -199,11 +217,23 @@ class Result:
         return arviz.InferenceData(**{name: group.isel(event=0) for name, group in groups.items()})
 
     def trackpy(self) -> pd.DataFrame:
-        """Mode ``track``: the tracks in trackpy's layout; see `to_trackpy`."""
+        """Mode ``track``: the tracks in trackpy's layout; see `to_trackpy`.
+
+        Returns
+        -------
+        DataFrame
+            One row for each position of a track.
+        """
         return to_trackpy(self.table)
 
     def napari(self) -> FloatArray:
-        """Mode ``track``: the tracks as an array (track, t, y, x); see `to_napari`."""
+        """Mode ``track``: the tracks as an array (track, t, y, x); see `to_napari`.
+
+        Returns
+        -------
+        ndarray, shape (n, 4)
+            One row for each position of a track.
+        """
         return to_napari(self.table)
 
     def save(self, folder: str | Path, *, overwrite: bool = False) -> Path:
