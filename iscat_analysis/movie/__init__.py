@@ -119,10 +119,9 @@ def open_stack(
         if value is not None and not (isinstance(value, Real) and 0 < value < math.inf):
             raise ConfigError(f"{key} = {value!r} must be a positive number")
     source = "arguments" if any(value is not None for value in said.values()) else "none"
+    metadata = StackMetadata(pixel_size_nm, exposure_ms, frame_rate_hz, source=source)
     name = name or "array"
-    return Stack(
-        Path(name), ArrayFrames(movie, name, StackMetadata(**said, source=source)), files=()
-    )
+    return Stack(Path(name), ArrayFrames(movie, name, metadata), files=())
 
 
 def _open_file(address: Path) -> Stack:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.records import StackMetadata
 
 TIME_FROM_HEIGHTS = (
@@ -55,7 +56,7 @@ Resolution = tuple[float, float, int]
 class Hints:
     """Pixel size along x and y [nm], exposure [ms] and frame rate [Hz] from one kind of metadata.
 
-    None where it is silent; `source` is as in `StackMetadata`.
+    None where it is silent; `ticks` and `source` are as in `StackMetadata`.
     """
 
     source: str
@@ -63,6 +64,7 @@ class Hints:
     pixel_y_nm: float | None = None
     exposure_ms: float | None = None
     frame_rate_hz: float | None = None
+    ticks: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -156,28 +158,30 @@ def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
     return {axis: int(length) for axis, length in lengths.items() if length is not None}
 
 
+def elapsed_ms(frame: object) -> float | None:
+    """Read when Micro-Manager received a frame [ms]; None where its metadata are silent."""
+    value = _mm_value(frame.get("ElapsedTime-ms")) if isinstance(frame, dict) else None
+    return 0.0 if value in (0, 0.0) else positive(value)
+
+
 def micro_manager_hints(
-    first: object, last: object, n_frames: int, summary: Mapping[str, Any]
+    first: object, times_ms: Sequence[float | None], summary: Mapping[str, Any]
 ) -> Hints:
-    """Read Micro-Manager's metadata."""
-    begin, end = (found if isinstance(found, dict) else {} for found in (first, last))
+    """Read Micro-Manager's metadata: those of the first frame, the times of all, the summary."""
+    begin = first if isinstance(first, dict) else {}
 
     def find(name: str) -> float | None:
         return _mm_number(begin.get(name)) or _mm_number(summary.get(name))
 
     pixel = positive(find("PixelSizeUm"), 1e3)
     exposure = find("Exposure-ms")
+    rate, ticks = measure_clock({k: t / 1e3 for k, t in enumerate(times_ms) if t is not None})
     interval = find("Interval_ms")
-    if interval is not None and exposure is not None and interval < exposure:
-        interval = None
-    if interval is None and n_frames > 1:
-        start, stop = (_mm_value(frame.get("ElapsedTime-ms")) for frame in (begin, end))
-        started = 0.0 if start in (0, 0.0) else positive(start)
-        stopped = positive(stop)
-        if started is not None and stopped is not None:
-            interval = positive((stopped - started) / (n_frames - 1))
-    rate = None if interval is None else positive(1e3 / interval)
-    return Hints("micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate)
+    if interval is not None and (exposure is None or interval >= exposure) and ticks is None:
+        rate = positive(1e3 / interval)
+    return Hints(
+        "micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate, ticks=ticks
+    )
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
@@ -224,7 +228,8 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
             )
         found |= fresh
         sources += [hint.source] if fresh else []
-    return StackMetadata(**found, source="+".join(sources) or "none")
+    ticks = next((hint.ticks for hint in hints if hint.ticks is not None), None)
+    return StackMetadata(**found, ticks=ticks, source="+".join(sources) or "none")
 
 
 def _plausible(*sizes_nm: float | None) -> bool:

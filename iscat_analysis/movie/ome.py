@@ -5,6 +5,7 @@ Schema: https://www.openmicroscopy.org/Schemas/OME/2016-06
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.movie.descriptions import (
     LENGTH_NM,
     TIME_S,
@@ -224,31 +226,31 @@ def _hints(pixels: ElementTree.Element, axis: str) -> Hints:
     )
     increment_unit = _factor(pixels, "TimeIncrementUnit", "s", TIME_S)
     increment = positive(pixels.get("TimeIncrement"), increment_unit) if increment_unit else None
-    rate = inverse(increment) or _rate_from_planes(planes, f"The{axis}")
+    rate, ticks = measure_clock(_times_s(planes, f"The{axis}"))
+    if ticks is None:
+        rate = inverse(increment) or rate
     return Hints(
         "ome",
         pixel_x_nm=_length(pixels, "PhysicalSizeX"),
         pixel_y_nm=_length(pixels, "PhysicalSizeY"),
         exposure_ms=next((value for value in exposures if value is not None), None),
         frame_rate_hz=rate,
+        ticks=ticks,
     )
 
 
-def _rate_from_planes(planes: list[ElementTree.Element], name: str) -> float | None:
-    """Mean rate between the first and the last frame that carry a time stamp."""
-    stamps = []
+def _times_s(planes: list[ElementTree.Element], name: str) -> dict[int, float]:
+    """Give the times of the frames that carry one."""
+    times = {}
     for plane in planes:
         factor = _factor(plane, "DeltaTUnit", "s", TIME_S)
         try:
-            stamp = (int(plane.get(name, "")), float(plane.get("DeltaT", "")))
+            frame, time = int(plane.get(name, "")), float(plane.get("DeltaT", ""))
         except ValueError:
             continue
-        if factor is not None:
-            stamps.append((stamp[0], stamp[1] * factor))
-    if len(stamps) < 2:
-        return None
-    (first, begin), (last, end) = min(stamps), max(stamps)
-    return positive((last - first) / (end - begin)) if end > begin else None
+        if factor is not None and math.isfinite(time):
+            times[frame] = time * factor
+    return times
 
 
 def _length(element: ElementTree.Element, name: str) -> float | None:

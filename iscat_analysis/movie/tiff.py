@@ -28,6 +28,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import (
     TIME_FROM_HEIGHTS,
     described_frames,
+    elapsed_ms,
     imagej_hints,
     merge,
     micro_manager_axes,
@@ -231,12 +232,12 @@ def _open(
     if frames[0].start is None:
         refuse_growth(n_frames * size, len(data), BOMB_RATIO, "it", path)
 
-    stamps = [file.pages[k].tags.valueof(_MICRO_MANAGER) for k in (order[0], order[-1])]
-    if stamps[0] is not None or _MICRO_MANAGER in first.tags:
+    if _MICRO_MANAGER in first.tags:
         summary = _micro_manager_summary(path)
         if ome_text is None and not member:
             time_axis(micro_manager_axes(summary), path)
-        hints.append(micro_manager_hints(stamps[0], stamps[1], len(frames), summary))
+        times_ms = [image.elapsed_ms for image in frames]
+        hints.append(micro_manager_hints(first.tags.valueof(_MICRO_MANAGER), times_ms, summary))
     resolution = _resolution(file.pages[0])
     hints += [imagej_hints(text, resolution) for text in texts if text.startswith("ImageJ=")]
     hints.append(plain_hints(resolution))
@@ -294,6 +295,7 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Im
             page.dataoffsets,
             page.databytecounts,
             page.dataoffsets[0] if page.is_final else None,
+            elapsed_ms(page.tags.valueof(_MICRO_MANAGER)),
         )
         pattern = repetition_of(file.tiff, data, page.offset, sum(image.sizes))
         yield image

@@ -44,6 +44,7 @@ class Image:
     offsets: tuple[int, ...]
     sizes: tuple[int, ...]
     start: int | None
+    elapsed_ms: float | None
 
     def __str__(self) -> str:
         return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"

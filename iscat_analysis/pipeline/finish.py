@@ -82,12 +82,14 @@ def gather(
     films: tuple[Film, ...] = ()
     if found.followed is not None:
         followed = found.followed
+        recorded = ready.movie.metadata.ticks
+        ticks = None if recorded is None else np.array(recorded)
         tracks, said = tracks_of(
             scene, table, followed.windows,
-            masses=followed.masses, tell=run.tell, progress=progress,
+            masses=followed.masses, ticks=ticks, tell=run.tell, progress=progress,
         )  # fmt: skip
         further |= said
-        for text in warnings_of(table, config.camera.frame_rate_hz):
+        for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
             run.tell(text)
         flat = plane_warning(config, table)
         if flat:

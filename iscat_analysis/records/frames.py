@@ -23,7 +23,10 @@ class StackMetadata:
     exposure_ms : float or None
         Exposure of one frame [ms].
     frame_rate_hz : float or None
-        Frames per second [Hz].
+        Frames per second [Hz]; the camera's own, where frames are missing.
+    ticks : tuple of int or None
+        Intervals of the camera from the first frame to each, shape (t,), where frames are missing;
+        None where each frame is one interval after the other, or nothing says so.
     source : str
         Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
     """
@@ -31,6 +34,7 @@ class StackMetadata:
     pixel_size_nm: float | None = None
     exposure_ms: float | None = None
     frame_rate_hz: float | None = None
+    ticks: tuple[int, ...] | None = None
     source: str = "none"
 
 

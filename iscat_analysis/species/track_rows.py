@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -56,6 +56,13 @@ class TrackRows:
         for status in NO_PLACE:
             useful &= self.status != status
         return self.only(useful)
+
+    def timed(self, ticks: NDArray[np.int64] | None) -> TrackRows:
+        """Count the camera's intervals instead of frames, some of which are missing.
+
+        Shapes: `ticks` (t,).
+        """
+        return self if ticks is None else replace(self, frame=1.0 * ticks[self.frame.astype(int)])
 
     def positions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Give frames, places and their errors, shapes (n,), (n, 2) and (n, 2) [nm]."""

@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from iscat_analysis.records import (
@@ -92,6 +93,8 @@ class TrackSetup:
     n_medium: float = 1.33
     change: float = 0.0
     hidden_nm: float = 0.0
+    ticks: NDArray[np.int64] | None = None
+    """Intervals of the camera from the movie's first frame to each, where frames are missing."""
 
 
 Correlation = Callable[[FloatArray], FloatArray]
@@ -116,7 +119,7 @@ def describe_tracks(
     )
     nearest = nearest_nm(groups)
     exact = {} if masses is None else masses.to_dict("index")
-    places = {track: rows.placed() for track, rows in groups.items()}
+    places = {track: rows.placed().timed(setup.ticks) for track, rows in groups.items()}
     motions = _motions(places, setup, seed, workers, progress)
     records = []
     for track, rows in groups.items():

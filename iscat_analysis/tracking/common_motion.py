@@ -59,9 +59,11 @@ class _Steps:
         return sums.astype(np.float64)
 
 
-def warnings_of(fits: pd.DataFrame, frame_rate_hz: float | None) -> Iterator[str]:
-    """Say what all particles do at once."""
-    steps = _steps_of(fits)
+def warnings_of(
+    fits: pd.DataFrame, frame_rate_hz: float | None, ticks: IntArray | None = None
+) -> Iterator[str]:
+    """Say what all particles do at once; `ticks` (t,) tells which frames are missing."""
+    steps = _steps_of(fits, ticks)
     if steps is None:
         return
     shaken = _shaking(steps, frame_rate_hz)
@@ -77,13 +79,15 @@ def warnings_of(fits: pd.DataFrame, frame_rate_hz: float | None) -> Iterator[str
         yield from (said for _, said in jumps)
 
 
-def _steps_of(fits: pd.DataFrame) -> _Steps | None:
+def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
     """Gather the steps of all tracks; None where too few particles are seen at once."""
     sound = fits["status"].eq(Status.OK).groupby(fits["track"]).transform("mean") > _SOUND
     good = fits.loc[sound & ~fits["status"].isin(NO_PLACE), ["track", "frame", "x_nm", "y_nm"]]
     good = good.sort_values(["track", "frame"])
     step = good.diff()
     next_ = ((step["track"] == 0) & (step["frame"] == 1)).to_numpy()
+    if ticks is not None:
+        next_ = next_ & (np.diff(ticks[good["frame"].to_numpy(int)], prepend=-1) == 1)
     xy = step.loc[next_, ["x_nm", "y_nm"]].to_numpy(float)
     track, frame = (good.loc[next_, name].to_numpy(dtype=np.int64) for name in ("track", "frame"))
     variance = np.full(len(track), np.nan)

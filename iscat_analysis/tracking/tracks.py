@@ -99,11 +99,12 @@ def tracks_of(
     windows: Windows,
     *,
     masses: pd.DataFrame | None,
+    ticks: NDArray[np.int64] | None,
     tell: Callable[[str], None],
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Describe the tracks of a movie."""
-    setup = track_setup(scene, windows)
+    setup = replace(track_setup(scene, windows), ticks=ticks)
     setup = replace(setup, change=changes_together(fits, setup.frames))
     with one_thread_algebra():
         tracks = describe_tracks(

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
+from numpy.typing import NDArray
 from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.records import StackMetadata
 
 FRAMES = 5
+INTERVAL_MS = 5.02
 OME = (
     '<?xml version="1.0" encoding="UTF-8"?>'
     '<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">'
@@ -286,3 +289,68 @@ def test_resolution_tags(
 
 def test_a_resolution_of_zero_is_ignored(path: Path) -> None:
     assert metadata(described(path, "", resolution=(([0, 1], [1, 0]), 3))) == StackMetadata()
+
+
+# --- frames that the camera dropped ------------------------------------------------------------
+
+
+def clock(kept: NDArray[np.int64], late_ms: float, seed: int) -> dict[int, float]:
+    """Make up when a computer received frames of a camera [s], in whole ms and somewhat late."""
+    late = np.random.default_rng(seed).exponential(late_ms, kept.size) if late_ms else 0.0
+    times_ms = np.maximum.accumulate(np.floor(INTERVAL_MS * kept + late))
+    return dict(enumerate((times_ms / 1e3).tolist()))
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_times_tell_which_frames_are_missing(share: float, late_ms: float, seed: int) -> None:
+    kept = np.flatnonzero(np.random.default_rng(seed).random(3000) >= share)
+    rate, ticks = measure_clock(clock(kept, late_ms, seed=2))
+    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=1e-4)
+    assert ticks is not None
+    wrong = np.diff(ticks) != np.diff(kept)  # where one was late by more than half an interval
+    assert np.mean(wrong) < 0.05
+
+
+@pytest.mark.parametrize("late_ms", [0.0, 0.3, 1.0])
+def test_late_frames_are_not_missing(late_ms: float) -> None:
+    rate, ticks = measure_clock(clock(np.arange(3000), late_ms, seed=2))
+    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=1e-4)
+    assert ticks is None
+
+
+def test_times_without_order_tell_a_mean_rate_alone() -> None:
+    kept = np.arange(1000)
+    rate, ticks = measure_clock(clock(kept, 20.0, seed=3))
+    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=0.02)
+    assert ticks is None
+
+
+def test_a_burst_of_missing_frames() -> None:
+    kept = np.r_[0:100, 140:300]
+    rate, ticks = measure_clock(clock(kept, 0.0, seed=0))
+    assert ticks == tuple(kept.tolist())
+    assert rate == pytest.approx(1e3 / INTERVAL_MS, rel=1e-3)
+
+
+def test_times_that_run_backwards_tell_a_mean_rate_alone() -> None:
+    assert measure_clock({0: 0.0, 1: 0.02, 2: 0.01, 3: 0.03}) == (pytest.approx(100), None)
+    assert measure_clock({0: 1.0, 1: 1.0, 2: 1.0}) == (None, None)
+    assert measure_clock({}) == (None, None)
+
+
+def test_missing_frames_of_ome_and_micro_manager(path: Path) -> None:
+    times = [0, 5, 10, 25, 30]
+    body = "".join(
+        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{time}" DeltaTUnit="ms"/>'
+        for t, time in enumerate(times)
+    )
+    found = metadata(ome(path, 'TimeIncrement="6" TimeIncrementUnit="ms"', body))
+    assert found.ticks == (0, 1, 2, 5, 6)
+    assert found.frame_rate_hz == pytest.approx(200)
+    stamps = [{"ElapsedTime-ms": time, "Interval_ms": 6} for time in times]
+    path.unlink()
+    found = metadata(write_micro_manager(path, movie(FRAMES), stamps))
+    assert found.ticks == (0, 1, 2, 5, 6)
+    assert found.frame_rate_hz == pytest.approx(200)

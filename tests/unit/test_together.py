@@ -169,3 +169,10 @@ def test_particles_keep_what_is_divided_out_with_rows_that_flicker(
     assert abs(mass(flickering)[0] - wanted) < 0.5 * error  # of the same noise
     monkeypatch.setattr("iscat_analysis.tracking.moving.give_back", lambda *_: None)
     assert wanted - mass(flickering)[0] > 4 * error  # control
+
+
+def test_steps_over_frames_that_are_known_to_be_missing_are_no_surprise() -> None:
+    kept = np.delete(np.arange(FRAMES), np.random.default_rng(3).choice(FRAMES, 35, replace=False))
+    table = _table(_walk(1)[kept])
+    assert list(warnings_of(table, FRAME_RATE_HZ))
+    assert not list(warnings_of(table, FRAME_RATE_HZ, kept))
