@@ -1,0 +1,147 @@
+"""Frames that are not as the camera gave them: interpolated, smoothed, sharpened or compressed.
+
+The noise of raw counts is as strong at the finest patterns of the pixels, which no lens transmits,
+as at coarser ones, and in every frame alike.  Bilinear interpolation by a fraction f of a pixel
+multiplies the finest ones by (1 − 2f)², and f changes from frame to frame where a movie was
+aligned.  Smoothing and lossy compression weaken them in all frames alike, sharpening strengthens
+them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from scipy import fft
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource
+
+_PAIRS = 48  # of neighbouring frames, all over the movie
+_FEWEST = 8  # of them that tell
+_SIDE_PX = 512  # of the middle of the field, that is looked at
+_LEAST_E = 20.0  # photoelectrons of a pixel, below which noise is far from normal
+_FINEST = 0.5  # cycles per pixel, beyond which only noise is: the corners of the spectrum
+_COARSE = (0.1, 0.3)  # cycles per pixel that they are compared with
+_STILL = 0.9  # quantile of their ratio, of pairs of frames between which little vibrates
+_OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_SIGNIFICANT = 6.0  # standard errors
+_UNEVEN = 0.1  # of the finest noise, by which it must change from frame to frame
+_WEAK, _STRONG = 0.5, 2.0  # finest noise over that at coarser patterns
+_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+
+Kind = Literal["interpolated", "smoothed", "sharpened"]
+
+
+@dataclass(frozen=True)
+class Processing:
+    """What was done to the frames, and the noise that tells it.
+
+    `finest` is the noise at the finest patterns over that at coarser ones; `uneven` is by how much
+    of itself the finest noise changes from frame to frame, beyond chance.
+    """
+
+    kind: Kind
+    finest: float
+    uneven: float
+
+    @property
+    def message(self) -> str:
+        """What the user should know."""
+        what = {
+            "interpolated": "the frames were interpolated, as where a movie is aligned by parts of "
+            f"a pixel: the noise of the finest patterns changes by {100 * self.uneven:.0f} % "
+            "from frame to frame, which no camera does",
+            "smoothed": "the frames were smoothed, denoised or compressed with losses: the finest "
+            f"patterns have {100 * self.finest:.0f} % of the noise of coarser ones, where a "
+            "camera has as much",
+            "sharpened": "the frames were sharpened: the finest patterns have "
+            f"{self.finest:.1f} times the noise of coarser ones, where a camera has as much",
+        }[self.kind]
+        instead = {
+            "interpolated": "the movie before it was aligned (its drift is measured and followed "
+            "here), or shift it by whole pixels",
+            "smoothed": "the camera's own counts, uncompressed or compressed without losses",
+            "sharpened": "the camera's own counts",
+        }[self.kind]
+        return f"{what}; all rows are flagged processed: export {instead}"
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """What ``summary.json`` says of it."""
+        return {"kind": self.kind, "finest": self.finest, "uneven": self.uneven}
+
+
+def find_processing(movie: FrameSource, camera: Camera, span: tuple[int, int]) -> Processing | None:
+    """Compare the noise of the finest patterns with that of coarser ones and between frames."""
+    rows, columns = (_middle(length) for length in movie.shape[1:])
+    fine, coarse = _bands(rows.stop - rows.start, columns.stop - columns.start)
+    found = []
+    starts = np.unique(np.linspace(span[0], span[1] - 2, _PAIRS).astype(int))
+    for start in starts.tolist() if span[1] - span[0] > 1 else ():
+        spectrum = _spectrum(movie, camera, start, (rows, columns))
+        if spectrum is not None:
+            found.append((spectrum[fine].mean(), spectrum[coarse].mean()))
+    if len(found) < _FEWEST:
+        return None
+    finest, coarser = np.array(found).T
+    # |z|² of a complex normal number scatters by its mean; a normalised movie's noise changes at
+    # all patterns alike, and what vibrates is coarse
+    sizes = [np.count_nonzero(band) for band in (fine, coarse)]
+    uneven = min(
+        _uneven(finest, 1 / sizes[0]), _uneven(finest / coarser, 1 / sizes[0] + 1 / sizes[1])
+    )
+    ratio = float(np.quantile(finest / coarser, _STILL))
+    if uneven > _UNEVEN:
+        return Processing("interpolated", ratio, uneven)
+    if ratio < _WEAK:
+        return Processing("smoothed", ratio, uneven)
+    return Processing("sharpened", ratio, uneven) if ratio > _STRONG else None
+
+
+def _uneven(values: FloatArray, chance: float) -> float:
+    """Say by how much of their mean values scatter beyond chance; 0 where that may be chance."""
+    excess = float(np.var(values / values.mean(), ddof=1)) - chance
+    significant = excess > _SIGNIFICANT * chance * math.sqrt(2 / (len(values) - 1))
+    return math.sqrt(excess) if significant else 0.0
+
+
+def _middle(length: int) -> slice:
+    size = min(length, _SIDE_PX)
+    start = (length - size) // 2
+    return slice(start, start + size)
+
+
+def _bands(rows: int, columns: int) -> tuple[BoolArray, BoolArray]:
+    """Select the finest and the coarser patterns of a half spectrum, each with its opposite once.
+
+    Whole rows and columns, which flicker by themselves, are in neither.
+    """
+    y, x = fft.fftfreq(rows)[:, None], fft.rfftfreq(columns)[None, :]
+    radius = np.hypot(y, x)
+    own = (y != 0) & (x > 0) & (x < 0.5)
+    return own & (radius > _FINEST), own & (radius > _COARSE[0]) & (radius < _COARSE[1])
+
+
+def _spectrum(
+    movie: FrameSource, camera: Camera, start: int, region: tuple[slice, slice]
+) -> FloatArray | None:
+    """Give the power of the noise of two frames; None where they are dark or the same."""
+    counts = movie.read(start, start + 2)
+    if np.array_equal(counts[0], counts[1]):
+        return None
+    before, after = camera.to_electrons(counts)[(slice(None), *region)]
+    powers = float(before.mean()), float(after.mean())
+    if min(powers) < _LEAST_E:
+        return None
+    before, after = before / powers[0], after / powers[1]
+    light = before + after
+    used = light > 0.1 * np.median(light)
+    change = np.where(used, (after - before) / np.sqrt(np.where(used, light, 1.0)), 0.0)
+    # shot noise over the light: alike in all frames, whatever the laser does
+    change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
+    limit = _OUTLIER * _NORMAL * float(np.median(np.abs(change[used])))
+    waves = fft.rfft2(np.clip(change, -limit, limit))
+    return np.asarray(np.square(waves.real) + np.square(waves.imag))
