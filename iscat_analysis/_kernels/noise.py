@@ -242,5 +242,5 @@ def tail_of_pixel(
         known, b, x = k > 0.0, n - a + 1.0, p if above else 1.0 - p
     else:
         k = max(np.floor(observed + _WHOLE), 0.0)
-        known, a, b, x = k > 0.0 or not above, k if above else k + 1.0, mean, float(above)
+        known, a, b, x = k > 0.0 or not above, k if above else k + 1.0, mean, 1.0 if above else 0.0
     return known, a, b, x
