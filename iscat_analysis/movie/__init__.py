@@ -1,8 +1,8 @@
 """Movie files and arrays become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
 
-Each format is one module that offers `Frames`; `FORMATS` of `folders` names its signature.  What a file says
-of itself is checked against what it holds before any pixel is read: a movie that is cut short, or
-whose description announces more than it holds, is refused and never analysed in part.
+Each format is one module that offers `Frames`; `FORMATS` of `folders` names its signature.  What a
+file says of itself is checked against what it holds before any pixel is read: a movie that is cut
+short, or whose description announces more than it holds, is refused and never analysed in part.
 """
 
 from __future__ import annotations
