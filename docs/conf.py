@@ -6,6 +6,7 @@ import contextlib
 import importlib.metadata
 import inspect
 import io
+import itertools
 import os
 import pkgutil
 import re
@@ -74,6 +75,7 @@ def _write_reference() -> None:
     _write_library()
     _write_commands()
     _write_schemas()
+    _write_columns()
 
 
 def _said(*arguments: str) -> str:
@@ -142,6 +144,21 @@ def _write_schemas() -> None:
             pages.append(f"| `{key}` | {kind}{missing} | {about.get('description', '')} |")
         pages.append("")
     (GENERATED / "schemas.md").write_text("\n".join(pages), encoding="utf-8")
+
+
+def _write_columns() -> None:
+    """Write the tables of columns from their registry, one line for columns that differ in unit."""
+    from iscat_analysis.records import EVENTS, TRACKS
+
+    for name, columns in (("fits", EVENTS), ("tracks", TRACKS)):
+        lines = ["| column | meaning |", "|---|---|"]
+        for meaning, group in itertools.groupby(columns, key=lambda column: column.meaning):
+            alike = list(group)
+            names = ", ".join(f"`{column.name}`" for column in alike)
+            units = ", ".join(dict.fromkeys(column.unit for column in alike))
+            absent = "; may be absent" if alike[0].optional else ""
+            lines.append(f"| {names} | {meaning.format(units)}{absent} |")
+        (GENERATED / f"{name}_columns.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _run_pages() -> None:

@@ -18,7 +18,6 @@ from iscat_analysis.bounds import parse_scan, scan
 from iscat_analysis.config import Config
 from iscat_analysis.records import (
     FREE_PARAMETERS,
-    TRACK_COLUMNS,
     Analysis,
     EventView,
     FloatArray,
@@ -50,7 +49,10 @@ ROWS_SHOWN = 20
 """Events that a `Result` shows of itself in a notebook."""
 
 _COLUMNS = ("event", "frame", "x_px", "y_px", "z_nm", "mass_kda")
-_TRACK_COLUMNS = TRACK_COLUMNS[: TRACK_COLUMNS.index("refractive_index")]
+_TRACK_COLUMNS = (
+    "track", "first_frame", "last_frame", "n_frames", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
+    "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, repr=False)

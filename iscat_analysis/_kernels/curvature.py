@@ -2,7 +2,7 @@
 
 `rows` has shape (ny, `iscat_analysis._kernels.hessian.ROWS`, nx): s, its gradient in (x, y, z, a)
 and its second derivatives, as `signal_hessian` fills it.  Data and parameters are those of
-`iscat_analysis._kernels.scoring`.
+`iscat_analysis._kernels.noise`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import Lens
 from iscat_analysis._kernels.lines import marked
+from iscat_analysis._kernels.noise import FLOOR, bias_of_pixel, curvature_of_row
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, image_score, span
+from iscat_analysis._kernels.scoring import blank_profile, image_score, span
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -33,41 +34,6 @@ def derivatives_between(
     start, stop = span(lens, pixels, theta, axial.heights.shape[3])
     profile_at(axial, theta[2], start, stop, profile)
     signal_hessian(profile, lens, pixels, theta[0], theta[1], theta[3], rows)
-
-
-@kernel(fastmath=FAST)
-def _slopes(
-    kind: int, data: FloatArray, row: int, level: float, s: FloatArray, t: FloatArray
-) -> float:
-    """Fill t (3, nx) with ∂ℓ/∂s, ∂²ℓ/∂s² and ∂²ℓ/∂s∂g, and return the sum of ∂²ℓ/∂g².
-
-    A masked pixel adds 0, as its quotients and their squares are finite, see `FLOOR`.
-    """
-    c0, c1, c2, c3 = data[0, row], data[1, row], data[2, row], data[3, row]
-    total = 0.0
-    if kind == CONDITIONAL:
-        for j in range(s.size):
-            bright = max(1.0 + s[j], FLOOR)
-            part = 1.0 / (1.0 + c2[j] * level * bright)
-            p = 1.0 - part
-            per = 1.0 / bright
-            spread = c3[j] * c1[j] * p * part
-            t[0, j] = c3[j] * (c0[j] - c1[j] * p) * per
-            t[1, j] = c3[j] * (c1[j] * p * p - c0[j]) * per * per
-            t[2, j] = -spread * per
-            total -= spread
-        return total
-    for j in range(s.size):
-        gain = level * c2[j]
-        light = level * (c1[j] + c2[j] * s[j])
-        rate = max(light + c3[j], FLOOR)
-        per = 1.0 / rate
-        excess, weight = (c0[j] - rate) * per, c0[j] * per * per
-        t[0, j] = gain * excess
-        t[1, j] = -gain * gain * weight
-        t[2, j] = gain * excess - light * gain * weight
-        total += light * excess - light * light * weight
-    return total
 
 
 @kernel(fastmath=FAST)
@@ -118,7 +84,7 @@ def observed_information(
     out[4, 4] = 0.0
     for row in range(rows.shape[0]):
         here = rows[row]
-        out[4, 4] -= _slopes(kind, data, row, level, here[0], t)
+        out[4, 4] -= curvature_of_row(kind, data, row, level, here[0], t)
         _products(t[1], here, sums)
         for k in range(10):
             sums[k] += _weighted(t[0], here[5 + k])
@@ -194,19 +160,9 @@ def _row_bias(
         t[2, j] = l0 * g0 + l1 * g1 + l2 * g2 + l3 * g3
     b0 = b1 = b2 = b3 = b4 = 0.0
     for j in range(c1.size):
-        if kind == CONDITIONAL:  # η = ln ρ + g + ln(1 + s)
-            per = 1.0 / max(1.0 + g[0, j], FLOOR)
-            part = 1.0 / (1.0 + c2[j] * level * max(1.0 + g[0, j], FLOOR))
-            variance = c3[j] * c1[j] * (1.0 - part) * part
-            square = t[0, j] * per * per
-            skewed = square + t[2, j] * per + l4
-            both = variance * ((2.0 * part - 1.0) * skewed + t[1, j] * per - square)
-            by_level = 1.0
-        else:  # η = ln(light + read variance)
-            light = level * (c1[j] + c2[j] * g[0, j])
-            rate = max(light + c3[j], FLOOR)
-            per, by_level = level * c2[j] / rate, light / rate
-            both = rate * (per * (t[1, j] + t[2, j]) + l4 * by_level)
+        both, per, by_level = bias_of_pixel(
+            kind, c1[j], c2[j], c3[j], level, g[0, j], t[0, j], t[1, j], t[2, j], l4
+        )
         b0 += both * per * g[1, j]
         b1 += both * per * g[2, j]
         b2 += both * per * g[3, j]

@@ -1,7 +1,7 @@
 """Particles that move over an unknown, constant background: every particle in every frame.
 
 The counts of pixel p in frame t are Poisson with w_t B_p (1 + C_tp), C the sum of the particles'
-signals, and read noise as in `iscat_analysis._kernels.scoring`, whose fit this is.  A *row* is one
+signals, and read noise as in `iscat_analysis._kernels.noise`, whose fit this is.  A *row* is one
 particle in one frame, θ = (x, y, z, a, 0); rows are in the order of their frames, and those of
 frame t are starts[t] to starts[t + 1].  Within a frame they are fitted in turn, each with the
 others in its background, so that the result does not depend on how frames are shared out among

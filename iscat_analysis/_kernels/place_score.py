@@ -23,20 +23,14 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
-from iscat_analysis._kernels.scoring import (
-    FLOOR,
-    POISSON,
-    SERIES,
-    image_score,
-    image_value,
-    twice_artanh,
-)
+from iscat_analysis._kernels.noise import FLOOR, POISSON, SERIES, twice_artanh
+from iscat_analysis._kernels.scoring import image_score, image_value
 
 FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 
 LEAST = 1e-15
-"""Least expected count, as `FLOOR` of `scoring`, but its square is a number in single precision."""
+"""Least expected count, as `FLOOR` of `noise`, but its square is a number in single precision."""
 
 
 @kernel(_nrt=False)

@@ -15,8 +15,9 @@ from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.image import Pixels, signal_parts
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import named_lens
+from iscat_analysis._kernels.noise import score_of_pixel
 from iscat_analysis._kernels.radial import AxialTable, profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR, blank_profile, signal_value, span
+from iscat_analysis._kernels.scoring import blank_profile, signal_value, span
 
 FloatArray = NDArray[np.float64]
 
@@ -68,19 +69,11 @@ def _amplitude(
 ) -> tuple[float, float]:
     """Score about the amplitude, and its information; data has shape (4, n)."""
     pull = known = 0.0
-    if kind == CONDITIONAL:
-        for j in range(p.size):
-            s, slope = a * (p[j] + a * q[j]), p[j] + 2 * a * q[j]
-            bright = max(1.0 + s, FLOOR)
-            odds = data[2, j] * level * bright
-            per = 1.0 / (bright * (1.0 + odds))
-            pull += data[3, j] * (data[0, j] + odds * (data[0, j] - data[1, j])) * per * slope
-            known += data[3, j] * data[1, j] * odds * (per * slope) ** 2
-        return pull, known
     for j in range(p.size):
         s, slope = a * (p[j] + a * q[j]), p[j] + 2 * a * q[j]
-        gain = level * data[2, j]
-        per = 1.0 / max(level * (data[1, j] + data[2, j] * s) + data[3, j], FLOOR)
-        pull += gain * (data[0, j] * per - 1.0) * slope
-        known += gain * gain * per * slope * slope
+        score, bend, _ = score_of_pixel(
+            kind, data[0, j], data[1, j], data[2, j], data[3, j], level, s
+        )
+        pull += score * slope
+        known += bend * slope * slope
     return pull, known

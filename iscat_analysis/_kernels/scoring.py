@@ -1,16 +1,7 @@
 """Log-likelihood, score and Fisher matrix in one pass over the pixels, and the fit built on it.
 
-Parameters are θ = (x, y, z, a, g): position [nm], amplitude, and the logarithm of a common level
-that multiplies the expected counts.  Two likelihoods, by `kind` and the first axis of `data`:
-
-CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts fell after landing, p = q/(1+q) with
-             q = ρ e^g (1+s); the unknown background has dropped out (physics.md, section 4).
-             ℓ = κ [d ln q − n ln(1+q)], κ ≤ 1 the share of the variance that is not read noise.
-POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v is read-noise variance, added to
-             the counts d as well (Huang et al., Nat. Methods 10, 653, 2013).
-
-ℓ is relative to its value without a particle.  `data` has shape (4, ny, nx); a masked pixel has all
-four entries zero.
+Parameters and data are those of `iscat_analysis._kernels.noise`, which holds what the noise models
+differ in; `kind` is the number of one.
 """
 
 from __future__ import annotations
@@ -18,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
@@ -27,6 +17,7 @@ from iscat_analysis._kernels.image import Pixels, signal_gradient, signal_image
 from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import lattice_span
 from iscat_analysis._kernels.lens import LATTICE, ROUND, STAMP, Lens, named_lens
+from iscat_analysis._kernels.noise import score_of_pixel, value_of_pixels
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_at
 from iscat_analysis._kernels.radial_rows import intervals_needed, radial_strip, strip_scratch
 from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
@@ -34,75 +25,14 @@ from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-CONDITIONAL, POISSON = 0, 1
-
 CONVERGED, STALLED, EXHAUSTED, HOPELESS = 0, 1, 2, 3
 """How a fit ended: step below tolerance; no step improves; iterations used up; little to gain."""
 
 HOPE = 16.0
 """Multiple of the expected gain in log-likelihood that a fit is trusted to make."""
 
-SERIES = 0.2
-"""Largest |x| at which ln(1+x) is taken from its series."""
-
-FLOOR = 1e-150
-"""Least expected count or intensity: keeps quotients, and their squares, finite where a dark fringe
-or a masked pixel is exactly zero."""
-
 _TOGETHER = 256
 """Pixels for which one series is tried: bright ones take the slow logarithm for these alone."""
-
-
-@njit(inline="always")
-def twice_artanh(w: float) -> float:
-    """ln(1+x) for w = x/(2+x), by its series; 1e-16 for |x| < SERIES."""
-    w2 = w * w
-    tail = 1 / 3 + w2 * (1 / 5 + w2 * (1 / 7 + w2 * (1 / 9 + w2 * (1 / 11 + w2 / 13))))
-    return 2.0 * w * (1.0 + w2 * tail)
-
-
-@kernel(fastmath=FAST, _nrt=False)
-def _some_value(
-    kind: int, data: FloatArray, first: int, last: int, level: float, s: FloatArray
-) -> float:
-    """Log-likelihood of some pixels of data (4, n); their signals are the first of s."""
-    c0, c1 = data[0, first:last], data[1, first:last]
-    c2, c3 = data[2, first:last], data[3, first:last]
-    total, beyond = 0.0, 0  # counted, because the largest would be found one after the other
-    if kind == CONDITIONAL:
-        for j in range(c0.size):
-            beyond += abs(level * (1.0 + s[j]) - 1.0) >= SERIES
-        if not beyond:
-            for j in range(c0.size):
-                change = level * (1.0 + s[j]) - 1.0
-                part = change * c2[j]
-                one, other = 2.0 + change, 2.0 * (1.0 + c2[j]) + part
-                per = 1.0 / (one * other)  # of both quotients, as it takes longer than the rest
-                now, later = twice_artanh(change * other * per), twice_artanh(part * one * per)
-                total += c3[j] * (c0[j] * now - c1[j] * later)
-        else:
-            for j in range(c0.size):
-                stretch = max(level * (1.0 + s[j]), FLOOR)
-                share = c2[j] / (1.0 + c2[j])
-                total += c3[j] * (
-                    c0[j] * np.log(stretch) - c1[j] * np.log1p((stretch - 1.0) * share)
-                )
-        return total
-    for j in range(c0.size):
-        base = c1[j] + c3[j]
-        rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
-        beyond += abs(rate - base) >= SERIES * max(base, FLOOR)
-    if not beyond:
-        for j in range(c0.size):
-            base = max(c1[j] + c3[j], FLOOR)
-            change = level * (c1[j] + c2[j] * s[j]) + c3[j] - base
-            total += c0[j] * twice_artanh(change / (2.0 * base + change)) - change
-    else:
-        for j in range(c0.size):
-            base = max(c1[j] + c3[j], FLOOR)
-            rate = level * (c1[j] + c2[j] * s[j]) + c3[j]
-            total += c0[j] * np.log(max(rate, FLOOR) / base) - (rate - base)
-    return total
 
 
 @kernel()
@@ -111,7 +41,7 @@ def signal_value(kind: int, data: FloatArray, level: float, s: FloatArray) -> fl
     flat, total = data.reshape(4, s.size), 0.0
     for first in range(0, s.size, _TOGETHER):
         last = min(first + _TOGETHER, s.size)
-        total += _some_value(kind, flat, first, last, level, s[first:last])
+        total += value_of_pixels(kind, flat, first, last, level, s[first:last])
     return total
 
 
@@ -132,21 +62,7 @@ def _add_score(
     f22 = f23 = f24 = 0.0
     f33 = f34 = f44 = 0.0
     for j in range(c0.size):
-        # pull = ∂ℓ/∂s, bend = information about s; ∂s/∂g in effect g4
-        if kind == CONDITIONAL:
-            g4 = max(1.0 + g[0, j], FLOOR)
-            part = 1.0 / (1.0 + c2[j] * level * g4)
-            p = 1.0 - part
-            per = 1.0 / g4
-            pull = c3[j] * (c0[j] - c1[j] * p) * per
-            bend = c3[j] * c1[j] * p * part * per * per
-        else:
-            gain = level * c2[j]
-            expected = level * (c1[j] + c2[j] * g[0, j])
-            per = 1.0 / max(expected + c3[j], FLOOR)
-            pull = gain * (c0[j] * per - 1.0)
-            bend = gain * gain * per
-            g4 = expected / max(gain, FLOOR)
+        pull, bend, g4 = score_of_pixel(kind, c0[j], c1[j], c2[j], c3[j], level, g[0, j])
         g0, g1, g2, g3 = g[1, j], g[2, j], g[3, j], g[4, j]
         b0 += pull * g0
         b1 += pull * g1
@@ -202,7 +118,7 @@ def image_value(kind: int, data: FloatArray, level: float, rows: FloatArray) -> 
         for i in range(first, last):
             for j in range(nx):
                 s[(i - first) * nx + j] = rows[i, 0, j]
-        total += _some_value(kind, flat, first * nx, last * nx, level, s)
+        total += value_of_pixels(kind, flat, first * nx, last * nx, level, s)
     return total
 
 
@@ -251,7 +167,7 @@ def score_pass(
             end = min(row + together, ny)
             here = radial_strip(profile, lens, pixels, row, end, theta[0], theta[1], theta[3], 5, f)
             _add_score(kind, flat, row * nx, end * nx, level, here, sums)
-            total += _some_value(kind, flat, row * nx, end * nx, level, here[0])
+            total += value_of_pixels(kind, flat, row * nx, end * nx, level, here[0])
         _unpack(sums, score, fisher)
         return total
     if len(lens) == STAMP:
@@ -262,7 +178,7 @@ def score_pass(
             end = min(row + STRIP, ny)
             stamp_strip(profile, lens, theta[3], row, end - row, nx, at, scratch, lines)
             _add_score(kind, flat, row * nx, end * nx, level, lines, sums)
-            total += _some_value(kind, flat, row * nx, end * nx, level, lines[0])
+            total += value_of_pixels(kind, flat, row * nx, end * nx, level, lines[0])
         _unpack(sums, score, fisher)
         return total
     g = np.empty((ny, 5, nx))

@@ -26,8 +26,8 @@ from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lens import STAMP, Lens
 from iscat_analysis._kernels.lines import copy_line, largest
 from iscat_analysis._kernels.moving import Room
+from iscat_analysis._kernels.noise import FLOOR
 from iscat_analysis._kernels.place_score import LEAST, place_score
-from iscat_analysis._kernels.scoring import FLOOR
 from iscat_analysis._kernels.stamp_bends import BENDS, stamp_bends
 
 FloatArray = NDArray[np.float64]

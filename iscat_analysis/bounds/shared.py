@@ -15,7 +15,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.pixels import pixel_terms
 from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import PARAMETERS, FloatArray
@@ -39,9 +38,7 @@ def joint_information(
         place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
         rows[: len(names)] = model.joint_gradient(*place, names)[2].reshape(len(names), -1)
     rows[len(names) : -1] = own.reshape(4, -1)
-    _, _, information, by_signal, by_level = pixel_terms(
-        likelihood.kind, likelihood.data, signal, level
-    )
+    _, _, information, by_signal, by_level = likelihood.noise.terms(likelihood.data, signal, level)
     rows[:-1] *= by_signal.ravel()
     rows[-1] = by_level.ravel()
     return np.asarray((rows * information.ravel()) @ rows.T)

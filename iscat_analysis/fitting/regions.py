@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iscat_analysis.camera.background import smooth_background
-from iscat_analysis.config import Config
 from iscat_analysis.fitting.scene import Scene, is_counted
-from iscat_analysis.inference.counts import MEAN, counts_likelihood
+from iscat_analysis.inference.counts import MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
@@ -99,7 +98,11 @@ def region_likelihood(
     return counts_likelihood(
         model, grid, before, after, windows.power_ratio,
         background=scene.background_variance,
-        use_conditional=_uses_conditional(config),
+        noise=choose_noise(
+            config.fit.likelihood,
+            interferes=config.optics.scheme != "darkfield",
+            counted=is_counted(config),
+        ),
         scale_e=photons_scale(scene, windows) if scene.additive else None,
         others=others,
         read_variance_before_e2=windows.read_variance_before_e2[cut],
@@ -134,10 +137,3 @@ def photons_scale(scene: Scene, windows: Windows) -> float:
     photons = darkfield_photons(scene.config.particle)
     per_frame = photons_per_intensity(scene.model, photons, scene.pixel_nm)
     return per_frame * windows.power_ratio * max(windows.n_before, 1)
-
-
-def _uses_conditional(config: Config) -> bool:
-    """Whether the fits condition on the sum of counts before and after."""
-    if config.fit.likelihood == "auto":
-        return config.optics.scheme != "darkfield" and is_counted(config)
-    return config.fit.likelihood == "conditional"

@@ -15,7 +15,7 @@ from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.collected import collected_area_nm2
-from iscat_analysis.pieces.regions import line_of, lines_from, numbered
+from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
     FRAME_COLUMN,
     Clip,
@@ -24,6 +24,7 @@ from iscat_analysis.records import (
     PosteriorResult,
     Trace,
     Windows,
+    make_rows,
 )
 from iscat_analysis.search.empty import EmptySpread
 
@@ -109,7 +110,7 @@ def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> 
 
 def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
     """Make a table of events whose frames are given."""
-    return numbered(lines_from(lines_of(scene, events)), range(len(events)))
+    return make_rows(lines_of(scene, events), event=range(len(events)))
 
 
 def view_of(

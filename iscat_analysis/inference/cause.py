@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.fit import AMPLITUDE
@@ -248,9 +247,10 @@ class _Left:
         _, first, _ = likelihood.model.amplitude_hessian(
             likelihood.grid, *(float(t) for t in theta[:4])
         )
-        level = 1 + signal if likelihood.kind == CONDITIONAL else None
         columns = [first[i][used] * root for i in range(4) if free[i]]
-        if free[LEVEL] and level is not None:
+        if free[LEVEL]:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                level = likelihood.noise.level_direction(likelihood.data, signal)
             columns.append(level[used] * root)
         fitted, _ = np.linalg.qr(np.stack(columns, axis=1))
         rest = residual[used]

@@ -11,10 +11,26 @@ from iscat_analysis.camera.background import smooth_background
 from iscat_analysis.inference.checks import BoolArray, FloatArray, mask_of, pixels_of
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
+from iscat_analysis.inference.noise_models import (
+    CONDITIONAL,
+    NOISE_MODELS,
+    POISSON,
+    NoiseModel,
+)
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2
 """Variance of a background over that of the mean of its frames."""
+
+
+def choose_noise(wanted: str, *, interferes: bool, counted: bool) -> NoiseModel:
+    """Choose the noise model that is named, or with ``"auto"`` the one that suits what is known.
+
+    The conditional one is for light that interferes with a background whose frames were counted.
+    """
+    if wanted != "auto":
+        return NOISE_MODELS[wanted]
+    return CONDITIONAL if interferes and counted else POISSON
 
 
 def counts_likelihood(
@@ -25,7 +41,7 @@ def counts_likelihood(
     power_ratio: float,
     *,
     background: float,
-    use_conditional: bool,
+    noise: NoiseModel,
     scale_e: float | None = None,
     others: FloatArray | None = None,
     read_variance_before_e2: ArrayLike = 0.0,
@@ -37,7 +53,7 @@ def counts_likelihood(
     Shapes: `before_e, after_e` (ny, nx), `others` (ny, nx), `masked` (ny, nx).
     """
     signal = np.zeros(grid.shape) if others is None else others
-    if use_conditional:
+    if noise == CONDITIONAL:
         return conditional(
             model, grid, before_e, after_e, power_ratio * (1 + signal),
             read_variance_before_e2=read_variance_before_e2,

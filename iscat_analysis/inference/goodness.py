@@ -16,15 +16,14 @@ Each p-value (`three_tests`) is uniform on good data; `goodness_of_fit` joins th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import betainc, gammainc, gammaincc, pdtr, pdtrc
+from scipy.special import gammaincc
 
 from iscat_analysis._kernels.goodness import look
-from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.noise_models import MANY_COUNTS
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -38,14 +37,10 @@ WAIST = 0.5
 POOLED_COUNTS = 5.0
 """Cells that expect fewer counts are joined until they expect as many."""
 
-MANY_COUNTS = 1e6
-"""Counts above which tails are normal: 5 σ out to a few per cent."""
-
 _NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
 _NORMAL = 1e-4  # excess kurtosis that changes no p-value
-_FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
 
 
 def goodness_of_fit(
@@ -90,12 +85,12 @@ def three_tests(
     optics, grid = likelihood.model.optics, likelihood.grid
     rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
     chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = look(
-        likelihood.kind, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm, theta,
-        WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL, MANY_COUNTS,
-        rate, tails,
+        likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
+        theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL,
+        MANY_COUNTS, rate, tails,
     )  # fmt: skip
     cells = pixels
-    if likelihood.kind == POISSON and least_rate < POOLED_COUNTS:
+    if likelihood.noise.pools_few and least_rate < POOLED_COUNTS:
         residual, kurtosis = _pooled(likelihood, rate)
         chi2, cells, excess = float(residual @ residual), residual.size, float(kurtosis.sum())
     freedom = cells - int(np.count_nonzero(free))
@@ -104,8 +99,8 @@ def three_tests(
     above = _gamma_above(chi2, freedom, excess / cells)
     structure = _gamma_above(mode_chi2, modes, mode_excess) if modes else 1.0
     if count:
-        least = min(least, 2 * float(_tails(likelihood.kind, *tails[:, :count]).min()))
-    outlier = _least_of_all(likelihood, rate, pixels, least)
+        least = min(least, 2 * float(likelihood.noise.tails(*tails[:, :count]).min()))
+    outlier = likelihood.noise.least_of_all(rate[likelihood.used], least)
     return chi2 / freedom, (2 * min(above, 1 - above), structure, outlier)
 
 
@@ -117,7 +112,7 @@ def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
 
 def _pooled(likelihood: Likelihood, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals in standard deviations and their excess kurtosis, cells of few counts pooled."""
-    used = likelihood.data[2] > 0
+    used = likelihood.used
     rate = rate[used]
     few = rate < POOLED_COUNTS
     excess = likelihood.data[0][used] - rate
@@ -129,49 +124,3 @@ def _pooled(likelihood: Likelihood, rate: FloatArray) -> tuple[FloatArray, Float
     rate = np.concatenate([rate[~few], together[filled]])
     excess = np.concatenate([excess[~few], surplus[filled]])
     return excess / np.sqrt(rate), 1 / rate
-
-
-def _least_of_all(likelihood: Likelihood, rate: FloatArray, pixels: int, least: float) -> float:
-    """Probability that the least likely of all pixels has a tail of at most `least`."""
-    if likelihood.kind == CONDITIONAL:
-        return -math.expm1(pixels * math.log1p(-min(least, 1 - 1e-16)))
-    # counts are whole: what each pixel can attain below `least` is less than that
-    below = _attainable(rate[likelihood.data[2] > 0], least)
-    return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, 1 - 1e-16)))))
-
-
-def _tails(kind: int, a: FloatArray, b: FloatArray, x: FloatArray) -> FloatArray:
-    """Probability of counts at least as far out, on their side; see `suspects`."""
-    if kind == CONDITIONAL:
-        return np.asarray(betainc(a, b, x))
-    return np.asarray(np.where(x > 0, gammainc(a, b), gammaincc(a, b)))
-
-
-def _attainable(rate: FloatArray, tail: float) -> FloatArray:
-    """Probability that a Poisson count has a two-sided tail of at most `tail`, for each rate."""
-    half = tail / 2
-    if half < _FINEST or half >= 0.5:
-        return np.full(rate.size, min(tail, 1.0))
-    out = np.full(rate.size, tail)
-    few = rate < MANY_COUNTS
-    mean = rate[few]
-    # Bernstein's and Chernoff's inequalities enclose the counts, halving finds them
-    depth = -math.log(half)
-    farthest = np.ceil(mean + depth / 3 + np.sqrt(depth**2 / 9 + 2 * mean * depth))
-    least = np.maximum(np.floor(mean - np.sqrt(2 * mean * depth)) - 1, -1.0)
-    limit = half * (1 + 1e-9)
-    above = _first(lambda k: pdtrc(k, mean) <= limit, np.floor(mean) - 1, farthest)
-    below = _first(lambda k: pdtr(k, mean) > limit, least, np.ceil(mean) + 1) - 1
-    out[few] = pdtrc(above, mean) + np.where(below >= 0, pdtr(np.maximum(below, 0), mean), 0.0)
-    return out
-
-
-def _first(
-    holds: Callable[[FloatArray], BoolArray], low: FloatArray, high: FloatArray
-) -> FloatArray:
-    """Find the smallest whole numbers above `low` for which something holds; at `high` it does."""
-    while np.any(high - low > 1):
-        middle = np.where(high - low > 1, np.floor((low + high) / 2), high)
-        there = holds(middle)
-        low, high = np.where(there, low, middle), np.where(there, middle, high)
-    return high

@@ -25,9 +25,7 @@ from iscat_analysis._kernels.lens import Lens
 from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scan import scan_heights
 from iscat_analysis._kernels.scoring import (
-    CONDITIONAL,
     CONVERGED,
-    POISSON,
     maximize,
     score_pass,
     value_batch,
@@ -35,6 +33,7 @@ from iscat_analysis._kernels.scoring import (
 from iscat_analysis._kernels.support import box_supported, supported
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
+from iscat_analysis.inference.noise_models import NoiseModel
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.stamp import margin_nm
 
@@ -65,14 +64,12 @@ class Likelihood:
 
     model: ForwardModel
     grid: PixelGrid
-    kind: int
+    noise: NoiseModel
     data: FloatArray
 
     def __post_init__(self) -> None:
-        if self.kind not in (CONDITIONAL, POISSON):
-            raise ConfigError(
-                f"kind = {self.kind!r}: use `conditional` or `poisson` of this module"
-            )
+        if not isinstance(self.noise, NoiseModel):
+            raise ConfigError(f"noise = {self.noise!r}: give one of `NOISE_MODELS`")
         ready = isinstance(self.data, np.ndarray) and self.data.dtype == np.float64
         if not ready or self.data.shape != (4, *self.grid.shape):
             raise DataError(
@@ -92,9 +89,7 @@ class Likelihood:
     @property
     def used(self) -> BoolArray:
         """Which pixels are not masked, shape (ny, nx)."""
-        column = 3 if self.kind == CONDITIONAL else 2
-        used: BoolArray = self.data[column] > 0
-        return used
+        return self.noise.used(self.data)
 
     def values(self, thetas: FloatArray) -> FloatArray:
         """Log-likelihood at many parameter vectors.
@@ -212,7 +207,7 @@ class Likelihood:
         Shapes: `theta` (5,), result (5, 5).
         """
         rows, info = self.derivatives(theta), np.empty((5, 5))
-        observed_information(self.kind, self.data, math.exp(theta[LEVEL]), rows, info)
+        observed_information(self.noise.code, self.data, math.exp(theta[LEVEL]), rows, info)
         return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:
@@ -220,17 +215,9 @@ class Likelihood:
 
         Shapes: `theta` (5,), result (ny, nx).
         """
-        s = self.signal(theta)
-        level = np.exp(theta[LEVEL])
-        c0, c1, c2, c3 = self.data
+        signal, level = self.signal(theta), float(np.exp(theta[LEVEL]))
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.kind == CONDITIONAL:
-                q = c2 * level * (1 + s)
-                p = q / (1 + q)
-                out = (c0 - c1 * p) / np.sqrt(c1 * p * (1 - p) / c3)
-            else:
-                rate = level * (c1 + c2 * s) + c3
-                out = (c0 - rate) / np.sqrt(rate)
+            out = self.noise.residuals(self.data, signal, level)
         return np.where(self.used, out, np.nan)
 
     def signal(self, theta: FloatArray) -> FloatArray:
@@ -240,10 +227,8 @@ class Likelihood:
 
     def measured_signal(self) -> FloatArray:
         """Signal that the counts show, shape (ny, nx); NaN where masked."""
-        c0, c1, c2, c3 = self.data
         with np.errstate(divide="ignore", invalid="ignore"):
-            conditional = self.kind == CONDITIONAL
-            out = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
+            out = self.noise.measured_signal(self.data)
         return np.where(self.used, out, np.nan)
 
     def signal_information(self, signal: FloatArray | None = None) -> FloatArray:
@@ -252,13 +237,8 @@ class Likelihood:
         Shapes: `signal` (ny, nx), result (ny, nx).
         """
         s = np.zeros(self.grid.shape) if signal is None else signal
-        _, c1, c2, c3 = self.data
         with np.errstate(divide="ignore", invalid="ignore"):
-            if self.kind == CONDITIONAL:
-                p = c2 * (1 + s) / (1 + c2 * (1 + s))
-                out = c3 * c1 * p * (1 - p) / (1 + s) ** 2
-            else:
-                out = c2**2 / np.maximum(c1 + c2 * s + c3, 1.0)
+            out = self.noise.signal_information(self.data, s)
         return np.where(self.used, out, 0.0)
 
     def _supported(self, theta: FloatArray) -> FloatArray:
@@ -330,7 +310,7 @@ class Likelihood:
     @cached_property
     def _arguments(self) -> tuple[Lens, Pixels, int, FloatArray]:
         """What every scoring kernel takes after the profiles."""
-        return self.model.lens, self.model.pixels(self.grid), self.kind, self.data
+        return self.model.lens, self.model.pixels(self.grid), self.noise.code, self.data
 
 
 def _listed(theta: FloatArray) -> str:

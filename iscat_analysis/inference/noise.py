@@ -1,4 +1,4 @@
-"""The noise models: from counts to the likelihood of one region.
+"""From counts to the likelihood of one region, under each noise model.
 
 What to use when
 ----------------
@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.hessian import ROWS
-from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import mask_of, pixels_of
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise_models import CONDITIONAL, POISSON
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 

@@ -43,7 +43,7 @@ def precision(
     sigma, covariance, bias = np.empty(4), np.empty((n, n)), np.empty(5)
     moving = free if walls is None else free & ~walls
     known = errors_and_bias(
-        likelihood.kind, likelihood.data, math.exp(theta[LEVEL]), derivatives, fisher, free, moving,
-        slope, sigma, covariance, bias,
+        likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), derivatives, fisher, free,
+        moving, slope, sigma, covariance, bias,
     )  # fmt: skip
     return known, sigma, covariance, bias

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.scoring import CONDITIONAL, FLOOR
+from iscat_analysis._kernels.noise import FLOOR
 from iscat_analysis._kernels.stepping import frame_scores, spreads
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 
@@ -69,23 +69,12 @@ def response_of(
     signal, first = likelihood.model.amplitude_gradient(likelihood.grid, x, y, z, amplitude)
     level = float(np.exp(theta[LEVEL]))
     used = likelihood.used
-    _, c1, c2, c3 = (np.where(used, c, 0.0) for c in likelihood.data)
-    slope = np.zeros((5, *signal.shape))
-    if likelihood.kind == CONDITIONAL:
-        bright = np.maximum(1 + signal, FLOOR)
-        odds = c2 * level * bright
-        p = odds / (1 + odds)
-        slope[:4], slope[LEVEL] = first / bright, 1.0
-        weight = c3 * c1 * p * (1 - p)
-        after, before = c3 * (1 - p), -c3 * p
-    else:
-        light = level * (c1 + c2 * signal)
-        rate = np.maximum(light + c3, FLOOR)
-        slope[:4], slope[LEVEL] = level * c2 * first / rate, light / rate
-        weight, after = rate, np.ones(signal.shape)
-        multiplies = likelihood.model.rho > 0
-        counted = light / np.maximum(before_e, FLOOR) if multiplies else power_ratio
-        before = -np.broadcast_to(counted, signal.shape)
+    data = np.where(used, likelihood.data, 0.0)
+    ratio = None if likelihood.model.rho > 0 else power_ratio
+    by_signal, by_level, weight, before, after = likelihood.noise.count_response(
+        data, signal, level, before_e, ratio
+    )
+    slope = np.concatenate([first * by_signal, by_level[None]])
     index = np.flatnonzero(free)
     slope = np.where(used, slope[index], 0.0)
     fisher = np.einsum("iyx,jyx,yx->ij", slope, slope, weight)

@@ -117,7 +117,7 @@ def rings_of(config: Config, sight: ParticleImage) -> Callable[[Settings], Forwa
 
 def goodness(sight: ParticleImage, model: ForwardModel) -> tuple[float, float]:
     """Reduced χ² and p-value of a fitted picture."""
-    likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
+    likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
     return goodness_of_fit(likelihood, sight.private, sight.free)
 
 

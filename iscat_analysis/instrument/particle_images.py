@@ -19,7 +19,7 @@ from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.scene import is_counted, variance_of_background
-from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.inference.counts import choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.instrument.bright import (
@@ -254,7 +254,8 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Parti
         cut = slice(*rows), slice(*columns)
         likelihood = counts_likelihood(
             model, grid, windows.before_e[cut], windows.after_e[cut], ratio,
-            background=variance_of_background(config), use_conditional=is_counted(config),
+            background=variance_of_background(config),
+            noise=choose_noise("auto", interferes=True, counted=is_counted(config)),
             read_variance_before_e2=windows.read_variance_before_e2[cut],
             read_variance_after_e2=windows.read_variance_after_e2[cut],
             masked=windows.masked[cut],
@@ -344,7 +345,7 @@ def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     variance = 1 / np.where(used, information, 1e-6)
     y, x, snr = centre_of_energy(contrast, variance, grid.pixel_nm)
     return ParticleImage(
-        grid=grid, kind=likelihood.kind, data=likelihood.data,
+        grid=grid, noise=likelihood.noise, data=likelihood.data,
         x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
         z_nm=config.particle.height_nm, snr=snr,
     )  # fmt: skip

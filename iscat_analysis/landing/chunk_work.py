@@ -19,13 +19,12 @@ from iscat_analysis.fitting.results import lines_of, view_of
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.merging import CLIPS, VIEWS, Done
 from iscat_analysis.landing.steps import ChunkFitter
-from iscat_analysis.pieces.regions import lines_from
 from iscat_analysis.records import (
-    FRAME_COLUMN,
     CountSource,
     FloatArray,
     PosteriorResult,
     Progress,
+    make_rows,
     silent,
 )
 from iscat_analysis.search.sliding import STRIDES, Chunk, stride_of
@@ -115,7 +114,7 @@ def analyse_chunk(
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(
         core=core,
-        lines=lines_from(lines_of(scene, events, mapper=pool.map), FRAME_COLUMN),
+        lines=make_rows(lines_of(scene, events, mapper=pool.map)),
         repeats=np.array([step.repeats for step in steps]),
         views=tuple(
             view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)

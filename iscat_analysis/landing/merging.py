@@ -10,8 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.drift import Trajectory, measure_drift
-from iscat_analysis.pieces.regions import lines_from, numbered
-from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray
+from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
 from iscat_analysis.search.empty import EmptySpread
 
 VIEWS = 1000
@@ -93,7 +92,7 @@ class Merged:
         """Events of all chunks, each once, numbered in order of frame; their views and repeats."""
         homes = [(done, row) for done in self._done for row in range(len(done.lines))]
         if not homes:
-            return numbered(lines_from([], FRAME_COLUMN), []), (), ()
+            return make_rows([], event=[], **{FRAME_COLUMN: []}), (), ()
         table = pd.concat([d.lines for d in self._done if len(d.lines)], ignore_index=True)
         cores = np.array([done.core for done, _ in homes])
         frame = table["frame"].to_numpy()
@@ -113,7 +112,7 @@ class Merged:
             if number < VIEWS and row < len(done.views):
                 view = replace(done.views[row], event=number)
                 views.append(view if number < CLIPS else replace(view, clip=None))
-        rows = numbered(table.iloc[order], range(len(order)))
+        rows = make_rows(table.iloc[order], event=range(len(order)))
         return rows, tuple(views), tuple(repeats)
 
     def light(self) -> FloatArray:

@@ -1,8 +1,8 @@
 """Movie files and arrays become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
 
-Each format is one module that offers `Frames`; `_READERS` names its signature.  What a file says
-of itself is checked against what it holds before any pixel is read: a movie that is cut short, or
-whose description announces more than it holds, is refused and never analysed in part.
+Each format is one module that offers `Frames`; `FORMATS` of `folders` names its signature.  What a
+file says of itself is checked against what it holds before any pixel is read: a movie that is cut
+short, or whose description announces more than it holds, is refused and never analysed in part.
 """
 
 from __future__ import annotations
@@ -15,23 +15,18 @@ from pathlib import Path
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.file_set import FileSet
-from iscat_analysis.movie.folders import files_of
+from iscat_analysis.movie.folders import FORMATS, files_of
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy, open_raw
+from iscat_analysis.movie.mapped_frames import open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
-from iscat_analysis.movie.tiff import open_tiff
 from iscat_analysis.records import StackMetadata
 
 __all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
 
 _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
-    b"II\x2a\x00": open_tiff,
-    b"MM\x00\x2a": open_tiff,
-    b"II\x2b\x00": open_tiff,
-    b"MM\x00\x2b": open_tiff,
-    NPY_SIGNATURE[:4]: open_npy,
+    signature: kind.open for kind in FORMATS for signature in kind.signatures
 }
 """The first bytes of a file and what opens it."""
 

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy
 from iscat_analysis.movie.ome import files_of_set, is_ome
 from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
 from iscat_analysis.movie.recorded import description_of, recorded_files
-from iscat_analysis.movie.tiff import first_texts
+from iscat_analysis.movie.stack import Frames
+from iscat_analysis.movie.tiff import first_texts, open_tiff
 
 _TIFF = (".tif", ".tiff", ".btf", ".tf8")
 _HDF5 = (".h5", ".hdf5")
 _ZARR = ".zarr"
-SUFFIXES = (*_TIFF, ".mp", ".npy", *_HDF5, _ZARR, *RECORDED)
+_REFEYN = ".mp"
+
+
+class Format(NamedTuple):
+    """A kind of file that its first four bytes tell: these, its suffixes, and what opens it."""
+
+    signatures: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
+    open: Callable[[Path], Frames]
+
+
+FORMATS = (
+    Format((b"II\x2a\x00", b"MM\x00\x2a", b"II\x2b\x00", b"MM\x00\x2b"), _TIFF, open_tiff),
+    Format((NPY_SIGNATURE[:4],), (".npy",), open_npy),
+)
+
+SUFFIXES = (
+    *(suffix for kind in FORMATS for suffix in kind.suffixes), _REFEYN, *_HDF5, _ZARR, *RECORDED,
+)  # fmt: skip
 """Files and folders that are taken for movies where a folder is searched for them; files of plain
 numbers only where something describes them."""
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import BoolArray, array_of, number_in, real_array, truth_in
-from iscat_analysis.inference.counts import KNOWN, MEAN, counts_likelihood
+from iscat_analysis.inference.counts import KNOWN, MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
@@ -48,7 +48,9 @@ class Counts:
         return counts_likelihood(
             self.model, self.grid, self.before[index], self.after[index], ratio,
             background=MEAN if self.n_before else KNOWN,
-            use_conditional=bool(self.model.rho) and self.n_before > 0,
+            noise=choose_noise(
+                "auto", interferes=bool(self.model.rho), counted=self.n_before > 0
+            ),
             scale_e=None if self.model.rho else self._scale_e(ratio),
             read_variance_before_e2=self.n_before * read,
             read_variance_after_e2=self.n_after * read,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -22,12 +22,12 @@ from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import (
-    EVENT_COLUMNS,
     FREE_PARAMETERS,
     PARAMETERS,
     Candidate,
     FitResult,
     Status,
+    make_rows,
     verdict,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
@@ -153,24 +153,7 @@ def fit_rois(
     compile_kernels(counts.model, parts_of(FREE_PARAMETERS[mode], posteriors=False))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    return numbered(lines_from(rows), range(count))
-
-
-def lines_from(lines: Sequence[Mapping[str, Any]], *further: str) -> pd.DataFrame:
-    """Put fits below one another."""
-    names = [name for name in (*EVENT_COLUMNS, *further) if name != "event"]
-    table = pd.DataFrame(list(lines), columns=names)
-    known = bool(table["frame"].notna().all())
-    kinds = dict.fromkeys(("n_before", "n_after", *further), "int64")
-    kinds["frame"] = "int64" if known else "Int64"
-    kinds |= dict.fromkeys(("status", "flags"), "object")
-    return table.astype({name: kinds.get(name, "float64") for name in names})
-
-
-def numbered(lines: pd.DataFrame, numbers: Sequence[int] | NDArray[np.int64]) -> pd.DataFrame:
-    """Make rows of lines: the number of an event is known where all events are."""
-    event = pd.Series(np.asarray(numbers, dtype=np.int64), name="event")
-    return pd.concat([event, lines.reset_index(drop=True)], axis=1)
+    return make_rows(rows, event=range(count))
 
 
 def line_of(

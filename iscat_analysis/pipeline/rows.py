@@ -12,7 +12,7 @@ import pandas as pd
 
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import FloatArray, make_rows
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.systematic import systematic
@@ -23,12 +23,11 @@ def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, Empir
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
-    columns: dict[str, pd.Series | FloatArray] = {}
-    for name in fits:
-        columns[name] = fits[name] * scale[name] if name in scale else fits[name]
-        if name == "flags":
-            shared = systematic(config, fits, mass_error(found.optics), found.scene.model.scale)
-            columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
+    columns: dict[str, pd.Series | FloatArray] = {
+        name: fits[name] * factor for name, factor in scale.items()
+    }
+    shared = systematic(config, fits, mass_error(found.optics), found.scene.model.scale)
+    columns |= {f"systematic_{name}": sigma for name, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
-    return pd.DataFrame(columns), achieved
+    return make_rows(fits, **columns), achieved

@@ -19,11 +19,14 @@ from iscat_analysis.records.arrays import (
 )
 from iscat_analysis.records.columns import (
     EVENT_COLUMNS,
+    EVENTS,
     FRAME_COLUMN,
     FREE_PARAMETERS,
     PARAMETERS,
     REPEAT_COLUMNS,
     TRACK_COLUMNS,
+    TRACKS,
+    Column,
     free_parameters,
     track_numbers,
 )
@@ -42,15 +45,18 @@ from iscat_analysis.records.frames import (
     StackMetadata,
     Windows,
 )
+from iscat_analysis.records.rows import make_rows
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
+    "EVENTS",
     "EVENT_COLUMNS",
     "FRAME_COLUMN",
     "FREE_PARAMETERS",
     "PARAMETERS",
     "REPEAT_COLUMNS",
     "SEVERITY",
+    "TRACKS",
     "TRACK_COLUMNS",
     "Alternative",
     "Analysis",
@@ -58,6 +64,7 @@ __all__ = [
     "Box",
     "Candidate",
     "Clip",
+    "Column",
     "CountSource",
     "EventView",
     "Film",
@@ -76,6 +83,7 @@ __all__ = [
     "TrackStatus",
     "Windows",
     "free_parameters",
+    "make_rows",
     "silent",
     "track_numbers",
     "verdict",

@@ -1,8 +1,14 @@
-"""Parameters of a particle, and the columns of tables."""
+"""Parameters of a particle, and the registry of the columns of ``fits.csv`` and ``tracks.csv``.
+
+A column is named once, in `EVENTS` or `TRACKS`, in the order of the files.  From there it has its
+type in tables, its place in the schema, its line in the manual and its heading in the report.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
 
 import pandas as pd
 
@@ -25,32 +31,209 @@ def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
     return fitted if mode == "track" and fitted else names
 
 
-EVENT_COLUMNS = (
-    "event", "frame", "n_before", "n_after", "x_px", "y_px", "x_nm", "y_nm", "z_nm", "mass_kda",
-    "contrast", "sigma_x_nm", "sigma_y_nm", "sigma_z_nm", "sigma_mass_kda",
-    "crb_x_nm", "crb_y_nm", "crb_z_nm", "crb_mass_kda",
-    "qcrb_x_nm", "qcrb_y_nm", "qcrb_z_nm", "qcrb_mass_kda",
-    "n_scattered", "snr", "chi2_reduced", "p_value", "status", "flags",
+@dataclass(frozen=True)
+class Column:
+    """One column: its values, what they mean, and whether every table has it.
+
+    Where `meaning` has ``{}``, the unit is put.  A column without a heading is not in the report's
+    table.
+    """
+
+    name: str
+    values: Literal[
+        "count", "natural", "number", "positive", "not_negative", "share", "span", "status",
+        "text", "end",
+    ]  # fmt: skip
+    meaning: str
+    heading: str = ""
+    unit: str = ""
+    optional: bool = False
+
+    @property
+    def description(self) -> str:
+        """What the column holds, with its unit."""
+        return self.meaning.format(self.unit)
+
+    @property
+    def dtype(self) -> str:
+        """Type in a table."""
+        whole = self.values in ("count", "natural", "span")
+        return "int64" if whole else "object" if self.is_text else "float64"
+
+    @property
+    def is_text(self) -> bool:
+        """Whether it holds words."""
+        return self.values in ("status", "text", "end")
+
+
+def _of_each_parameter(
+    prefix: str, meaning: str, heading: str, *, optional: bool = False
+) -> tuple[Column, ...]:
+    """Make a column for each parameter of a particle."""
+    return tuple(
+        Column(
+            f"{prefix}_{name}", "number" if prefix in ("systematic", "repeat") else "positive",
+            meaning, heading, "kDa" if name == "mass_kda" else "nm", optional,
+        )
+        for name in PARAMETERS
+    )  # fmt: skip
+
+
+_PIXEL = ", 0-based; an integer is a pixel's centre [px]"
+
+EVENTS = (
+    Column("event", "count", "Number of the event"),
+    Column("frame", "count", "First frame of the new state, or the fitted frame"),
+    Column("n_before", "count", "Frames summed before"),
+    Column("n_after", "count", "Frames summed after"),
+    Column("x_px", "number", f"Column in the full frame{_PIXEL}", "x [px]"),
+    Column("y_px", "number", f"Row in the full frame, downwards{_PIXEL}", "y [px]"),
+    Column("x_nm", "number", "x_px times the pixel size [nm]"),
+    Column("y_nm", "number", "y_px times the pixel size [nm]"),
+    Column("z_nm", "number", "Height above the coverslip [nm]", "z", "nm"),
+    Column(
+        "mass_kda", "number",
+        "Mass [kDa]; negative for a particle that leaves; on the model's own scale, which is no "
+        "mass, unless mass_scale is calibration",
+        "mass", "kDa",
+    ),
+    Column(
+        "contrast", "number", "Signed peak contrast of the fitted model; null in dark field",
+        "contrast [10⁻³]",
+    ),
+    *_of_each_parameter(
+        "sigma",
+        "Standard deviation from the observed information [{}]; null where it is not free", "σ",
+    ),
+    *_of_each_parameter(
+        "crb",
+        "Joint Cramér–Rao bound at the estimate, for the same frames and noise [{}]; null where "
+        "the parameter is not free", "CRB",
+    ),
+    *_of_each_parameter(
+        "qcrb", "Quantum Cramér–Rao bound for the collected photons [{}]", "QCRB"
+    ),
+    Column("n_scattered", "number", "Scattered photons collected in the frames after"),
+    Column("snr", "number", "Matched-filter signal over its noise", "SNR"),
+    Column("chi2_reduced", "number", "Reduced χ² of the fitted pixels", "χ²"),
+    Column("p_value", "share", "Probability of a worse fit if the model holds", "p"),
+    Column("status", "status", "The verdict: the worst of the remarks"),
+    Column("flags", "text", "Every remark, worst first, joined by semicolons"),
+    *_of_each_parameter(
+        "systematic",
+        "Error common to the movie, from calibrations of optics and mass; no part of σ [{}]",
+        "systematic", optional=True,
+    ),
+    Column(
+        "systematic_contrast", "number",
+        "Error of the contrast that is common to the movie; where no calibration makes it a mass",
+        optional=True,
+    ),
+    Column(
+        "frame_ci95", "span",
+        "Half-width of the 95 % interval of frame [frames]; landing movies only", optional=True,
+    ),
+    Column("track", "count", "Number of the track that the row belongs to", optional=True),
+    *_of_each_parameter(
+        "repeat",
+        "Standard error from eight disjoint parts of the event's own frames, itself to 19 %; in "
+        "mode track, from the empty places of its frame [{}]",
+        "repeats", optional=True,
+    ),
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
+
+EVENT_COLUMNS = tuple(column.name for column in EVENTS if not column.optional)
+"""Names of the columns that every ``fits.csv`` has, in order."""
 
 FRAME_COLUMN = "frame_ci95"
 """Column of ``fits.csv`` after `EVENT_COLUMNS`, of landing movies: half-width of the 95 % interval
 of ``frame`` [frames]."""
 
-REPEAT_COLUMNS = ("repeat_x_nm", "repeat_y_nm", "repeat_z_nm", "repeat_mass_kda")
+REPEAT_COLUMNS = tuple(f"repeat_{name}" for name in PARAMETERS)
 """Columns of ``fits.csv``: standard errors of an event as disjoint parts of its own frames show
 them; of a single frame, as the empty places of that frame do."""
 
-TRACK_COLUMNS = (
-    "track", "first_frame", "last_frame", "n_frames", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
-    "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
-    "refractive_index", "confinement_nm", "status", "flags",
-    "d_low_um2_s", "d_high_um2_s", "d_disagreement", "p_confinement", "exponent", "sigma_exponent",
-    "p_anomalous", "p_steady", "sigma_refractive_index", "contrast", "mass_scatter", "p_mass",
-    "n_mass_frames", "n_d_frames", "x_nm", "y_nm", "z_nm", "nearest_nm", "begins", "ends",
+TRACKS = (
+    Column("track", "count", "Number of the track, as in fits.csv"),
+    Column("first_frame", "count", "First frame with the particle"),
+    Column("last_frame", "count", "Last frame with it"),
+    Column("n_frames", "natural", "Frames in which it was fitted", "frames"),
+    Column(
+        "mass_kda", "number",
+        "Mass common to its frames that are ok [kDa]; on the model's own scale, which is no mass, "
+        "unless mass_scale is calibration", "mass [kDa]",
+    ),
+    Column("sigma_mass_kda", "positive", "Its standard error [kDa]", "σ [kDa]"),
+    Column("crb_mass_kda", "positive", "Its Cramér–Rao bound [kDa]", "CRB [kDa]"),
+    Column(
+        "d_um2_s", "not_negative",
+        "Diffusion coefficient along x and y of highest likelihood, with the error of each frame "
+        "and its motion blur [µm²/s]; null without a frame rate or with fewer positions than "
+        "track.min_frames", "D [µm²/s]",
+    ),
+    Column("sigma_d_um2_s", "positive", "Its standard error, from the curvature [µm²/s]",
+           "σ [µm²/s]"),
+    Column("crb_d_um2_s", "positive", "Its Cramér–Rao bound [µm²/s]", "CRB [µm²/s]"),
+    Column(
+        "diameter_nm", "positive",
+        "Hydrodynamic diameter [nm]; with track.free = \"joint\", where D is above zero within its "
+        "error and a sphere of that size fits between the particle and the coverslip",
+        "diameter [nm]",
+    ),
+    Column("sigma_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]"),
+    Column(
+        "refractive_index", "positive",
+        "Index of the sphere of that diameter that scatters like mass_kda of [particle]; null for "
+        "a material that absorbs", "index",
+    ),
+    Column(
+        "confinement_nm", "positive",
+        "Standard deviation of the place in a harmonic well [nm]; where p_confinement is at most "
+        "0.005", "well [nm]",
+    ),
+    Column("status", "status", "The worst remark"),
+    Column("flags", "text",
+           "Every remark, worst first, joined by semicolons; crosses makes no verdict"),
+    Column("d_low_um2_s", "not_negative", "Lower end of the 95 % interval of D [µm²/s]; 0: open"),
+    Column("d_high_um2_s", "positive", "Upper end [µm²/s]"),
+    Column(
+        "d_disagreement", "number",
+        "Covariance-based estimate of D minus this one, in standard errors; far from 0 the errors "
+        "of the places or the exposure are wrong, or motion is not free",
+    ),
+    Column("p_confinement", "share",
+           "Chance of a free track that looks as confined; first 300 positions", "p, confined"),
+    Column("exponent", "number",
+           "Exponent of time in the mean-squared displacement; 1 where free", "exponent"),
+    Column("sigma_exponent", "positive", "Its standard error"),
+    Column("p_anomalous", "share", "Chance of a free track with an exponent as far from 1",
+           "p, anomalous"),
+    Column("p_steady", "share",
+           "Chance of one D in all stretches of the track that differ as much", "p, one D"),
+    Column("sigma_refractive_index", "not_negative", "Standard error of the refractive index",
+           "σ of index"),
+    Column("contrast", "number",
+           "Signed peak contrast of a particle of mass_kda; null in dark field"),
+    Column("mass_scatter", "not_negative", "Scatter of the frames' masses over their σ",
+           "scatter / σ"),
+    Column("p_mass", "share", "Chance of at least that scatter with one mass"),
+    Column("n_mass_frames", "count", "Frames that are ok, whose masses were combined"),
+    Column("n_d_frames", "count", "Frames whose places were used for D; 0 where these are too few"),
+    Column("x_nm", "number", "Mean place along x [nm]", "x [nm]"),
+    Column("y_nm", "number", "Mean place along y [nm]", "y [nm]"),
+    Column("z_nm", "number", "Mean height [nm]", "z [nm]"),
+    Column("nearest_nm", "positive", "Smallest distance to another track in the same frame [nm]"),
+    Column("begins", "end",
+           "movie: in the first frame; border: within a step of that of the field; inside: else"),
+    Column("ends", "end", "The same of the last frame"),
+    Column("systematic_mass_kda", "number", "Error common to the movie, from calibrations [kDa]",
+           "systematic [kDa]", optional=True),
 )  # fmt: skip
 """The columns of ``tracks.csv``, in order."""
+
+TRACK_COLUMNS = tuple(column.name for column in TRACKS if not column.optional)
+"""Names of the columns that every ``tracks.csv`` has, in order."""
 
 
 def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:

@@ -13,7 +13,9 @@ import pandas as pd
 from markupsafe import Markup, escape
 
 from iscat_analysis.records import (
+    EVENTS,
     FREE_PARAMETERS,
+    PARAMETERS,
     Analysis,
     EventView,
     Status,
@@ -166,21 +168,26 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     return tiles
 
 
+def _headings(analysis: Analysis) -> Iterator[tuple[str, str]]:
+    """Name the columns of the table of events: place, each fitted quantity with its errors, fit."""
+    headed = [column for column in EVENTS if column.heading]
+    fitted = [name for name in ("z_nm", "mass_kda") if name in FREE_PARAMETERS[analysis.mode]]
+    own = [column for column in headed if column.name.endswith(PARAMETERS)]
+    rest = [column for column in headed if column not in own]
+    last = rest.index(next(column for column in rest if column.name == "contrast")) + 1
+    yield from ((column.name, column.heading) for column in rest[:last])
+    for name in fitted:
+        yield name, f"{label_of(analysis, name)} [{UNITS[name]}]"
+        errors = [column for column in own if column.name.endswith(f"_{name}")]
+        for column in sorted(errors, key=lambda column: "crb_" in column.name):
+            yield column.name, f"{column.heading} [{column.unit}]"
+    yield from ((column.name, column.heading) for column in rest[last:])
+
+
 def event_rows(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
     """Write the table of events, one column of one kind with the same decimals throughout."""
-    free = FREE_PARAMETERS[analysis.mode]
-    columns = [("x_px", "x [px]"), ("y_px", "y [px]"), ("contrast", "contrast [10⁻³]")]
-    for name in ("z_nm", "mass_kda"):
-        if name in free:
-            columns.append((name, f"{label_of(analysis, name)} [{UNITS[name]}]"))
-            for kind, heading in (
-                ("sigma", "σ"), ("systematic", "systematic"), ("repeat", "repeats"),
-                ("crb", "CRB"), ("qcrb", "QCRB"),
-            ):  # fmt: skip
-                columns.append((f"{kind}_{name}", f"{heading} [{UNITS[name]}]"))
-    columns += [("snr", "SNR"), ("chi2_reduced", "χ²"), ("p_value", "p")]
     shown = {}
-    for name, heading in columns:
+    for name, heading in _headings(analysis):
         if name in table and np.isfinite(values := table[name].to_numpy(float)).any():
             scaled = 1e3 * values if name == "contrast" else values
             decimals = 2 if name in ("chi2_reduced", "p_value") else _decimals(scaled)

@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from iscat_analysis.records import EVENT_COLUMNS, Analysis
+from iscat_analysis.records import EVENT_COLUMNS, EVENTS, Analysis
 from iscat_analysis.schemas import to_json
 
 CSV_DIGITS = 9
@@ -22,13 +22,10 @@ def event_table(analysis: Analysis) -> pd.DataFrame:
         raise ValueError(f"analysis.table lacks the columns {', '.join(missing)}")
     further = [name for name in analysis.table.columns if name not in EVENT_COLUMNS]
     table = analysis.table.reindex(columns=[*EVENT_COLUMNS, *further]).reset_index(drop=True)
-    for name in ("event", "frame", "n_before", "n_after"):
-        table[name] = table[name].astype("int64")
-    for name in EVENT_COLUMNS[4:-2]:
-        table[name] = table[name].astype("float64")
-    table["status"] = [_text(value) for value in table["status"]]
-    table["flags"] = [_text(value) for value in table["flags"]]
-    return table.astype({"status": "object", "flags": "object"})
+    kept = [column for column in EVENTS if not column.optional]
+    for name in (column.name for column in kept if column.is_text):
+        table[name] = [_text(value) for value in table[name]]
+    return table.astype({column.name: column.dtype for column in kept})
 
 
 def _text(value: Any) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
 
-from iscat_analysis.records import Analysis, TrackStatus
+from iscat_analysis.records import TRACKS, Analysis, TrackStatus
 from iscat_analysis.report.event_figures import event_details
 from iscat_analysis.report.films import films_shown
 from iscat_analysis.report.headline import (
@@ -27,16 +27,11 @@ from iscat_analysis.report.tracks import (
     tracks_of,
 )
 
-_COLUMNS = (
-    ("n_frames", "frames"), ("x_nm", "x [nm]"), ("y_nm", "y [nm]"), ("z_nm", "z [nm]"),
-    ("mass_kda", "mass [kDa]"), ("sigma_mass_kda", "σ [kDa]"), ("crb_mass_kda", "CRB [kDa]"),
-    ("systematic_mass_kda", "systematic [kDa]"),
-    ("d_um2_s", "D [µm²/s]"), ("sigma_d_um2_s", "σ [µm²/s]"), ("crb_d_um2_s", "CRB [µm²/s]"),
-    ("diameter_nm", "diameter [nm]"), ("sigma_diameter_nm", "σ [nm]"),
-    ("refractive_index", "index"), ("sigma_refractive_index", "σ of index"),
-    ("exponent", "exponent"), ("p_confinement", "p, confined"), ("p_anomalous", "p, anomalous"),
-    ("p_steady", "p, one D"),
-    ("confinement_nm", "well [nm]"), ("mass_scatter", "scatter / σ"),
+_SHOWN = (
+    "n_frames", "x_nm", "y_nm", "z_nm", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
+    "systematic_mass_kda", "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm",
+    "sigma_diameter_nm", "refractive_index", "sigma_refractive_index", "exponent", "p_confinement",
+    "p_anomalous", "p_steady", "confinement_nm", "mass_scatter",
 )  # fmt: skip
 _ERROR_OF = {
     "mass_kda": "sigma_mass_kda",
@@ -89,7 +84,8 @@ def _tiles(analysis: Analysis, fits: pd.DataFrame) -> list[dict[str, str]]:
 def track_rows(analysis: Analysis) -> dict[str, Any]:
     """Write the table of tracks."""
     tracks = tracks_of(analysis)
-    names = dict(_COLUMNS)
+    headings = {column.name: column.heading for column in TRACKS}
+    names = {name: headings[name] for name in _SHOWN}
     if main_quantity(analysis).column == "contrast":
         tracks = as_contrasts(tracks) if len(tracks) else tracks
         for name in ("mass_kda", "sigma_mass_kda", "crb_mass_kda", "systematic_mass_kda"):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from iscat_analysis.records import Column
 
 Number = float | None
 Count = Annotated[int, Field(ge=0)]
@@ -20,6 +23,14 @@ Scheme = Literal["iscat", "cobri", "darkfield"]
 Emission = Literal["dong2021", "reciprocal"]
 Convention = Literal["exact", "dong2021"]
 Parameter = Literal["x_nm", "y_nm", "z_nm", "mass_kda"]
+End = Literal["movie", "border", "inside"]
+
+_VALUES: dict[str, Any] = {
+    "count": Count, "natural": Natural, "number": Number, "positive": Positive,
+    "not_negative": NotNegative | None, "share": Share, "span": NotNegative | None,
+    "text": str | None, "end": End,
+}  # fmt: skip
+"""Type of the values of a column; that of its status depends on the table."""
 
 
 def key(description: str) -> Any:
@@ -42,3 +53,15 @@ class Closed(BaseModel):
     """A part that holds the keys named here and no other."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)
+
+
+def row_model(name: str, said: str, columns: Iterable[Column], status: Any) -> type[Closed]:
+    """Make the model of one row of a table from the registry of its columns."""
+    fields: dict[str, Any] = {}
+    for column in columns:
+        values = (_VALUES | {"status": status})[column.values]
+        if column.optional:
+            fields[column.name] = values | None, maybe(column.description)
+        else:
+            fields[column.name] = values, key(column.description)
+    return create_model(name, __base__=Closed, __doc__=said, **fields)

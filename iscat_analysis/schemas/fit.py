@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from iscat_analysis.records import Status
+from iscat_analysis.records import EVENTS, Status
 from iscat_analysis.schemas.base import (
     Closed,
     Convention,
@@ -18,75 +18,19 @@ from iscat_analysis.schemas.base import (
     NotNegative,
     Number,
     Parameter,
-    Positive,
     Scheme,
     Share,
     key,
     maybe,
+    row_model,
 )
 from iscat_analysis.schemas.calibration import OpticsParameter, Twin
 from iscat_analysis.schemas.tracks import Motion, Track
 
-_SIGMA = "Standard deviation from the observed information [{}]; null where it is not free"
-_CRB = "Joint Cramér–Rao bound at the estimate [{}]; null where the parameter is not free"
-_QCRB = "Quantum Cramér–Rao bound for the collected photons [{}]"
-_SYSTEMATIC = "Error common to the movie, from calibrations of optics and mass [{}]"
-_REPEAT = (
-    "Standard error from eight disjoint parts of the event's own frames, itself to 19 %; in mode "
-    "track, from the empty places of its frame [{}]"
-)
-
-
-class Event(Closed):
-    """One row of fits.csv."""
-
-    event: Count = key("Number of the event")
-    frame: Count = key("First frame of the new state")
-    n_before: Count = key("Frames summed before")
-    n_after: Count = key("Frames summed after")
-    x_px: Number = key("Column, 0-based; an integer is a pixel's centre [px]")
-    y_px: Number = key("Row, downwards, 0-based; an integer is a pixel's centre [px]")
-    x_nm: Number = key("x_px times the pixel size [nm]")
-    y_nm: Number = key("y_px times the pixel size [nm]")
-    z_nm: Number = key("Height above the coverslip [nm]")
-    mass_kda: Number = key(
-        "Mass [kDa]; negative for a particle that leaves; on the model's own scale, which is no "
-        "mass, unless mass_scale is calibration"
-    )
-    contrast: Number = key("Signed peak contrast of the fitted model; null in dark field")
-    sigma_x_nm: Positive = key(_SIGMA.format("nm"))
-    sigma_y_nm: Positive = key(_SIGMA.format("nm"))
-    sigma_z_nm: Positive = key(_SIGMA.format("nm"))
-    sigma_mass_kda: Positive = key(_SIGMA.format("kDa"))
-    crb_x_nm: Positive = key(_CRB.format("nm"))
-    crb_y_nm: Positive = key(_CRB.format("nm"))
-    crb_z_nm: Positive = key(_CRB.format("nm"))
-    crb_mass_kda: Positive = key(_CRB.format("kDa"))
-    qcrb_x_nm: Positive = key(_QCRB.format("nm"))
-    qcrb_y_nm: Positive = key(_QCRB.format("nm"))
-    qcrb_z_nm: Positive = key(_QCRB.format("nm"))
-    qcrb_mass_kda: Positive = key(_QCRB.format("kDa"))
-    n_scattered: Number = key("Scattered photons collected in the frames after")
-    snr: Number = key("Matched-filter signal over its noise")
-    chi2_reduced: Number = key("Reduced χ² of the fitted pixels")
-    p_value: Share = key("Probability of a worse fit if the model holds")
-    status: Status = key("The verdict")
-    flags: str | None = key("Every condition that was noticed, joined by semicolons")
-    frame_ci95: NotNegative | None = maybe(
-        "Half-width of the 95 % interval of frame [frames]; landing movies only"
-    )
-    systematic_x_nm: Number = maybe(_SYSTEMATIC.format("nm"))
-    systematic_y_nm: Number = maybe(_SYSTEMATIC.format("nm"))
-    systematic_z_nm: Number = maybe(_SYSTEMATIC.format("nm"))
-    systematic_mass_kda: Number = maybe(_SYSTEMATIC.format("kDa"))
-    systematic_contrast: Number = maybe(
-        "Error of the contrast that is common to the movie; where no calibration makes it a mass"
-    )
-    repeat_x_nm: Number = maybe(_REPEAT.format("nm"))
-    repeat_y_nm: Number = maybe(_REPEAT.format("nm"))
-    repeat_z_nm: Number = maybe(_REPEAT.format("nm"))
-    repeat_mass_kda: Number = maybe(_REPEAT.format("kDa"))
-    track: Count | None = maybe("Number of the track that the row belongs to")
+if TYPE_CHECKING:
+    Event = Closed
+else:
+    Event = row_model("Event", "One row of fits.csv.", EVENTS, Status)
 
 
 class Medians(Document):

@@ -26,6 +26,7 @@ from scipy.special import ndtri
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
+    TRACKS,
     FloatArray,
     Progress,
     TrackStatus,
@@ -369,13 +370,7 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:
     """Put records into columns with the right types."""
     table = pd.DataFrame(list(records), columns=list(TRACK_COLUMNS))
-    whole = ("track", "first_frame", "last_frame", "n_frames", "n_mass_frames", "n_d_frames")
-    text = ("status", "flags", "begins", "ends")
-    kinds = {
-        name: "int64" if name in whole else "object" if name in text else "float64"
-        for name in TRACK_COLUMNS
-    }
-    table = table.astype(kinds)
+    table = table.astype({column.name: column.dtype for column in TRACKS if not column.optional})
     table["nearest_nm"] = table["nearest_nm"].where(np.isfinite(table["nearest_nm"]))
     if "systematic_mass_kda" in fits:
         shared = fits.groupby(track_numbers(fits))["systematic_mass_kda"].median()

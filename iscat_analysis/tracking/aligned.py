@@ -95,7 +95,7 @@ class Aligned:
         x, y, z = (float(v) for v in theta[:3])
         signal = likelihood.signal(theta)
         return ParticleImage(
-            grid=likelihood.grid, kind=likelihood.kind, data=likelihood.data,
+            grid=likelihood.grid, noise=likelihood.noise, data=likelihood.data,
             x_nm=x, y_nm=y, z_nm=z, mass_kda=float(scene.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
             owner=int(self.track[number]),

@@ -36,7 +36,6 @@ from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, 
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pieces.regions import lines_from, numbered
 from iscat_analysis.records import (
     CountSource,
     EventView,
@@ -45,6 +44,7 @@ from iscat_analysis.records import (
     Progress,
     Status,
     Windows,
+    make_rows,
 )
 from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.threads import beside, threads
@@ -289,7 +289,7 @@ def track_frames(
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
     own = numbers[order]
-    fits = numbered(lines_from([lines[k] for k in order]).assign(track=own), own)
+    fits = make_rows([lines[k] for k in order], event=own, track=own)
     seen: dict[int, EventView] = {}
     for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
         if number not in seen:

@@ -14,7 +14,7 @@ from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.pieces.regions import saturated_near
-from iscat_analysis.records import EVENT_COLUMNS, PARAMETERS, BoolArray, FloatArray, Status, verdict
+from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray, Status, make_rows, verdict
 from iscat_analysis.tracking.joint.common import variances_left
 from iscat_analysis.tracking.linking import unlike
 from iscat_analysis.tracking.moving import Moving
@@ -102,7 +102,7 @@ def table_of_tracks(
     status = [str(status) for status, _ in judged]
     flags = [";".join(map(str, flags)) for _, flags in judged]
     status, flags = (np.array(said, dtype=object)[2 * numbers + off] for said in (status, flags))
-    return table.assign(status=status, flags=flags)[[*EVENT_COLUMNS, "track"]]
+    return make_rows(table, status=status, flags=flags)
 
 
 def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:

@@ -119,7 +119,7 @@ def test_masses_of_other_particles_err_by_what_was_foreseen() -> None:
         wrong = forward_model(
             with_settings(config, {**settings_of(config), **moved}), 2500.0, z_max_nm=5.0
         )
-        likelihood = Likelihood(wrong, GRID, truth.kind, truth.data)
+        likelihood = Likelihood(wrong, GRID, truth.noise, truth.data)
         start = theta.copy()
         start[3] = wrong.scale.amplitude(200.0)
         width = np.array([80.0, 80.0, 0.0, abs(start[3]), 0.5])

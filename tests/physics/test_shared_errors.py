@@ -90,7 +90,7 @@ def test_a_fit_with_the_wrong_microscope_moves_as_foreseen(
     found = []
     for sign in (1, -1):
         wrong = _model(_moved(config, name, sign * step))
-        likelihood = Likelihood(wrong, GRID, truth.kind, truth.data)
+        likelihood = Likelihood(wrong, GRID, truth.noise, truth.data)
         start = theta.copy()
         start[3] = wrong.scale.amplitude(300.0)
         width = np.array([100.0, 100.0, 40.0, abs(start[3]), 0.5])

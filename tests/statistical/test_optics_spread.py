@@ -7,8 +7,8 @@ import pytest
 from calibrations import configuration
 from instruments import Instrument, Pictures
 
-from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.inference.noise import conditional
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner import ParticleImage, build_microscope, maximise, settings_of
 from iscat_analysis.instrument.learner.starts import with_masses
 from iscat_analysis.optics.grid import PixelGrid

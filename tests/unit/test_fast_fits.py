@@ -14,7 +14,6 @@ from iscat_analysis._kernels.curvature import first_order_bias
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.image import signal_gradient, signal_image
 from iscat_analysis._kernels.scoring import (
-    CONDITIONAL,
     image_score,
     image_value,
     picture_at,
@@ -25,6 +24,7 @@ from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import FOLLOWED, PLAIN, fit_particle, search_box
 from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, three_tests
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, Candidate, FloatArray
@@ -103,7 +103,7 @@ def _bias(which: Likelihood, theta: FloatArray, free: BoolArray) -> FloatArray:
     _, c1, c2, c3 = which.data
     level = math.exp(theta[LEVEL])
     gradient, bend = np.zeros((5, *GRID.shape)), np.zeros((5, 5, *GRID.shape))
-    if which.kind == CONDITIONAL:
+    if which.noise == CONDITIONAL:
         odds = c2 * level * (1 + signal)
         variance = c3 * c1 * odds / (1 + odds) ** 2
         skewness = variance * (1 - odds) / (1 + odds)
@@ -137,14 +137,14 @@ def test_bias(case: Case, free: tuple[bool, ...]) -> None:
     derivatives = which.derivatives(case.theta)
     got, lost = np.empty((2, 5))
     level = math.exp(case.theta[LEVEL])
-    first_order_bias(which.kind, which.data, level, derivatives, free_array, got)
+    first_order_bias(which.noise.code, which.data, level, derivatives, free_array, got)
     slow = _bias(which, case.theta, free_array)
     scale = 1 / np.sqrt(np.diag(which.score_fisher(case.theta)[2]))
     np.testing.assert_allclose(got / scale, slow / scale, atol=1e-9)
     assert np.abs(slow / scale).max() > 1e-5
     nowhere = case.theta * np.array([1, 1, 1, 0, 1])
     none = which.derivatives(nowhere)
-    first_order_bias(which.kind, which.data, level, none, free_array, lost)
+    first_order_bias(which.noise.code, which.data, level, none, free_array, lost)
     assert np.isnan(lost).any() or not case.model.rho
 
 
@@ -183,7 +183,7 @@ def _structure(which: Likelihood, theta: FloatArray, free: BoolArray) -> float:
     signal, gradient = which.model.amplitude_gradient(GRID, *theta[:4])
     c0, c1, c2, c3 = (c[which.used] for c in which.data)
     level, s = math.exp(theta[LEVEL]), signal[which.used]
-    if which.kind == CONDITIONAL:
+    if which.noise == CONDITIONAL:
         p = c2 * level * (1 + s) / (1 + c2 * level * (1 + s))
         weight = np.sqrt(c3 * c1 * p * (1 - p))
         residual, relative = (c0 - c1 * p) * c3 / weight, 1 / (1 + s)
@@ -429,11 +429,11 @@ def test_strips_of_a_picture_are_scored_as_its_rows(kind: str, rows: int) -> Non
         table, lens, model.height_nm, 0, table.heights.shape[3], np.empty((0, 0, 0))
     )
     got, score, wanted = np.empty((5, 5)), np.empty((2, 5)), np.empty((5, 5))
-    value = score_pass(profile, lens, pixels, which.kind, which.data, theta, score[0], got)
+    value = score_pass(profile, lens, pixels, which.noise.code, which.data, theta, score[0], got)
     signal_gradient(profile, lens, pixels, theta[0], theta[1], theta[3], out)
-    image_score(which.kind, which.data, math.exp(theta[LEVEL]), out, score[1], wanted)
+    image_score(which.noise.code, which.data, math.exp(theta[LEVEL]), out, score[1], wanted)
     assert value == pytest.approx(
-        image_value(which.kind, which.data, math.exp(theta[LEVEL]), out), rel=1e-10
+        image_value(which.noise.code, which.data, math.exp(theta[LEVEL]), out), rel=1e-10
     )
     unit = np.sqrt(np.diag(wanted) + 1e-300)
     np.testing.assert_allclose(score[0] / unit, score[1] / unit, atol=1e-9)

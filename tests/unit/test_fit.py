@@ -170,13 +170,13 @@ def test_a_particle_pulled_into_the_coverslip_is_flagged() -> None:
     """Control: a focus wrong by 40 nm is no chance, and widening the range below 0 no remedy."""
     data = _data(make_config(optics={"focus_nm": -500.0}), (X, Y, 5.0, 3000.0))
     model = forward_model(make_config(optics={"focus_nm": -540.0}), 4000.0)
-    wrong = Likelihood(model, GRID, data.kind, data.data)
+    wrong = Likelihood(model, GRID, data.noise, data.data)
     fits = [
         fit_particle(wrong, _start(mass=3000.0), "localize", (0, 60), level=False),
         fit_particle(
             Likelihood(
                 forward_model(make_config(optics={"focus_nm": -460.0}), 4000.0),
-                GRID, data.kind, data.data,
+                GRID, data.noise, data.data,
             ),
             _start(mass=3000.0), "localize", (0, 60), level=False,
         ),
@@ -215,7 +215,7 @@ def test_poor_fit(wrong: str) -> None:
     if wrong != "neighbour":
         change = {"focus": {"focus_nm": -150.0}, "polarisation": {"polarization_deg": 90.0}}[wrong]
         model = forward_model(make_config(optics=change), 4000.0)
-        data = Likelihood(model, GRID, data.kind, data.data)
+        data = Likelihood(model, GRID, data.noise, data.data)
     fit = fit_particle(data, _start(mass=3000.0), "mass", (0, 1000), level=False)
     assert Status.POOR_FIT in fit.flags
     assert fit.p_value < 1e-3

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iscat_analysis._kernels.scoring import POISSON
+from iscat_analysis.inference.noise_models import POISSON
 from iscat_analysis.instrument.learner.estimate import Estimate
 from iscat_analysis.instrument.learner.measure import _Search
 from iscat_analysis.instrument.learner.particle_images import ParticleImage, Settings

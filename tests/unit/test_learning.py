@@ -15,10 +15,10 @@ from scenes import PIXEL_NM, Stack, make_config
 from scipy.ndimage import gaussian_filter, shift
 
 import iscat_analysis as ia
-from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument import learning
 from iscat_analysis.instrument.learner import ParticleImage
 from iscat_analysis.instrument.learning import LEAST_TESTED, learn_optics

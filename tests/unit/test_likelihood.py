@@ -10,9 +10,9 @@ from scenes import PIXEL_NM, gold, make_config
 from scipy.stats import binom, poisson
 
 from iscat_analysis._kernels.radial import profile_at
-from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 
 # Sums of a few hundred logarithms of counts near 1e6 carry this much rounding.
@@ -104,7 +104,7 @@ def _log_pmf(which: Likelihood, theta: np.ndarray) -> float:
     data0, data1, data2, _ = which.data
     level = np.exp(theta[LEVEL])
     signal = which.model.image(which.grid, *theta[:4])
-    if which.kind == CONDITIONAL:
+    if which.noise == CONDITIONAL:
         q = data2 * level * (1 + signal)
         return float(binom.logpmf(data0, data1, q / (1 + q)).sum())
     return float(poisson.logpmf(data0, level * (data1 + data2 * signal)).sum())

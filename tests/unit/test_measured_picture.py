@@ -94,7 +94,7 @@ def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> lis
         data = conditional(truth, grid, before.astype(float), after.astype(float), 1.0)
         sights.append(
             ParticleImage(
-                grid=grid, kind=data.kind, data=data.data,
+                grid=grid, noise=data.noise, data=data.data,
                 x_nm=float(x + rng.normal(0, 20)), y_nm=float(y + rng.normal(0, 20)),
                 z_nm=truth.height_nm, snr=20.0,
             )
@@ -124,7 +124,7 @@ def test_a_template_describes_what_the_model_does_not() -> None:
     ratio, error = [], []
     for sight, mass in zip(judged, masses[30:], strict=True):
         theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda, sight.level])
-        likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
+        likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
         bounds = event_bounds(likelihood, theta, ("x_nm", "y_nm", "mass_kda"), float("nan"))
         assert np.all(np.isnan(bounds.qcrb))
         ratio.append(sight.mass_kda / mass)

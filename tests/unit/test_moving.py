@@ -270,7 +270,7 @@ def test_rows_are_fitted_by_the_one_likelihood(pool: ThreadPoolExecutor) -> None
                            (observed[:4, :4] * scale)[square], atol=SECOND)  # fmt: skip
         bias = np.empty(5)
         rows_at = likelihood.derivatives(theta)
-        first_order_bias(likelihood.kind, likelihood.data, 1.0, rows_at, free, bias)
+        first_order_bias(likelihood.noise.code, likelihood.data, 1.0, rows_at, free, bias)
         assert np.allclose(judged.bias[row] / sigma, bias[:4] / sigma, atol=SECOND)
         residuals = likelihood.residuals(theta)
         assert judged.chi2[row] == pytest.approx(np.nansum(residuals**2), rel=1e-5)

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from calibrations import GRID, configuration, make_sights, microscope
 
-from iscat_analysis._kernels.scoring import CONDITIONAL, POISSON
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.inference.noise_models import CONDITIONAL, POISSON, NoiseModel
 from iscat_analysis.instrument.learner import (
     PRIVATE,
     ParticleImage,
@@ -29,20 +28,20 @@ from iscat_analysis.optics.grid import PixelGrid
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
 
 
-@pytest.mark.parametrize("kind", [CONDITIONAL, POISSON])
-def test_pixel_terms_are_derivatives(kind: int) -> None:
+@pytest.mark.parametrize("noise", [CONDITIONAL, POISSON])
+def test_pixel_terms_are_derivatives(noise: NoiseModel) -> None:
     random = np.random.default_rng(3)
     signal = random.normal(0, 0.05, (6, 7))
     data = np.ones((4, 6, 7))
     data[0] = random.poisson(900, (6, 7))
-    if kind == CONDITIONAL:
+    if noise == CONDITIONAL:
         data[1], data[2], data[3] = data[0] + random.poisson(1000, (6, 7)), 0.9, 0.97
     else:
         data[1], data[2], data[3] = 880.0, 880.0, 4.0
-    _, score, _, by_signal, by_level = pixel_terms(kind, data, signal, 0.02)
+    _, score, _, by_signal, by_level = noise.terms(data, signal, 0.02)
 
     def value(change: np.ndarray, level: float) -> float:  # type: ignore[type-arg]
-        return pixel_terms(kind, data, signal + change, level)[0]
+        return noise.terms(data, signal + change, level)[0]
 
     step = 1e-5
     push = np.zeros(signal.shape)
@@ -59,10 +58,10 @@ def test_value_is_that_of_the_likelihood_of_fits() -> None:
     settings = settings_of(configuration())
     model = build(settings)
     for sight in sights:
-        likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
+        likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
         theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, 5000.0, 0.01])
         place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, 5000.0)
-        mine = pixel_terms(sight.kind, sight.data, model.gradient(*place)[0], 0.01)[0]
+        mine = sight.noise.terms(sight.data, model.gradient(*place)[0], 0.01)[0]
         assert mine == pytest.approx(likelihood.values(theta[None])[0], rel=1e-9)
 
 

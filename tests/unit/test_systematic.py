@@ -13,6 +13,7 @@ from iscat_analysis.bounds import joint_information
 from iscat_analysis.config import Calibration, Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner import settings_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
@@ -47,7 +48,7 @@ def _fitted(
     model = forward_model(config, 2000.0)
     light = np.full(grid.shape, LIGHT)
     likelihood = counts_likelihood(
-        model, grid, light, light * (1 + signal), 1.0, background=1.0, use_conditional=True
+        model, grid, light, light * (1 + signal), 1.0, background=1.0, noise=CONDITIONAL
     )
     start = np.array([0.0, 0.0, z_nm, amplitude, 0.0])
     width = np.array([150.0, 150.0, 60.0, 0.5 * abs(amplitude), 0.0])

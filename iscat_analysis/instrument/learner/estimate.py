@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.likelihood import LEVEL
-from iscat_analysis.inference.pixels import pixel_terms
 from iscat_analysis.instrument.learner.particle_images import (
     FOCUS_DRIFT,
     FOCUS_STEP,
@@ -358,9 +357,7 @@ def _scores(
         else:
             row[:] = slopes[wanted.index(name)].ravel()
     rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
-    value, residual, weight, of_signal, of_level = pixel_terms(
-        sight.kind, sight.data, signal, level
-    )
+    value, residual, weight, of_signal, of_level = sight.noise.terms(sight.data, signal, level)
     rows[:-1] *= of_signal.ravel()
     rows[-1] = of_level.ravel()
     weighted = rows * weight.ravel()

@@ -136,7 +136,7 @@ def fit_picture(
 
 def fit_own(sight: ParticleImage, model: ForwardModel, *, level: bool) -> ParticleImage:
     """Fit what is a picture's own."""
-    likelihood = Likelihood(model, sight.grid, sight.kind, sight.data)
+    likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
     start = np.array([sight.x_nm, sight.y_nm, model.height_nm, sight.mass_kda, sight.level])
     room = np.array([_ROAM_NM, _ROAM_NM, 0.0, 20 * abs(sight.mass_kda), float(level)])
     half = (np.array(sight.grid.shape[::-1]) - 1) / 2 * sight.grid.pixel_nm
@@ -177,7 +177,7 @@ def _seen(
     sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Measured signal of a picture and its information, 0 where masked; the model takes no part."""
-    likelihood = Likelihood(nominal, sight.grid, sight.kind, sight.data)
+    likelihood = Likelihood(nominal, sight.grid, sight.noise, sight.data)
     return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
 
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from iscat_analysis._kernels.scoring import CONDITIONAL
+from iscat_analysis.inference.noise_models import NoiseModel
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -67,7 +67,7 @@ class ParticleImage:
     """The picture of one particle: counts of a region, and where the search begins."""
 
     grid: PixelGrid
-    kind: int
+    noise: NoiseModel
     data: FloatArray
     x_nm: float
     y_nm: float
@@ -96,20 +96,9 @@ class ParticleImage:
     def among(self, contrast: FloatArray) -> ParticleImage:
         """Return the sight with the contrast of its neighbours in its expectation."""
         rings = 1 + contrast
-        data = self.data.copy()
-        # a factor of the odds, or of the expected counts with and without the particle
-        columns = [2] if self.kind == CONDITIONAL else [1, 2]
-        data[columns] *= rings / self.rings
-        bare = data.copy()
-        bare[columns] /= rings
-        if self.kind == CONDITIONAL:
-            terms = data[0] * np.log(rings) - data[1] * (np.log1p(data[2]) - np.log1p(bare[2]))
-            baseline = float(np.sum(data[3] * terms))
-        else:
-            now, then = data[1] + data[3], bare[1] + bare[3]
-            used = (data[2] > 0) & (then > 0)
-            ratio = np.where(used, now / np.where(used, then, 1.0), 1.0)
-            baseline = float(np.sum(np.where(used, data[0] * np.log(ratio) - now + then, 0.0)))
+        data = self.noise.multiplied(self.data, rings / self.rings)
+        bare = self.noise.multiplied(data, 1 / rings)
+        baseline = self.noise.reference_change(data, bare)
         return replace(self, data=data, rings=rings, baseline=baseline)
 
     def seen_with(self, settings: Settings) -> dict[str, Any]:

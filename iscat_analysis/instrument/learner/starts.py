@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from scipy import fft, ndimage
 
-from iscat_analysis._kernels.scoring import CONDITIONAL
-from iscat_analysis.inference.pixels import pixel_terms
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray
@@ -114,14 +113,10 @@ def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
 
     Shapes: `contrast, variance` (ny, nx).
     """
-    _, _, information, by_signal, _ = pixel_terms(
-        sight.kind, sight.data, np.zeros(sight.grid.shape), 0.0
-    )
-    information = information * by_signal**2
-    c0, c1, c2, c3 = sight.data
+    terms = sight.noise.terms(sight.data, np.zeros(sight.grid.shape), 0.0)
+    information = terms.information * terms.by_signal**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        conditional = sight.kind == CONDITIONAL
-        contrast = c0 / ((c1 - c0) * c2) - 1 if conditional else (c0 - c3 - c1) / c2
+        contrast = sight.noise.measured_signal(sight.data)
     used = (information > 0) & np.isfinite(contrast)
     level = float(np.average(contrast[used], weights=information[used]))
     variance = 1 / np.where(used, information, 1e-6)

@@ -16,7 +16,8 @@ from iscat_analysis._kernels.canvas import Canvas, Field, Light, Pictures, draw_
 from iscat_analysis._kernels.lens import LatticeLens, RoundLens, StampLens
 from iscat_analysis._kernels.moving import Room, Search, fit_frames
 from iscat_analysis._kernels.radial import POWERS
-from iscat_analysis._kernels.scoring import POISSON, maximize
+from iscat_analysis._kernels.scoring import maximize
+from iscat_analysis.inference.noise_models import POISSON
 from iscat_analysis.records import BoolArray, FloatArray
 
 IntArray = NDArray[np.int64]
@@ -101,7 +102,7 @@ def _climb(
         lens = lens._replace(window=near.windows[min(group, len(near.windows) - 1)])
     x, y, offsets, weights = field.pixels
     value, _, outcome = maximize(
-        table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON, data,
+        table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON.code, data,
         search.free, np.maximum(search.lower, start - search.reach),
         np.minimum(search.upper, start + search.reach), search.max_step, search.tolerance,
         search.passes, theta, np.empty((5, 5)), -math.inf,

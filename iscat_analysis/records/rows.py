@@ -1,0 +1,36 @@
+"""The one maker of rows: what was computed of events, in the columns of ``fits.csv``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import pandas as pd
+
+from iscat_analysis.records.columns import EVENTS
+
+
+def make_rows(
+    lines: pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any]], **columns: Any
+) -> pd.DataFrame:
+    """Put lines below one another, in the order and with the types of the registry.
+
+    A line may lack what is not known of it, which stays empty.  Optional columns are there if a
+    line has them, and the number of an event once it is given.  `columns` are added to the lines.
+    """
+    whole = isinstance(lines, (pd.DataFrame, Mapping))
+    table = pd.DataFrame(lines if whole else list(lines)).reset_index(drop=True)
+    table = table.assign(**columns)
+    unknown = set(table) - {column.name for column in EVENTS}
+    if unknown:
+        raise ValueError(f"no column of fits.csv: {', '.join(sorted(unknown))}; see `EVENTS`")
+    kept = [
+        column
+        for column in EVENTS
+        if column.name in table or not (column.optional or column.name == "event")
+    ]
+    types = {column.name: column.dtype for column in kept}
+    table = table.reindex(columns=list(types))
+    if table["frame"].isna().any():  # sums do not say when
+        types["frame"] = "Int64"
+    return table.astype(types)
