@@ -9,18 +9,17 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from filelock import FileLock, Timeout
+
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
-from iscat_analysis.files import whole_file
+from iscat_analysis.files import take, whole_file
 from iscat_analysis.hashing import fingerprint, sha256_of_files
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.folders import files_of
@@ -69,46 +68,31 @@ class Records:
         """Wait until no other run does a job, and keep others from it."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        lock = FileLock(path, thread_local=False, fallback_to_soft=False, poll_interval=_POLL_S)
         try:
-            _wait(handle, lambda: notify(f"waiting for another run, which is at {name}"))
+            held = take(lock, _PATIENCE_S)
+        except Timeout:
+            notify(f"waiting for another run, which is at {name}")
+            held = take(lock, -1)
+        try:
             yield
         finally:
-            os.close(handle)  # the system releases the lock however the process ends
+            if held:  # the system releases the lock however the process ends
+                lock.release()
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"
-
-
-if sys.platform == "win32":  # without locks two runs may do the same job, with the same result
-
-    def _wait(handle: int, tell: Callable[[], None]) -> None:
-        del handle, tell
-
-else:
-    import fcntl
-
-    def _wait(handle: int, tell: Callable[[], None]) -> None:
-        """Take a lock; go on without where the disk knows none."""
-        due = time.monotonic() + _PATIENCE_S
-        while True:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() > due:
-                    tell()
-                    due = float("inf")
-                time.sleep(_POLL_S)
-            except OSError:
-                return
-            else:
-                return
 
 
 def claim_folder(out: Path) -> None:
     """Make the folder of a batch, and refuse one that holds something else."""
     state = out / STATE
     try:
+        if state.is_symlink():
+            raise DataError(
+                f"{state}: is a link, where a batch keeps files of its own, and is left alone; "
+                "remove it, or choose another `out`"
+            )
         held = sorted(p.name for p in out.iterdir()) if out.is_dir() else []
         if held and not state.is_dir():  # asked last: another part may just have begun
             raise DataError(
