@@ -13,6 +13,7 @@ from numbers import Real
 from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.hashing import refuse_changed, states_of
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.folders import files_of

@@ -17,6 +17,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import fingerprint, sha256_of_files
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
+from iscat_analysis.text import printable
 from iscat_analysis.threads import beside
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
@@ -100,11 +101,6 @@ class ArrayFrames:
 
     def close(self) -> None:
         """Leave the array as it is; it belongs to the caller."""
-
-
-def printable(text: str) -> str:
-    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def not_shared(path: Path) -> DataError:
