@@ -95,5 +95,12 @@ def _names(table: Table) -> list[str]:
         ]
         many = Counter(names)
         if len(many) == len(names):
-            return [printable(name) for name in names]
+            break
         folders = [n + (many[name] > 1) for n, name in zip(folders, names, strict=True)]
+    texts = Counter(printable(name) for name in names)
+    if twice := [text for text, times in texts.items() if times > 1]:
+        raise ConfigError(
+            f"{table.source}: two movies would be called {twice[0]}, because bytes of a file name "
+            "that are no text are written so; rename one"
+        )
+    return [printable(name) for name in names]

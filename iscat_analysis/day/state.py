@@ -1,8 +1,8 @@
 """What is finished, on disk: records beside the results, and locks for runs at the same time.
 
 A result is as its job asks for if its record holds the job's key, a hash of the program's version
-and the resolved configuration, and the movie is the one that the record saw: of the same size, time
-and ends, or, where it was copied, of the same SHA-256.
+and the resolved configuration, if its files are as they were written, and if the movie is the one
+that the record saw: of the same size, time and ends, or, where it was copied, of the same SHA-256.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ STATE = ".batch"
 
 _POLL_S = 0.2  # between two looks at a lock that another run holds
 _PATIENCE_S = 2.0  # after which the waiting is told
+_READ_AGAIN = (".json", ".parquet", ".toml")
 _MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
 
 
@@ -142,6 +143,12 @@ def saw(record: Mapping[str, Any], path: Path) -> bool:
     except OSError:
         return False
     return bool(record.get("sha256")) and record["sha256"] == sha256_of(path)
+
+
+def results_in(folder: Path) -> dict[str, str]:
+    """Hash the files of a result that other jobs and the page are made of."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    return {path.name: sha256_of(path) for path in files if path.suffix in _READ_AGAIN}
 
 
 def seen(path: Path) -> str:

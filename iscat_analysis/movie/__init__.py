@@ -133,6 +133,18 @@ def _open_file(address: Path) -> Stack:
         is_pipe = path.exists() and not (is_folder or path.is_file())  # or a device
     except OSError as error:  # nobody may look into the folder that it is in
         raise DataError(f"{address}: cannot be read ({error.strerror})") from None
+    before = states_of([path])
+    stack = _opened(path, part, is_folder=is_folder, is_pipe=is_pipe)
+    try:
+        refuse_changed([path], before)
+    except DataError:
+        stack.close()
+        raise
+    return stack
+
+
+def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
+    """Open a file or folder by what is in it."""
     if is_folder:
         if not is_zarr(path):
             raise DataError(

@@ -151,6 +151,7 @@ class Stack:
         self._frames = frames
         self._part = part
         self._files = (path,) if files is None else tuple(files)
+        self._states = states_of(self._files)
         self._closed = False
         self._own = True
         self._left_out: LeftOut | None = None
@@ -264,7 +265,7 @@ class Stack:
     def _again(self, frames: Frames) -> Stack:
         """Give another one of the same file, which is hashed once for both."""
         seen = Stack(self._path, frames, part=self._part, files=self._files)
-        seen._hashing = self._hashing
+        seen._hashing, seen._states = self._hashing, self._states
         return seen
 
     def close(self) -> None:
@@ -375,14 +376,16 @@ class Stack:
         Raises
         ------
         DataError
-            The file can no longer be read.
+            The file can no longer be read, or is not the one that was opened.
         """
         if not self._files:
             digest = hashlib.sha256(f"{self.dtype.str} {self.shape}".encode())
             for _, block in self.chunks():
                 digest.update(block.data)
             return digest.hexdigest()
-        return sha256_of_files(self._files, self._part)
+        found = sha256_of_files(self._files, self._part)
+        refuse_changed(self._files, self._states)
+        return found
 
     def hashed(self) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.

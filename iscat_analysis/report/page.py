@@ -28,7 +28,8 @@ from iscat_analysis.text import in_page
 def render_page(template: str, context: Mapping[str, Any]) -> str:
     """Fill one of the templates in ``iscat_analysis/report/templates``.
 
-    Everything is escaped, signs that nobody sees among it; the result needs no network and no other file.
+    Everything is escaped, and so are signs that nobody sees; the result needs no network and no
+    other file.
     """
     defaults = {
         "kicker": "iscat-analysis",
