@@ -33,7 +33,9 @@ class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
     def on_start(self, event: event.Event) -> None:
         """Note a function, by what Numba names its files after."""
         function = event.data["dispatcher"].py_func
-        code = function.__code__
+        code = getattr(function, "__code__", None)
+        if code is None:  # nothing that has a file
+            return
         name = f"{inspect.getmodulename(code.co_filename)}.{function.__qualname__}"
         name = name.replace("<", "").replace(">", "")
         self._begin.add(f"{name}-{code.co_firstlineno}.")

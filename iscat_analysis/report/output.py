@@ -199,6 +199,8 @@ def _remove_listed(folder: Path) -> None:
                 continue
             with suppress(OSError):  # a folder that holds something else
                 if path.is_dir() and not path.is_symlink():
+                    for litter in _LITTER:
+                        (path / litter).unlink(missing_ok=True)
                     path.rmdir()
                 else:
                     path.unlink()

@@ -72,8 +72,8 @@ def test_camera_from_a_movie_and_a_dark(recordings: Path, tmp_path: Path, capsys
     assert "saturated and left out" in said.err
     assert found["shot_limited_frames"] == 32
     assert sorted(path.name for path in out.iterdir()) == [
-        ".iscat-files", "camera.html", "camera.json", "camera.toml", "gain_e_per_adu.tif", "masked.tif",
-        "offset_adu.tif", "read_noise_e.tif",
+        ".iscat-files", "camera.html", "camera.json", "camera.toml", "gain_e_per_adu.tif",
+        "masked.tif", "offset_adu.tif", "read_noise_e.tif",
     ]  # fmt: skip
     assert tifffile.imread(out / "masked.tif").sum() == 1
     camera = load_config(out / "camera.toml").camera  # a section to paste, with paths beside it
