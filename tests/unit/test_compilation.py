@@ -134,10 +134,10 @@ def test_a_process_does_not_vouch_for_what_others_compiled(tmp_path):
     damage = f"""
 import pathlib
 from iscat_analysis import _kernels
-from iscat_analysis._kernels import checksums
 pathlib.Path({str(file)!r}).write_bytes({_flipped(kept)!r})
 import numpy as np
-from iscat_analysis._kernels.support import MORE
+from iscat_analysis._kernels.lines import largest
+largest(np.zeros(3))
 """
     subprocess.run(
         [sys.executable, "-c", damage], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},

@@ -60,7 +60,7 @@ def test_a_figure_shows_any_text(text: str) -> None:
         legend = axes.legend()
         assert len(legend.get_texts()) == (text != "")
         svg = publish([("a", figure)])["a"]
-    root = ET.fromstring(svg.replace("<svg ", '<svg xmlns:xlink="links" ', 1))
+    root = ET.fromstring(str(svg).replace("<svg ", '<svg xmlns:xlink="links" ', 1))
     if text.strip() and text.isascii() and text.isprintable():
         assert text.strip() in ["".join(node.itertext()).strip() for node in root.iter()]
 
