@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import tifffile
 
-import iscat_analysis.movie
 import iscat_analysis as ia
+import iscat_analysis.movie
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import sha256_of_files
 

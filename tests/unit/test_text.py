@@ -97,7 +97,7 @@ def test_numbers_are_written_as_numbers() -> None:
 
 
 @given(EVERY)
-@example("\x7f\x9b\u202e\"\\\n\t")
+@example('\x7f\x9b\u202e"\\\n\t')
 def test_json_and_toml_mean_the_same_text(text: str) -> None:
     document = in_json(json.dumps({"name": text}, ensure_ascii=False))
     assert json.loads(document) == {"name": text}
