@@ -1,7 +1,7 @@
 """What is finished, on disk: records beside the results, and locks for runs at the same time.
 
 A result is as its job asks for if its record holds the job's key, a hash of the program's version
-and the resolved configuration, if its files can be read, and if the movie is the one
+and the resolved configuration, if its files are whole, and if the movie is the one
 that the record saw: of the same size, time and ends, or, where it was copied, of the same SHA-256.
 """
 
@@ -20,8 +20,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from filelock import FileLock, Timeout
 
-from iscat_analysis.config import Config, config_to_toml, load_config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.errors import DataError
 from iscat_analysis.files import take, whole_file
 from iscat_analysis.hashing import fingerprint, sha256_of_files
 from iscat_analysis.movie.addresses import split_address
@@ -32,8 +32,7 @@ STATE = ".batch"
 
 _POLL_S = 0.2  # between two looks at a lock that another run holds
 _PATIENCE_S = 2.0  # after which the waiting is told
-_READ_AGAIN = (".json", ".parquet", ".toml")
-_REMEMBERED = 2**14  # files that were read
+_REMEMBERED = 2**14  # tables that were read
 _MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
 
 
@@ -149,30 +148,32 @@ def saw(record: Mapping[str, Any], path: Path) -> bool:
     return bool(record.get("sha256")) and record["sha256"] == sha256_of(path)
 
 
-def unreadable(folder: Path) -> str:
-    """Name a file of a result that cannot be read, of those that other jobs and the page need."""
+def results_in(folder: Path) -> dict[str, str]:
+    """Give the state of the files of a result that other jobs and the page need.
+
+    That is the hash of a document, of which a part may be a document as well, and of a table
+    whether it can be read.
+    """
+    found: dict[str, str] = {}
     for path in sorted(folder.iterdir()):
-        state = path.stat()
-        if path.suffix in _READ_AGAIN and not _reads(path, state.st_size, state.st_mtime_ns):
-            return path.name
-    return ""
+        if path.suffix in (".json", ".toml"):
+            found[path.name] = sha256_of(path)
+        elif path.suffix == ".parquet":
+            state = path.stat()
+            found[path.name] = _reads(path, state.st_size, state.st_mtime_ns)
+    return found
 
 
 @lru_cache(maxsize=_REMEMBERED)
-def _reads(path: Path, size: int, changed_ns: int) -> bool:
-    """Tell whether a file can be read to its end; it is read again once it has changed."""
+def _reads(path: Path, size: int, changed_ns: int) -> str:
+    """Tell whether a table can be read to its end, once until it changes."""
     del size, changed_ns
     try:
-        if path.suffix == ".parquet":
-            with path.open("rb") as file:
-                pq.read_table(file)
-        elif path.suffix == ".toml":
-            load_config(path)
-        else:
-            json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError, MemoryError, ConfigError, pa.ArrowException):
-        return False
-    return True
+        with path.open("rb") as file:
+            pq.read_table(file)
+    except (OSError, ValueError, MemoryError, pa.ArrowException):
+        return "damaged"
+    return "whole"
 
 
 def seen(path: Path) -> str:

@@ -110,7 +110,7 @@ def test_a_damaged_result_costs_only_itself(lab: Path, name: str, share: float) 
     found = ia.batch(lab, out=out, config=SETUP, notify=told.append)
     assert found.failed == ()
     assert sorted(found.analysed) == ["NA", "another"]
-    assert any(f"{name}: cannot be read; this is made anew" in line for line in told)
+    assert any("NA.iscat: is damaged, and is made anew" in line for line in told)
     assert file.read_bytes() == kept
     assert ia.batch(lab, out=out, config=SETUP).analysed == ()
 
