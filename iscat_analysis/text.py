@@ -80,7 +80,7 @@ def _with_texts(table: pd.DataFrame, change: Callable[[str], str]) -> pd.DataFra
     made = table.rename(columns=changed)
     for place, kind in enumerate(table.dtypes):
         if kind.kind == "O":
-            made.isetitem(place, table.iloc[:, place].map(changed))
+            made.isetitem(place, table.iloc[:, place].map(changed).astype(kind))
     return made
 
 

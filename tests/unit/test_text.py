@@ -90,6 +90,12 @@ def test_a_table_holds_no_formula_and_reads_back(texts: list[str]) -> None:
     assert list(back["x"]) == list(made["x"]) == [-1.0] * len(texts)
 
 
+def test_a_column_without_a_text_keeps_its_kind() -> None:
+    table = pd.DataFrame({"why": pd.Series([None, None], dtype=object), "x": [1, 2]})
+    for made in (in_table(table), from_table(table)):
+        assert list(made.dtypes) == list(table.dtypes)
+
+
 def test_numbers_are_written_as_numbers() -> None:
     table = pd.DataFrame({"a": [-1.5, 2.0], "b": ["-1.5", "=2"], "c": [-1, None]})
     file = io.StringIO(in_table(table).to_csv(index=False))
