@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from iscat_cli import INTERRUPTED
 from iscat_cli.ending import ending_in_time, interrupts_kept, termination_interrupts
@@ -34,6 +35,16 @@ SECONDS_BETWEEN_LINES = 10.0
 PLAIN_WIDTH = 200
 
 
+class _Console(Console):
+    """Prints names of files and samples as text, whatever a terminal would make of them."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Prepare a text, of which every cell of a table is one, to be printed."""
+        from iscat_analysis.text import in_terminal
+
+        return super().render_str(in_terminal(text), **options)
+
+
 class Messages:
     """Progress, notes and errors of one command, on stderr.
 
@@ -44,7 +55,7 @@ class Messages:
         self.name = name
         self.quiet = quiet
         self.writing = False
-        self._terminal = Console(stderr=True, highlight=False, markup=False, emoji=False)
+        self._terminal = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
     def error(self, text: str) -> None:
         """Say in one line what went wrong, and what to do."""
@@ -267,9 +278,9 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
 
 def print_result(result: RenderableType) -> None:
     """Print a result on stdout: in colour on a terminal, as plain text elsewhere."""
-    console = Console(highlight=False, markup=False, emoji=False)
+    console = _Console(highlight=False, markup=False, emoji=False)
     if not console.is_terminal:
-        console = Console(
+        console = _Console(
             highlight=False, markup=False, emoji=False, width=PLAIN_WIDTH, no_color=True
         )
     with _failing_once(sys.stdout), console.capture() as captured:
@@ -337,4 +348,6 @@ def _failing_once(stream: TextIO) -> Iterator[None]:
 
 
 def _one_line(text: str) -> str:
-    return "; ".join(line.strip() for line in text.splitlines() if line.strip())
+    from iscat_analysis.text import in_terminal
+
+    return in_terminal("; ".join(line.strip() for line in text.splitlines() if line.strip()))

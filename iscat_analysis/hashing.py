@@ -28,6 +28,29 @@ def sha256_of_files(files: Sequence[Path], part: str = "") -> str:
     return digest.hexdigest()
 
 
+def states_of(files: Sequence[Path]) -> tuple[tuple[int, ...], ...]:
+    """Give what changes of files when they are replaced or written to; nothing of one not there."""
+    found: list[tuple[int, ...]] = []
+    for path in files:
+        try:
+            state = path.stat()
+        except OSError:
+            found.append(())
+        else:
+            found.append((state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns))
+    return tuple(found)
+
+
+def refuse_changed(files: Sequence[Path], states: Sequence[tuple[int, ...]]) -> None:
+    """Refuse files that were replaced or written to since their states were taken."""
+    for path, before, now in zip(files, states, states_of(files), strict=True):
+        if now != before:
+            raise DataError(
+                f"{path}: was replaced or written to while it was open; start again once nothing "
+                "changes it any more"
+            )
+
+
 def fingerprint(files: Sequence[Path], part: str = "") -> str:
     """Tell a movie's content from another's without reading all of it."""
     end = max(_END_BYTES // max(len(files), 1), _LEAST_END_BYTES)

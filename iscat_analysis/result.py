@@ -40,6 +40,7 @@ from iscat_analysis.report.posterior import posterior_groups
 from iscat_analysis.report.spread import counted
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.tracks import tracks_headline, tracks_of
+from iscat_analysis.text import in_page
 from iscat_analysis.units import count
 
 if TYPE_CHECKING:
@@ -298,8 +299,8 @@ class Result:
 
     def _repr_html_(self) -> str:
         facts = "".join(
-            f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
-            f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+            f"<tr><th style='text-align:left'>{html.escape(in_page(name))}</th>"
+            f"<td style='text-align:left'>{html.escape(in_page(text))}</td></tr>"
             for name, text in self._facts()
         )
         names = [*_COLUMNS, *(f"sigma_{name}" for name in FREE_PARAMETERS[self.mode]), "status"]
@@ -318,7 +319,7 @@ class Result:
         more = f"<p>… and {rest} more in <code>{where}</code></p>" if rest else ""
         body = shown.to_html(index=False, float_format="{:.4g}".format, border=0, escape=True)
         return (
-            f"<p><b>{html.escape(self._heading())}</b></p><table>{facts}</table>"
+            f"<p><b>{html.escape(in_page(self._heading()))}</b></p><table>{facts}</table>"
             f"{body if len(listed) else ''}{more}"
         )
 
@@ -388,4 +389,4 @@ class Bounds:
 
     def _repr_html_(self) -> str:
         body = self.actual.to_html(float_format="{:.4g}".format, na_rep="–", border=0)
-        return f"<p><b>{html.escape(self._heading())}</b></p>{body}"
+        return f"<p><b>{html.escape(in_page(self._heading()))}</b></p>{body}"

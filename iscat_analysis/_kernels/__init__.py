@@ -15,6 +15,7 @@ from collections.abc import Callable, Set
 from typing import Any
 
 from numba import config, njit
+from numba.core import event
 
 from iscat_analysis._kernels import checksums
 from iscat_analysis.errors import ConfigError
@@ -51,10 +52,13 @@ NO_ROOM = checksums.refusal(FOLDER)
 
 checksums.remove_damaged(FOLDER)
 
+_COMPILED = checksums.Compiled()
+event.register("numba:compile", _COMPILED)
+
 
 def record_checksums() -> None:
     """Vouch for what this process compiled, so that the next one takes it."""
-    checksums.record(FOLDER)
+    checksums.record(FOLDER, _COMPILED.taken())
 
 
 atexit.register(record_checksums)

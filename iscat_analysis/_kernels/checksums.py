@@ -1,20 +1,52 @@
 """Checksums of compiled kernels on disk: code that is damaged is removed and compiled again.
 
 Numba runs the machine code that it finds in its cache as it is, and a flipped bit there ends the
-process.  A list of SHA-256 stands beside the files.  What is not in the list is not trusted.
+process.  A list of SHA-256 stands beside the files.  What is not in the list is not trusted, and a
+process adds only what it compiled itself.
 """
 
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import tempfile
 from contextlib import suppress
 
+from filelock import FileLock
+from numba.core import event
+
 _LIST = "checksums.json"
+_LOCK = "checksums.lock"
+_PATIENCE_S = 5.0  # with others that write the list; an entry that is lost costs a compilation
 _ROOM_BYTES = 2**25  # all kernels of one analysis
 _KINDS = (".nbi", ".nbc")  # Numba's indices and its compiled code
+
+
+class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
+    """Notes how the files of the functions begin that this process compiles."""
+
+    def __init__(self) -> None:
+        self._begin: set[str] = set()
+
+    def on_start(self, event: event.Event) -> None:
+        """Note a function, by what Numba names its files after."""
+        function = event.data["dispatcher"].py_func
+        code = getattr(function, "__code__", None)
+        if code is None:  # nothing that has a file
+            return
+        name = f"{inspect.getmodulename(code.co_filename)}.{function.__qualname__}"
+        name = name.replace("<", "").replace(">", "")
+        self._begin.add(f"{name}-{code.co_firstlineno}.")
+
+    def on_end(self, event: event.Event) -> None:
+        """Do nothing more."""
+
+    def taken(self) -> tuple[str, ...]:
+        """Give what was noted since this was last asked."""
+        taken, self._begin = tuple(self._begin), set()
+        return taken
 
 
 def refusal(folder: str) -> str:
@@ -37,15 +69,30 @@ def remove_damaged(folder: str) -> None:
                 os.unlink(f"{folder}/{name}")  # noqa: PTH108  # kernels know no paths
 
 
-def record(folder: str) -> None:
-    """List the compiled files of a folder as they are now; a full disk costs the next run time."""
-    found = _digests(folder)
-    if not found or found == _listed(folder):
+def record(folder: str, compiled: tuple[str, ...]) -> None:
+    """Add the files that begin so to the list; a full disk costs the next run time."""
+    found = _digests(folder, compiled) if compiled else {}
+    if not found:
         return
-    with suppress(OSError), tempfile.NamedTemporaryFile("w", dir=folder, delete=False) as file:
-        json.dump(found, file)
-        file.close()
-        os.replace(file.name, f"{folder}/{_LIST}")  # noqa: PTH105
+    lock = FileLock(f"{folder}/{_LOCK}", fallback_to_soft=False)
+    with suppress(OSError):  # without, the later of two processes wins
+        lock.acquire(timeout=_PATIENCE_S)
+    try:
+        _replace(folder, _listed(folder) | found)
+    finally:
+        lock.release()
+
+
+def _replace(folder: str, digests: dict[str, str]) -> None:
+    """Write the list whole, or leave it as it is."""
+    with suppress(OSError):
+        file = tempfile.NamedTemporaryFile("w", dir=folder, delete=False)  # noqa: SIM115
+        try:
+            with file:
+                json.dump(digests, file)
+            os.replace(file.name, f"{folder}/{_LIST}")  # noqa: PTH105
+        except OSError:
+            os.unlink(file.name)  # noqa: PTH108
 
 
 def _listed(folder: str) -> dict[str, str]:
@@ -57,12 +104,12 @@ def _listed(folder: str) -> dict[str, str]:
     return known if isinstance(known, dict) else {}
 
 
-def _digests(folder: str) -> dict[str, str]:
-    """Hash the compiled files of a folder."""
+def _digests(folder: str, begin: tuple[str, ...] = ("",)) -> dict[str, str]:
+    """Hash the compiled files of a folder whose names begin so."""
     found: dict[str, str] = {}
     with suppress(OSError):
         for name in sorted(os.listdir(folder)):  # noqa: PTH208
-            if name.endswith(_KINDS):
+            if name.endswith(_KINDS) and name.startswith(begin):
                 with suppress(OSError), open(f"{folder}/{name}", "rb") as file:  # noqa: PTH123
                     found[name] = hashlib.file_digest(file, "sha256").hexdigest()
     return found

@@ -27,6 +27,7 @@ from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
 from iscat_analysis.species.tables import EventTable, event_table, refuse_far
+from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 
 BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
@@ -248,7 +249,8 @@ def fit_kd(
     if folder is not None:
         contents = {"source": name, **result.to_dict()}
         with atomic_folder(folder, overwrite, known=BINDING_FILES) as building:
-            result.samples.to_csv(building / "kd.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
+            samples = in_table(result.samples)
+            samples.to_csv(building / "kd.csv", index=False, float_format=f"%.{CSV_DIGITS}g")
             (building / "kd.json").write_text(to_json("kd", contents) + "\n", "utf-8")
             (building / "figures").mkdir()
             publish(binding_figure(jsonable(contents)), building / "figures")
@@ -281,7 +283,7 @@ def _read_samples(path: Path) -> pd.DataFrame:
     try:
         text = path.read_text(encoding="utf-8-sig")
         rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
-        return pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else ".")
+        return from_table(pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else "."))
     except OSError as error:
         what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None

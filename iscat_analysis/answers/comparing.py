@@ -22,6 +22,7 @@ from iscat_analysis.species import LEAST_EVENTS, Comparison
 from iscat_analysis.species.comparison import compare
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.text import in_table
 from iscat_analysis.threads import processors, threads
 from iscat_analysis.units import count
 
@@ -211,7 +212,7 @@ def compare_tables(
     if folder is not None:
         contents = comparison_document(read[0].name, [t.name for t in read[1:]], found, notes)
         with atomic_folder(folder, overwrite, known=COMPARISON_FILES) as building:
-            comparison_rows(contents).to_csv(
+            in_table(comparison_rows(contents)).to_csv(
                 building / "comparison.csv", index=False, float_format=f"%.{CSV_DIGITS}g"
             )
             text = to_json("species_comparison", contents)

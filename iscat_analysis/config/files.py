@@ -15,6 +15,7 @@ from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.text import in_toml
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,7 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
+        return in_toml(value)
     if isinstance(value, tuple):
         return "[" + ", ".join(_toml_value(v) for v in value) + "]"
     if isinstance(value, Section):

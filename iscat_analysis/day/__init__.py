@@ -29,6 +29,7 @@ from iscat_analysis.executors import THREADS, open_place
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
+from iscat_analysis.text import from_table
 from iscat_analysis.units import count
 
 __all__ = ["Batch", "Table", "batch", "read_table"]
@@ -280,18 +281,20 @@ def _gathered(
             publish_day(plan, day, found, reaction, failed, out)
             runner.records.write("page", {"key": key})
     text = {"movie": str, "sample": str, "condition": str, "replicate": str}
-    movies, species = (
-        pd.read_csv(out / f"{name}.csv", dtype=text, keep_default_na=True)
-        for name in ("movies", "species")
-    )
+    movies, species = (_read(out / f"{name}.csv", text) for name in ("movies", "species"))
     found_kd = pd.DataFrame()
     if reaction is not None:
         words = dict.fromkeys(("condition", "model", "masses_kda", "remarks", "why"), str)
-        found_kd = pd.read_csv(out / "kd.csv", dtype=words)
+        found_kd = _read(out / "kd.csv", words)
         found_kd = found_kd.fillna(dict.fromkeys(words, ""))
         absent = found_kd[found_kd["why"] != ""]
         failed += tuple(zip(map(kd_name, absent["condition"]), absent["why"], strict=True))
     return Batch(out, movies, species, found_kd, ran, failed)
+
+
+def _read(path: Path, text: Mapping[str, type[str]]) -> pd.DataFrame:
+    """Read a table as it was before it was written; a sample may be called NA."""
+    return from_table(pd.read_csv(path, dtype=text, keep_default_na=False, na_values=[""]))
 
 
 def _page_key(

@@ -11,6 +11,7 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.day.table import Row, Table
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.addresses import beside, split_address
+from iscat_analysis.text import printable
 
 
 @dataclass(frozen=True)
@@ -94,5 +95,12 @@ def _names(table: Table) -> list[str]:
         ]
         many = Counter(names)
         if len(many) == len(names):
-            return names
+            break
         folders = [n + (many[name] > 1) for n, name in zip(folders, names, strict=True)]
+    texts = Counter(printable(name) for name in names)
+    if twice := [text for text, times in texts.items() if times > 1]:
+        raise ConfigError(
+            f"{table.source}: two movies would be called {twice[0]}, because bytes of a file name "
+            "that are no text are written so; rename one"
+        )
+    return [printable(name) for name in names]

@@ -28,6 +28,7 @@ from iscat_analysis.report.batch import batch_page, summary_line
 from iscat_analysis.report.batch_figures import Curve
 from iscat_analysis.report.output import atomic_folder
 from iscat_analysis.report.tables import CSV_DIGITS
+from iscat_analysis.text import in_table
 
 _FIGURE = re.compile(r"(overlaid|stacked(_\d+)?|species|shares|rates|kd(_\d+)?)\.(png|svg|pdf)")
 
@@ -51,7 +52,9 @@ def publish_day(
     else:
         (out / "kd.csv").unlink(missing_ok=True)
     for name, table in tables.items():
-        text = table.to_csv(index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n")
+        text = in_table(table).to_csv(
+            index=False, float_format=f"%.{CSV_DIGITS}g", lineterminator="\n"
+        )
         write_whole(out / f"{name}.csv", text)
     with atomic_folder(out / "figures", True, known=_figure_files(out / "figures")) as folder:
         page = _page(plan, day, found, movies, species, shifted, series, failed, folder)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from iscat_analysis.config import Config, with_absolute_paths
-from iscat_analysis.day.state import STATE, Records, key_of, saw, seen
+from iscat_analysis.day.state import STATE, Records, key_of, results_in, saw, seen
 from iscat_analysis.errors import IscatError, SchedulerError
 from iscat_analysis.executors import Executor
 from iscat_analysis.movie import open_stack
@@ -60,7 +60,12 @@ class Runner:
             current = record.get("key") == key and set(files) == set(inputs)
             current = current and all(saw(files[each], path) for each, path in inputs.items())
             if current and record["state"] == "done" and result.is_file():
-                return Outcome("done", record=record)
+                found = results_in(result.parent)
+                whole = record.get("results", found)
+                if "damaged" not in found.values() and found == whole:
+                    return Outcome("done", record=record)
+                if not self.dry:
+                    self.notify(f"{result.parent}: is damaged, and is made anew")
             failed = current and record["state"] == "failed"
             if self.dry or (failed and not self.retry):
                 return Outcome("failed" if failed else "missing", record.get("why", ""))
@@ -85,6 +90,7 @@ class Runner:
                 "key": key,
                 "state": state,
                 "why": why,
+                "results": {} if why else results_in(result.parent),
                 "inputs": {
                     each: {**found, **hashes.get(each, {})} for each, found in before.items()
                 },

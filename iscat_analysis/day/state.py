@@ -1,26 +1,28 @@
 """What is finished, on disk: records beside the results, and locks for runs at the same time.
 
 A result is as its job asks for if its record holds the job's key, a hash of the program's version
-and the resolved configuration, and the movie is the one that the record saw: of the same size, time
-and ends, or, where it was copied, of the same SHA-256.
+and the resolved configuration, if its files are whole, and if the movie is the one
+that the record saw: of the same size, time and ends, or, where it was copied, of the same SHA-256.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import sys
-import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
+from filelock import FileLock, Timeout
+
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.errors import DataError
-from iscat_analysis.files import whole_file
+from iscat_analysis.files import take, whole_file
 from iscat_analysis.hashing import fingerprint, sha256_of_files
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.folders import files_of
@@ -30,6 +32,7 @@ STATE = ".batch"
 
 _POLL_S = 0.2  # between two looks at a lock that another run holds
 _PATIENCE_S = 2.0  # after which the waiting is told
+_REMEMBERED = 2**14  # tables that were read
 _MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
 
 
@@ -69,46 +72,31 @@ class Records:
         """Wait until no other run does a job, and keep others from it."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        lock = FileLock(path, thread_local=False, fallback_to_soft=False, poll_interval=_POLL_S)
         try:
-            _wait(handle, lambda: notify(f"waiting for another run, which is at {name}"))
+            held = take(lock, _PATIENCE_S)
+        except Timeout:
+            notify(f"waiting for another run, which is at {name}")
+            held = take(lock, -1)
+        try:
             yield
         finally:
-            os.close(handle)  # the system releases the lock however the process ends
+            if held:  # the system releases the lock however the process ends
+                lock.release()
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"
-
-
-if sys.platform == "win32":  # without locks two runs may do the same job, with the same result
-
-    def _wait(handle: int, tell: Callable[[], None]) -> None:
-        del handle, tell
-
-else:
-    import fcntl
-
-    def _wait(handle: int, tell: Callable[[], None]) -> None:
-        """Take a lock; go on without where the disk knows none."""
-        due = time.monotonic() + _PATIENCE_S
-        while True:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                if time.monotonic() > due:
-                    tell()
-                    due = float("inf")
-                time.sleep(_POLL_S)
-            except OSError:
-                return
-            else:
-                return
 
 
 def claim_folder(out: Path) -> None:
     """Make the folder of a batch, and refuse one that holds something else."""
     state = out / STATE
     try:
+        if state.is_symlink():
+            raise DataError(
+                f"{state}: is a link, where a batch keeps files of its own, and is left alone; "
+                "remove it, or choose another `out`"
+            )
         held = sorted(p.name for p in out.iterdir()) if out.is_dir() else []
         if held and not state.is_dir():  # asked last: another part may just have begun
             raise DataError(
@@ -158,6 +146,34 @@ def saw(record: Mapping[str, Any], path: Path) -> bool:
     except OSError:
         return False
     return bool(record.get("sha256")) and record["sha256"] == sha256_of(path)
+
+
+def results_in(folder: Path) -> dict[str, str]:
+    """Give the state of the files of a result that other jobs and the page need.
+
+    That is the hash of a document, of which a part may be a document as well, and of a table
+    whether it can be read.
+    """
+    found: dict[str, str] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix in (".json", ".toml"):
+            found[path.name] = sha256_of(path)
+        elif path.suffix == ".parquet":
+            state = path.stat()
+            found[path.name] = _reads(path, state.st_size, state.st_mtime_ns)
+    return found
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _reads(path: Path, size: int, changed_ns: int) -> str:
+    """Tell whether a table can be read to its end, once until it changes."""
+    del size, changed_ns
+    try:
+        with path.open("rb") as file:
+            pq.read_table(file)
+    except (OSError, ValueError, MemoryError, pa.ArrowException):
+        return "damaged"
+    return "whole"
 
 
 def seen(path: Path) -> str:

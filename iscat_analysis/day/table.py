@@ -22,6 +22,7 @@ from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
 from iscat_analysis.movie.text_tables import separator
+from iscat_analysis.text import printable
 
 ROLES = ("sample", "calibrant", "blank", "flat")
 """What a movie is for."""
@@ -299,8 +300,8 @@ def _row(
     row = Row(
         where=where,
         path=path,
-        given=given,
-        sample=str(known["sample"]) or beside(path, "").name,
+        given=printable(given),
+        sample=printable(str(known["sample"]) or beside(path, "").name),
         condition=str(known["condition"]),
         replicate=str(known["replicate"]),
         concentration_nm=concentration,

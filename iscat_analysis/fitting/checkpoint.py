@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 GOES_ON = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
+_PART = re.compile(r"[0-9a-f]{32}-\d{5}\.(parquet|npz)(\.\d+-[0-9a-f]+\.partial)?")
 _NO_TRACE = (0.0,) * 9
 _NO_CLIP = (0,) * 4
 
@@ -156,6 +158,15 @@ def _clips(data: Mapping[str, Any]) -> Iterator[Clip | None]:
 def partial_folder(folder: Path) -> Path:
     """Name the folder of an output folder's finished chunks: hidden, beside it."""
     return folder.with_name(f".{folder.name}.partial")
+
+
+def remove_parts(folder: Path) -> None:
+    """Remove the finished chunks of a folder, and the folder if it holds nothing else."""
+    with suppress(OSError):
+        for path in folder.iterdir():
+            if _PART.fullmatch(path.name):
+                path.unlink(missing_ok=True)
+        folder.rmdir()
 
 
 def saying(stop: KeyboardInterrupt, what: str) -> KeyboardInterrupt:

@@ -27,6 +27,7 @@ from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel, forward_model, with_template
 from iscat_analysis.optics.measured import Template, lattice_step_nm
 from iscat_analysis.records import Mapper, Progress, silent
+from iscat_analysis.text import in_toml
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
@@ -107,7 +108,7 @@ class MeasuredPicture:
             "", "[template]", f'sha256 = "{checksum}"',
             f"pixel_nm = {self.template.pixel_nm:.9g}", f"roi_nm = {self.template.roi_nm:.9g}",
             f"peak_se = {self.template.peak_se:.3g}",
-            "", "[provenance]", *(f"{key} = {_quoted(text)}" for key, text in self.source.items()),
+            "", "[provenance]", *(f"{key} = {in_toml(text)}" for key, text in self.source.items()),
             f"particles = {self.template.sights}", "",
         ]  # fmt: skip
         return "\n".join(lines)
@@ -222,9 +223,3 @@ def _alone(sights: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> 
         return all(max(abs(o.x_nm - x), abs(o.y_nm - y)) > room for o in near)
 
     return [sight for sight in sights if is_alone(sight)]
-
-
-def _quoted(text: str) -> str:
-    """Write text as TOML."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

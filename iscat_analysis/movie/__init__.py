@@ -13,6 +13,7 @@ from numbers import Real
 from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.hashing import refuse_changed, states_of
 from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.folders import FORMATS, files_of
@@ -126,6 +127,18 @@ def _open_file(address: Path) -> Stack:
         is_pipe = path.exists() and not (is_folder or path.is_file())  # or a device
     except OSError as error:  # nobody may look into the folder that it is in
         raise DataError(f"{address}: cannot be read ({error.strerror})") from None
+    before = states_of([path])
+    stack = _opened(path, part, is_folder=is_folder, is_pipe=is_pipe)
+    try:
+        refuse_changed([path], before)
+    except DataError:
+        stack.close()
+        raise
+    return stack
+
+
+def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
+    """Open a file or folder by what is in it."""
     if is_folder:
         if not is_zarr(path):
             raise DataError(

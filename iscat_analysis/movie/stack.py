@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.hashing import fingerprint, sha256_of_files
+from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
+from iscat_analysis.text import printable
 from iscat_analysis.threads import beside
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
@@ -102,11 +103,6 @@ class ArrayFrames:
         """Leave the array as it is; it belongs to the caller."""
 
 
-def printable(text: str) -> str:
-    """Escape the bytes of a file name that are not text, which no file in UTF-8 can hold."""
-    return text.encode("utf-8", "backslashreplace").decode("utf-8")
-
-
 def not_shared(path: Path) -> DataError:
     """Say that a file is not, or not the same, where it shall be read."""
     return DataError(
@@ -155,6 +151,7 @@ class Stack:
         self._frames = frames
         self._part = part
         self._files = (path,) if files is None else tuple(files)
+        self._states = states_of(self._files)
         self._closed = False
         self._own = True
         self._left_out: LeftOut | None = None
@@ -268,7 +265,7 @@ class Stack:
     def _again(self, frames: Frames) -> Stack:
         """Give another one of the same file, which is hashed once for both."""
         seen = Stack(self._path, frames, part=self._part, files=self._files)
-        seen._hashing = self._hashing
+        seen._hashing, seen._states = self._hashing, self._states
         return seen
 
     def close(self) -> None:
@@ -379,14 +376,16 @@ class Stack:
         Raises
         ------
         DataError
-            The file can no longer be read.
+            The file can no longer be read, or is not the one that was opened.
         """
         if not self._files:
             digest = hashlib.sha256(f"{self.dtype.str} {self.shape}".encode())
             for _, block in self.chunks():
                 digest.update(block.data)
             return digest.hexdigest()
-        return sha256_of_files(self._files, self._part)
+        found = sha256_of_files(self._files, self._part)
+        refuse_changed(self._files, self._states)
+        return found
 
     def hashed(self) -> Future[str]:
         """Hash the movie in a thread of its own, once however often it is asked for.

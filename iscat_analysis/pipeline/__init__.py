@@ -11,7 +11,6 @@ that are known only then (`rows`).
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -21,7 +20,12 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
-from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept
+from iscat_analysis.fitting.checkpoint import (
+    is_resumable,
+    partial_folder,
+    parts_kept,
+    remove_parts,
+)
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, unheard
@@ -121,7 +125,7 @@ def fit_stack(
         with parts_kept(None if way == "fixed" else partial):
             write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
         if not analysis.summary["interrupted"]:
-            shutil.rmtree(partial, ignore_errors=True)
+            remove_parts(partial)
     if analysis.summary["interrupted"]:
         progress("report", 1, 1)
         goes_on = ", and the same command goes on from there" if is_resumable(folder) else ""

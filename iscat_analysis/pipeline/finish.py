@@ -22,11 +22,11 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import versions
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
 from iscat_analysis.records import Analysis, Film, Provenance, silent
 from iscat_analysis.report.spread import rejection
+from iscat_analysis.text import printable
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
 from iscat_analysis.trust.empirical_spread import spread_verdict

@@ -16,6 +16,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, log_y, new_figure
+from iscat_analysis.text import in_figure
 
 WIDTH_INCHES = 7.2
 """Two columns of a journal."""
@@ -102,17 +103,18 @@ def _overlaid(curves: Sequence[Curve], limit: float, label: str) -> Figure:
         inside = [curve for curve in curves if curve.group == group]
         samples = list(dict.fromkeys(curve.sample for curve in inside))
         for sample, color in zip(samples, shades(len(samples)), strict=True):
-            label_once = sample if len(samples) <= _NAMED else None
+            label_once = in_figure(sample) if len(samples) <= _NAMED else None
             for curve in (c for c in inside if c.sample == sample and c.density.size):
                 density = 100 * curve.density / curve.masses_kda.size
                 panel.plot(curve.grid_kda, density, color=color, lw=1, label=label_once)
                 label_once = None
         if group or len(groups) > 1:
-            panel.set_title(group or "no condition")
+            panel.set_title(in_figure(group) or "no condition")
         if panel.get_legend_handles_labels()[0]:
             panel.legend(fontsize=6, ncols=1 if len(samples) <= _SHORT else 2)
         elif len(samples) > _NAMED:
-            panel.set_title(f"{group}: {len(samples)} samples, from dark to bright".strip(": "))
+            said = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
+            panel.set_title(said.strip(": "))
     panels[0].set(xlim=(0, limit))
     panels[0].set_ylim(0, _HEADROOM * panels[0].get_ylim()[1])
     _leave_out(panels, len(groups), columns)
@@ -168,7 +170,7 @@ def _named(key: tuple[str, str], events: int, groups: int) -> str:
     group, sample = key
     name = f"{group}: {sample}" if groups > 1 and group and group != sample else sample
     name = name if len(name) <= 34 else f"{name[:33]}…"
-    return f"{name}  ({events})"
+    return f"{in_figure(name)}  ({events})"
 
 
 def _places(table: pd.DataFrame, axes: Axes) -> FloatArray:
@@ -180,7 +182,7 @@ def _places(table: pd.DataFrame, axes: Axes) -> FloatArray:
     many = table.groupby("sample")["movie"].transform("nunique").to_numpy(float)
     every = math.ceil(len(samples) / _TICKS)
     ticks = range(0, len(samples), every)
-    names = [s if len(s) <= 22 else f"{s[:21]}…" for s in samples[::every]]
+    names = [in_figure(s if len(s) <= 22 else f"{s[:21]}…") for s in samples[::every]]
     slant = {"rotation": 90} if len(names) > 6 else {}
     axes.set_xticks(list(ticks), names, fontsize=7, **slant)  # type: ignore[arg-type]
     axes.set_xlim(-0.6, len(samples) - 0.4)
@@ -243,7 +245,7 @@ def _shares(species: pd.DataFrame) -> Figure:
             _bars(panel, x, chosen, names, color, label)
         panel.set_xscale("log")
         panel.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-        panel.set_title(group or "")
+        panel.set_title(in_figure(group))
     panels[0].set_ylim(-0.03, 1.3)
     panels[0].set_yticks([0, 0.25, 0.5, 0.75, 1])
     named = [panel.get_legend_handles_labels() for panel in panels]
@@ -269,7 +271,7 @@ def _rates(movies: pd.DataFrame) -> Figure:
     for group, color in zip(groups, shades(len(groups)), strict=True):
         chosen = (table["group"] == group).to_numpy()
         names = ("rate", "rate_from", "rate_to")
-        label = (group or "no condition") if 1 < len(groups) <= _NAMED else None
+        label = (in_figure(group) or "no condition") if 1 < len(groups) <= _NAMED else None
         _bars(axes, x[chosen], table[chosen], names, color, label)
     blank = movies[(movies["role"] == "blank")]
     if against and len(blank):

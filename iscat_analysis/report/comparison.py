@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, new_figure
+from iscat_analysis.text import in_figure
 
 _COLOURS = (GREY, VERMILLION, BLUE, PURPLE)
 _NAMED = 12  # samples whose names fit beside an axis
@@ -76,4 +77,4 @@ def _short(source: str) -> str:
     """Name a table by its folder where the file is named as all are."""
     path = PurePath(source)
     name = path.parent.name if path.stem == "fits" and path.parent.name else path.name
-    return name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…"
+    return in_figure(name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…")

@@ -1,25 +1,28 @@
 """An output folder that appears whole or not at all, and never replaces files of other programs.
 
-The folder is filled under a hidden name beside its own and renamed when it is complete.  One
-process at a time may do so: it holds a lock that the system releases however the process ends.
-Whoever holds the lock next removes what a killed process left, and puts back an earlier result
-that it had set aside.
+The folder is filled under a hidden name beside its own and renamed when it is complete.  It holds a
+list of what this program wrote into it; nothing else is ever removed.  One process at a time may
+write: it holds a lock that the system releases however the process ends.  Whoever holds the lock
+next removes what a killed process left, and puts back an earlier result that it had set aside.
 """
 
 from __future__ import annotations
 
-import errno
 import hashlib
+import json
 import os
 import secrets
-import shutil
-import sys
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from filelock import FileLock, Timeout
+
 from iscat_analysis.errors import DataError
-from iscat_analysis.files import remove_folder, unfinished
+from iscat_analysis.files import remove_folder, take, unfinished
+
+FILE_LIST = ".iscat-files"
+"""The list of files in every output folder: a first line, then a path in each, as JSON."""
 
 OUTPUT_NAMES = frozenset(
     {
@@ -32,15 +35,16 @@ OUTPUT_NAMES = frozenset(
         "posterior.nc",
         "report.html",
         "figures",
+        FILE_LIST,
     }
 )
 """Everything `write_report` may leave in its folder."""
 
+_HEADING = "Files of iscat-analysis; what is not in this list is never removed."
+_SIGNED = "lock of iscat-analysis, process "
 _LITTER = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 _BUILDING, _EARLIER, _LOCK = ".iscat-building.", ".iscat-earlier.", ".iscat-lock."
 _LONGEST_NAME = 200  # bytes; longer ones leave no room for the words above
-_NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
-_LOCK_ATTEMPTS = 100
 
 
 def check_output(
@@ -53,16 +57,22 @@ def check_output(
             return
         if not target.is_dir():
             raise DataError(f"{folder}: is a file, not a folder; choose another `out`")
-        entries = sorted(entry.name for entry in target.iterdir() if entry.name not in _LITTER)
+        listed = _listed(target)
+        foreign = _foreign(target, listed, known)
+        empty = all(entry.name in _LITTER for entry in target.iterdir())
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
-    foreign = [name for name in entries if name not in known]
+    if foreign and not listed and foreign in known:
+        raise DataError(
+            f"{folder}: holds {foreign!r} but not {FILE_LIST}, the list of what this version "
+            "wrote: it may be yours, and is left alone; move it, or choose another `out`"
+        )
     if foreign:
         raise DataError(
-            f"{folder}: holds {foreign[0]!r}, which is not part of a result, and is left alone; "
+            f"{folder}: holds {foreign!r}, which is not part of a result, and is left alone; "
             "choose another `out`"
         )
-    if entries and not overwrite:
+    if not empty and not overwrite:
         raise DataError(
             f"{folder}: holds an earlier result; pass `overwrite` to replace it, or choose "
             "another `out`"
@@ -76,27 +86,11 @@ def claim_output(
     """Hold an output folder for this process, before any work is done."""
     check_output(folder, overwrite, known=known)
     target = _resolved(folder)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        # What the lock file is called must not depend on who may write into the folder itself.
-        lock = target.parent / f"{_LOCK}{_short(target)}"
-        held = _acquire(lock, folder)
-    except OSError as error:
-        raise DataError(
-            f"{folder}: cannot be made ({error.strerror}); choose another `out`"
-        ) from None
-    if held is None:
+    with _locked(target, folder) as first:
+        if first:
+            _recover(target)
         check_output(folder, overwrite, known=known)
         yield
-        return
-    try:
-        with unfinished(lock):
-            _recover(target)
-            check_output(folder, overwrite, known=known)
-            yield
-    finally:
-        lock.unlink(missing_ok=True)  # before it is released: no other run waits for this file
-        os.close(held)
 
 
 @contextmanager
@@ -110,13 +104,14 @@ def atomic_folder(
         try:
             with unfinished(building):
                 try:
-                    building.mkdir(0o700)
+                    _make_ours(building)
                 except OSError as error:
                     raise DataError(
                         f"{folder}: cannot be made ({error.strerror}); choose another `out`"
                     ) from None
                 yield building
                 _like_an_ordinary_folder(building)
+                _list_files(building)
                 check_output(folder, overwrite, known=known)
             _swap(building, target)
         except OSError as error:
@@ -144,48 +139,154 @@ def _hidden(kind: str, target: Path) -> Path:
     return target.with_name(f"{kind}{secrets.token_hex(4)}.{_short(target)}")
 
 
-if sys.platform == "win32":  # without locks, of two runs into one folder the last to end wins
+# ---- What is ours --------------------------------------------------------------------------------
 
-    def _acquire(lock: Path, folder: Path) -> int | None:
-        del lock, folder
+
+def _make_ours(folder: Path) -> None:
+    """Make a folder with a list that is empty so far."""
+    folder.mkdir(0o700)
+    (folder / FILE_LIST).write_text(f"{_HEADING}\n", encoding="utf-8")
+
+
+def _list_files(folder: Path) -> None:
+    """Put everything into the list that is in a folder of ours."""
+    names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
+    with (folder / FILE_LIST).open("a", encoding="utf-8") as file:
+        file.writelines(f"{json.dumps(name)}\n" for name in names)
+
+
+def _listed(folder: Path) -> frozenset[str]:
+    """Give the paths that a folder's list names, itself among them; none without a list of ours."""
+    path = folder / FILE_LIST
+    try:
+        if path.is_symlink() or not path.is_file():
+            return frozenset()
+        heading, *lines = path.read_text(encoding="utf-8").splitlines()
+        if heading != _HEADING:
+            return frozenset()
+        return frozenset([FILE_LIST, *(str(json.loads(line)) for line in lines)])
+    except (OSError, ValueError, RecursionError):
+        return frozenset()
+
+
+def _foreign(folder: Path, listed: Collection[str], known: Collection[str]) -> str:
+    """Name something in a folder that its list does not name, or that is no part of this result."""
+    for name in _inside(folder):
+        top = name.partition("/")[0]
+        if name not in listed or not (top in known or top == FILE_LIST):
+            return name
+    return ""
+
+
+def _inside(folder: Path, *, deepest_first: bool = False) -> Iterator[str]:
+    """Give the paths in a folder, without following links or naming what systems leave."""
+
+    def refuse(error: OSError) -> None:
+        raise error
+
+    for where, folders, files in os.walk(folder, topdown=not deepest_first, onerror=refuse):
+        for name in sorted({*folders, *files} - _LITTER):
+            yield (Path(where) / name).relative_to(folder).as_posix()
+
+
+def _remove_listed(folder: Path) -> None:
+    """Remove what a folder's list names, the list last, and the folder if nothing else is left."""
+    listed = _listed(folder)
+    with suppress(OSError):
+        for name in _inside(folder, deepest_first=True):
+            path = folder / name
+            if name not in listed or name == FILE_LIST:
+                continue
+            with suppress(OSError):  # a folder that holds something else
+                if path.is_dir() and not path.is_symlink():
+                    for litter in _LITTER:
+                        (path / litter).unlink(missing_ok=True)
+                    path.rmdir()
+                else:
+                    path.unlink()
+        if all(entry.name in {*_LITTER, FILE_LIST} for entry in folder.iterdir()):
+            remove_folder(folder)
+
+
+# ---- Locks ---------------------------------------------------------------------------------------
+
+
+def _sign(handle: int) -> None:
+    """Say in a lock file whose it is; on a full disk it stays empty."""
+    with suppress(OSError):
+        os.ftruncate(handle, 0)
+        os.write(handle, f"{_SIGNED}{os.getpid()}\n".encode())
+
+
+@contextmanager
+def _locked(target: Path, folder: Path) -> Iterator[bool]:
+    """Hold the lock of a folder; tell whether this process did not hold it before."""
+    # What the lock file is called must not depend on who may write into the folder itself.
+    path = target.parent / f"{_LOCK}{_short(target)}"
+    lock = FileLock(
+        path, thread_local=False, is_singleton=True, fallback_to_soft=False, on_acquired=_sign
+    )
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        before = _state_of_lock(path)
+        held = take(lock, 0)
+    except Timeout:
+        owner = _owner(path)
+        who = f" (process {owner})" if owner else ""
+        raise DataError(
+            f"{folder}: another run{who} is about to write there; wait for it, or choose "
+            "another `out`"
+        ) from None
+    except OSError as error:
+        raise DataError(
+            f"{folder}: cannot be made ({error.strerror}); choose another `out`"
+        ) from None
+    ours = before is None or before.st_size > 0 or not _is_still(path, before)
+    try:
+        first = held and lock.lock_counter == 1
+        if first and ours:
+            with unfinished(path):
+                yield first
+        else:
+            yield first
+    finally:
+        if ours and (not held or lock.lock_counter == 1):
+            path.unlink(missing_ok=True)  # before it is released: nobody waits for this file
+        if held:
+            lock.release()
+
+
+def _state_of_lock(path: Path) -> os.stat_result | None:
+    """Give the state of a lock file of ours, or of an empty one; refuse what is something else."""
+    if not path.is_symlink() and not path.exists():
         return None
+    if path.is_symlink() or not path.is_file() or _owner(path) is None:
+        raise DataError(
+            f"{path}: is in the place of a lock, but is not one, and is left alone; move it, or "
+            "choose another `out`"
+        )
+    return path.lstat()
 
-else:
-    import fcntl
 
-    def _acquire(lock: Path, folder: Path) -> int | None:
-        """Take the lock; None where this process has it already, or the disk knows no locks."""
-        for _ in range(_LOCK_ATTEMPTS):
-            handle = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                owner = os.read(handle, 20).decode("ascii", "replace").strip()
-                os.close(handle)
-                if owner == str(os.getpid()):
-                    return None
-                who = f" (process {owner})" if owner else ""
-                raise DataError(
-                    f"{folder}: another run{who} is about to write there; wait for it, or choose "
-                    "another `out`"
-                ) from None
-            except OSError as error:
-                os.close(handle)
-                if error.errno in _NO_LOCKS:
-                    return None
-                raise
-            if _is_still(lock, handle):
-                os.ftruncate(handle, 0)
-                os.write(handle, str(os.getpid()).encode())
-                return handle
-            os.close(handle)  # another run removed the file between opening and locking it
-        raise DataError(f"{folder}: other runs keep writing there; choose another `out`")
+def _owner(path: Path) -> str | None:
+    """Read which process holds a lock file; empty where it says nothing, None if it is no lock."""
+    try:
+        with path.open("rb") as file:
+            said = file.read(len(_SIGNED) + 20).decode("ascii", "replace")
+    except OSError:
+        return ""
+    return None if said and not said.startswith(_SIGNED) else said.removeprefix(_SIGNED).strip()
 
-    def _is_still(lock: Path, handle: int) -> bool:
-        try:
-            return os.path.samestat(lock.stat(), os.fstat(handle))
-        except FileNotFoundError:
-            return False
+
+def _is_still(path: Path, before: os.stat_result) -> bool:
+    """Tell whether a file is the one that it was."""
+    try:
+        return os.path.samestat(path.lstat(), before)
+    except OSError:
+        return False
+
+
+# ---- Putting in place ----------------------------------------------------------------------------
 
 
 def _recover(target: Path) -> None:
@@ -196,10 +297,23 @@ def _recover(target: Path) -> None:
             middle = entry.name.removeprefix(kind).removesuffix(end)
             if entry.name != f"{kind}{middle}{end}" or not middle or "." in middle:
                 continue
+            if entry.is_symlink() or not _listed(entry):  # the name alone does not make it ours
+                continue
             kept = entry / target.name
             if kind == _EARLIER and kept.is_dir() and not target.exists():
                 kept.rename(target)
-            shutil.rmtree(entry, ignore_errors=True)
+            if kind == _EARLIER:
+                _remove_earlier(entry, kept)
+            else:
+                remove_folder(entry)
+
+
+def _remove_earlier(earlier: Path, kept: Path) -> None:
+    """Remove a result that was set aside; what came into it since then stays."""
+    if kept.is_dir():
+        _remove_listed(kept)
+    if not kept.exists():
+        _remove_listed(earlier)
 
 
 def _like_an_ordinary_folder(folder: Path) -> None:
@@ -218,11 +332,11 @@ def _swap(building: Path, target: Path) -> None:
     earlier = _hidden(_EARLIER, target)
     kept = earlier / target.name
     try:
-        earlier.mkdir(0o700)
+        _make_ours(earlier)
         target.rename(kept)
         building.rename(target)
     finally:
         if kept.exists() and not target.exists():
             kept.rename(target)
         if target.exists():
-            remove_folder(earlier)
+            _remove_earlier(earlier, kept)

@@ -22,12 +22,14 @@ from iscat_analysis.report.style import Sketch, drawn, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.track_context import tracks_context
 from iscat_analysis.schemas import jsonable
+from iscat_analysis.text import in_page
 
 
 def render_page(template: str, context: Mapping[str, Any]) -> str:
     """Fill one of the templates in ``iscat_analysis/report/templates``.
 
-    Everything is escaped; the result needs no network and no other file.
+    Everything is escaped, and so are signs that nobody sees; the result needs no network and no
+    other file.
     """
     defaults = {
         "kicker": "iscat-analysis",
@@ -35,7 +37,7 @@ def render_page(template: str, context: Mapping[str, Any]) -> str:
         "footer": "iscat-analysis",
         "nav": [(part["id"], part["title"]) for part in context.get("sections", ())],
     }
-    return templates().get_template(template).render({**defaults, **context})
+    return in_page(templates().get_template(template).render({**defaults, **context}))
 
 
 @cache

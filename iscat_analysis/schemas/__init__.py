@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.text import in_json
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -86,7 +87,7 @@ def to_json(name: str, values: Mapping[str, Any]) -> str:
     """Write a document as JSON, through its model."""
     document = _model(name).model_validate(jsonable(values))
     plain = document.model_dump(mode="json", exclude_unset=True, by_alias=True)
-    return json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False)
+    return in_json(json.dumps(plain, indent=2, ensure_ascii=False, allow_nan=False))
 
 
 def jsonable(value: Any) -> Any:

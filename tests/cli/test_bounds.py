@@ -43,7 +43,7 @@ def test_scan_writes_table_and_figure(capsys: pytest.CaptureFixture[str], tmp_pa
     status, _, _ = run(capsys, "--mode", "joint", "--scan", "focus=-400:400:200", "--out", str(out))
     assert status == 0
     names = {"bounds.json", "scan.csv", "scan.png", "scan.svg", "tradeoff.png", "tradeoff.svg"}
-    assert {p.name for p in out.iterdir()} == names
+    assert {p.name for p in out.iterdir()} == {*names, ".iscat-files"}
     assert "Holevo" in (out / "tradeoff.svg").read_text(encoding="utf-8")
     table = pd.read_csv(out / "scan.csv")
     assert list(table["focus"]) == [-400, -200, 0, 200, 400]
@@ -74,7 +74,7 @@ def test_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         assert word in said
     names = {"bounds.json", "optics.toml", *(f"{n}.{e}" for n in ("pupil", "tradeoff")
                                              for e in ("png", "svg"))}  # fmt: skip
-    assert {p.name for p in out.iterdir()} == names
+    assert {p.name for p in out.iterdir()} == {*names, ".iscat-files"}
     found = json.loads((out / "bounds.json").read_text(encoding="utf-8"))["pupil"]
     assert main(["bounds", "--config", str(out / "optics.toml"), "--json", "--quiet"]) == 0
     again = json.loads(capsys.readouterr().out)["actual"]["crb_joint"]
@@ -143,7 +143,7 @@ def test_the_paper_whole(
     said = capsys.readouterr()
     assert status == 0
     assert "114" in said.out
-    assert {p.name for p in out.iterdir()} == PAPER_FILES
+    assert {p.name for p in out.iterdir()} == {*PAPER_FILES, ".iscat-files"}
     table = pd.read_csv(out / "comparison.csv").set_index("quantity")
     assert table.loc["z_cobri", "printed"] == 114
     assert table.loc["z_cobri", "exact"] == pytest.approx(92.0265, abs=1e-3)

@@ -72,8 +72,8 @@ def test_camera_from_a_movie_and_a_dark(recordings: Path, tmp_path: Path, capsys
     assert "saturated and left out" in said.err
     assert found["shot_limited_frames"] == 32
     assert sorted(path.name for path in out.iterdir()) == [
-        "camera.html", "camera.json", "camera.toml", "gain_e_per_adu.tif", "masked.tif",
-        "offset_adu.tif", "read_noise_e.tif",
+        ".iscat-files", "camera.html", "camera.json", "camera.toml", "gain_e_per_adu.tif",
+        "masked.tif", "offset_adu.tif", "read_noise_e.tif",
     ]  # fmt: skip
     assert tifffile.imread(out / "masked.tif").sum() == 1
     camera = load_config(out / "camera.toml").camera  # a section to paste, with paths beside it
@@ -127,7 +127,7 @@ def test_mass_from_the_packages_own_table(tmp_path: Path, capsys: Captured) -> N
     assert found["events"] == 192
     out = tmp_path / "fits.calibration"
     assert sorted(p.name for p in out.iterdir()) == [
-        "calibration.html", "calibration.json", "calibration.toml",
+        ".iscat-files", "calibration.html", "calibration.json", "calibration.toml",
     ]  # fmt: skip
     assert load_config(out / "calibration.toml").calibration is not None
     assert json.loads((out / "calibration.json").read_text())["dof"] == 1

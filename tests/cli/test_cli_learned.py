@@ -54,7 +54,7 @@ def test_a_measured_template_serves_a_fit(
     assert main([*given, "--out", str(out), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["accepted"]
     assert {path.name for path in out.iterdir()} == {
-        "optics.toml", "template.npz", "template.json", "template.html",
+        "optics.toml", "template.npz", "template.json", "template.html", ".iscat-files",
     }  # fmt: skip
     sketch_figures(monkeypatch)
     with_it = ["--config", setup, "--set", f"optics.file={out / 'optics.toml'}"]

@@ -97,7 +97,7 @@ def test_options_of_the_forecast_belong_together(tmp_path: Path, capsys: Capture
     assert main(["bounds", "--for", "optics", "--events", "20", *given]) == 0
     assert "particles needed for" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {
-        "optics_bounds.json", "needed.csv", "needed.png", "needed.svg",
+        "optics_bounds.json", "needed.csv", "needed.png", "needed.svg", ".iscat-files",
     }  # fmt: skip
 
 

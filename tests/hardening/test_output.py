@@ -394,15 +394,15 @@ def mount(tmp_path: Path) -> Iterator[Path]:
 def test_a_full_disk(mount: Path) -> None:
     analysis = make_analysis(3, "joint", posteriors=2)
     earlier = mount / "result"
-    earlier.mkdir()
-    (earlier / "fits.csv").write_text("event\n")
+    with atomic_folder(earlier) as building:
+        (building / "fits.csv").write_text("event\n")
     ballast = mount / "ballast"
     for kilobytes in (390, 370, 350, 320, 290, 250, 200, 150):
         ballast.write_bytes(bytes(kilobytes * 1000))
         with pytest.raises(DataError, match=r"cannot be (written|made) \(.*\S"):
             write_report(analysis, earlier, overwrite=True)
         assert names(mount) == ["ballast", "result"]
-        assert names(earlier) == ["fits.csv"]
+        assert names(earlier) == [".iscat-files", "fits.csv"]
 
 
 def test_a_read_only_disk(mount: Path, forker: Forker) -> None:
@@ -497,8 +497,10 @@ def test_neighbours_with_similar_names_are_left_alone(tmp_path: Path) -> None:
         (tmp_path / name / "file").write_text("")
     before = names(tmp_path)
     stale = tmp_path / ".iscat-building.abcdefgh.out"
-    stale.mkdir()
+    with atomic_folder(tmp_path / "out") as building:
+        shutil.copytree(building, stale)  # as a run that is killed leaves it
     (stale / "fits.csv").write_text("half")
+    shutil.rmtree(tmp_path / "out")
     with atomic_folder(tmp_path / "out") as building:
         (building / "fits.csv").write_text("event\n")
     assert names(tmp_path) == sorted([*before, "out"])

@@ -222,12 +222,12 @@ def _text(value: object) -> str:
 
 def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     folder = tmp_path / "out"
-    folder.mkdir()
-    (folder / "benchmark.json").write_text("{}")  # of an earlier study
+    write_benchmark(study, folder)
+    (folder / "benchmark.json").write_text("{}")
     with pytest.raises(DataError, match="overwrite"):
         write_benchmark(study, folder)
     assert write_benchmark(study, folder, overwrite=True) == folder
-    assert {entry.name for entry in folder.iterdir()} == set(BENCHMARK_NAMES)
+    assert {entry.name for entry in folder.iterdir()} == {*BENCHMARK_NAMES, ".iscat-files"}
     plain = json.loads((folder / "benchmark.json").read_text(encoding="utf-8"))
     assert plain["mass"]["x_nm"]["crb"] == pytest.approx(study["mass"]["x_nm"]["crb"])
     drawn = {path.name for path in (folder / "figures").iterdir()}

@@ -15,6 +15,7 @@ from numba.core import event
 
 import iscat_analysis
 from iscat_analysis import _kernels
+from iscat_analysis._kernels import checksums
 from iscat_analysis.fitting import compilation as module
 from iscat_analysis.fitting.compilation import compiling
 
@@ -78,9 +79,10 @@ print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_signal, sta
 SUPPORT = """
 import numpy as np
 from iscat_analysis._kernels.support import supported
-from iscat_analysis.fitting.compilation import compiling
+from iscat_analysis.fitting import compilation
 
-with compiling(print):
+compilation._PATIENCE_S = 600.0
+with compilation.compiling(print):
     edge = np.array([-100.0, 100.0])
     places = np.array([[0, 0, 50, 1, 0], [900, 0, 50, 1, 0]], dtype=float)
     print(*supported(places, edge, edge, 5.0, 500.0, 0.0, 100.0, 1.0))
@@ -125,6 +127,80 @@ def test_kernels_that_nobody_vouches_for_are_compiled_again(tmp_path):
     assert supported(tmp_path) == ["True False", "1"]
 
 
+def test_a_process_does_not_vouch_for_what_others_compiled(tmp_path):
+    """A file is damaged while a process runs that takes another file from the same folder."""
+    assert supported(tmp_path) == ["True False", "0"]
+    (file,) = tmp_path.glob("*/support.*.nbc")
+    kept = file.read_bytes()
+    damage = f"""
+import pathlib
+from iscat_analysis import _kernels
+pathlib.Path({str(file)!r}).write_bytes({_flipped(kept)!r})
+import numpy as np
+from iscat_analysis._kernels.lines import largest
+largest(np.zeros(3))
+"""
+    subprocess.run(
+        [sys.executable, "-c", damage], env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+        check=True,
+    )  # fmt: skip
+    assert supported(tmp_path) == ["True False", "0"]  # removed, and compiled again
+    assert supported(tmp_path) == ["True False", "1"]
+
+
+def _list_in(folder: Path, name: str, content: bytes) -> None:
+    (folder / f"{name}-1.py311.1.nbc").write_bytes(content)
+
+
+def test_the_list_keeps_what_others_wrote_into_it(tmp_path):
+    for name in ("a.f", "b.g"):
+        _list_in(tmp_path, name, name.encode())
+        checksums.record(str(tmp_path), (f"{name}-1.",))
+    checksums.remove_damaged(str(tmp_path))
+    assert len(list(tmp_path.glob("*.nbc"))) == 2
+    _list_in(tmp_path, "a.f", b"damaged")
+    checksums.record(str(tmp_path), ("b.g-1.",))
+    checksums.remove_damaged(str(tmp_path))
+    assert [path.name for path in tmp_path.glob("*.nbc")] == ["b.g-1.py311.1.nbc"]
+
+
+def test_processes_that_end_together_lose_no_entry(tmp_path):
+    code = """
+import sys
+from iscat_analysis._kernels import checksums
+sys.stdin.readline()
+for k in range(20):
+    checksums.record(sys.argv[1], (f"{sys.argv[2]}{k}.f-1.",))
+"""
+    for name in "abc":
+        for k in range(20):
+            _list_in(tmp_path, f"{name}{k}.f", name.encode())
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path), name], stdin=subprocess.PIPE, text=True
+        )
+        for name in "abc"
+    ]
+    for process in running:
+        process.communicate("go\n", timeout=300)
+        assert process.returncode == 0
+    checksums.remove_damaged(str(tmp_path))
+    assert len(list(tmp_path.glob("*.nbc"))) == 60
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
+def test_a_list_that_finds_no_room_leaves_nothing(tmp_path):
+    _list_in(tmp_path, "a.f", b"compiled")
+    code = """
+import resource, sys
+from iscat_analysis._kernels import checksums
+resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
+checksums.record(sys.argv[1], ("a.f-1.",))
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+    assert {path.name for path in tmp_path.iterdir()} == {"a.f-1.py311.1.nbc", "checksums.lock"}
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
 def test_kernels_that_cannot_be_kept_for_want_of_room_end_no_run(tmp_path):
     full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
@@ -155,6 +231,7 @@ def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
     code = """
 import os, numpy as np
 from iscat_analysis import _kernels
+from iscat_analysis._kernels import checksums
 from iscat_analysis._kernels.curvature import _weighted
 assert _weighted(np.ones(4), np.ones(4)) == 4
 folder = _kernels.environment()["NUMBA_CACHE_DIR"]

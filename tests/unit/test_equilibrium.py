@@ -152,7 +152,9 @@ def test_samples_are_read_and_results_written(dimers, tmp_path: Path) -> None:
     found = ia.fit_kd(tmp_path / "samples.csv", model="dimer", masses_kda=[66.0], out=out)
     same = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0])
     assert found.fit.kd_nm == pytest.approx(same.fit.kd_nm, rel=1e-6)
-    assert sorted(path.name for path in out.iterdir()) == ["figures", "kd.csv", "kd.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        ".iscat-files", "figures", "kd.csv", "kd.json",
+    ]  # fmt: skip
     assert json.loads((out / "kd.json").read_text())["kd_nm"] == pytest.approx(found.fit.kd_nm)
     assert list(pd.read_csv(out / "kd.csv")["replicate"]) == [1] * 4
     assert (out / "figures" / "kd.png").stat().st_size > 10_000

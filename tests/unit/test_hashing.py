@@ -10,6 +10,7 @@ import pytest
 import tifffile
 
 import iscat_analysis as ia
+import iscat_analysis.movie
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import sha256_of_files
 
@@ -45,3 +46,35 @@ def test_a_movie_that_was_removed_has_no_identity(file: Path) -> None:
         file.unlink()
         with pytest.raises(DataError, match=r"movie\.tif: can no longer be read"):
             _ = movie.identity
+
+
+def test_a_movie_that_was_replaced_while_it_was_open_is_refused(file: Path, tmp_path: Path) -> None:
+    """Its frames are of the file that was opened, and the hash is of the other."""
+    other = tmp_path / "other.tif"
+    tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
+    with ia.open_stack(file) as movie:
+        before = movie.sha256()
+        other.replace(file)
+        with pytest.raises(DataError, match=r"movie\.tif: was replaced or written to while"):
+            movie.sha256()
+        with pytest.raises(DataError, match="was replaced"):
+            movie.without(np.zeros((16, 32), bool), np.zeros(0)).hashed().result()
+    with ia.open_stack(file) as movie:  # from the beginning it is another movie
+        assert movie.sha256() not in ("", before)
+
+
+def test_a_movie_that_is_replaced_while_it_is_being_opened_is_refused(
+    file: Path, tmp_path: Path, monkeypatch
+) -> None:
+    other = tmp_path / "other.tif"
+    tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
+    readers = dict(iscat_analysis.movie._READERS)
+
+    def late(path: Path) -> object:
+        frames = readers[b"II\x2a\x00"](path)
+        other.replace(path)
+        return frames
+
+    monkeypatch.setattr(iscat_analysis.movie, "_READERS", {**readers, b"II\x2a\x00": late})
+    with pytest.raises(DataError, match="was replaced"):
+        ia.open_stack(file)

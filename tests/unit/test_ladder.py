@@ -243,7 +243,9 @@ def test_results_are_written(tmp_path: Path, oligomers: pd.DataFrame) -> None:
     out = tmp_path / "answer"
     notes: list[str] = []
     found = ia.find_species(oligomers, ladder=66.0, draws=2, out=out, notify=notes.append)
-    assert sorted(path.name for path in out.iterdir()) == ["figures", "species.csv", "species.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        ".iscat-files", "figures", "species.csv", "species.json",
+    ]  # fmt: skip
     written = json.loads((out / "species.json").read_text())
     assert written["ladder"]["steps"] == [1, 2, 4]
     assert written["notes"] == notes

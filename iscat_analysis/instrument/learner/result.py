@@ -16,6 +16,7 @@ from iscat_analysis.instrument.learner.particle_images import FOCUS_DRIFT, FOCUS
 from iscat_analysis.instrument.learner.pictures import Pictures
 from iscat_analysis.instrument.learner.settings import exists, is_term, with_settings
 from iscat_analysis.records import FloatArray
+from iscat_analysis.text import in_toml
 from iscat_analysis.units import count
 
 _ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
@@ -132,7 +133,7 @@ class OpticsCalibration:
         lines += ["", "[covariance]", f"names = [{quoted}]", "matrix = ["]
         lines += [f"  [{', '.join(f'{v:.9g}' for v in row)}]," for row in covariance]
         lines += ["]", "", "[provenance]"]
-        lines += [f"{key} = {_quoted(text)}" for key, text in self.source.items()]
+        lines += [f"{key} = {in_toml(text)}" for key, text in self.source.items()]
         if FOCUS_STEP in self.names:
             lines += [f"{FOCUS_STEP} = {self.value(FOCUS_STEP):.9g}"]
         return "\n".join([*lines, f"particles = {self.sights}", ""])
@@ -293,8 +294,3 @@ def with_error(label: str, value: float, sigma: float, unit: str) -> str:
     """Write a value with as many digits as its error deserves."""
     digits = max(0, 1 - int(np.floor(np.log10(sigma)))) if sigma > 0 else 3
     return f"{label} {value:.{digits}f} ± {sigma:.{digits}f} {unit}".rstrip()
-
-
-def _quoted(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
