@@ -182,10 +182,10 @@ def unbinding_rate(
         )
     top = height(best)
     ends = interval(lambda x: 2 * (top - height(x)), best, low, high, step=1.0)
-    rates = (math.exp(x) for x in (best, *ends))
+    rate, least, most = (math.exp(x) for x in (best, *ends))
     if not number:
-        rates = (0.0, 0.0, math.exp(ends[1]))
-    return UnbindingRate(stay_s.size, number, chance_pairs, *rates)
+        rate = least = 0.0
+    return UnbindingRate(stay_s.size, number, chance_pairs, rate, least, most)
 
 
 def _log_slope(x: float) -> float:
