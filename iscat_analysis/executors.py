@@ -33,8 +33,8 @@ THREADS = "threads"
 """The scheduler that is this process."""
 
 DEPENDENCIES = (
-    "numpy", "scipy", "numba", "tifffile", "emcee", "arviz-stats", "pandas", "pyarrow",
-    "matplotlib",
+    "numpy", "scipy", "scikit-image", "numba", "tifffile", "emcee", "arviz-stats", "pandas",
+    "pyarrow", "matplotlib",
 )  # fmt: skip
 """Packages whose versions are part of a result."""
 

@@ -46,7 +46,7 @@ def _exp_falling(x: float) -> float:
     value = value * r + 0.5
     value = value * r + 1.0
     value = value * r + 1.0
-    value *= _HALVES[np.uint32(halvings)]
+    value *= _HALVES[np.uint32(halvings) & np.uint32(1023)]  # of no number it is any
     return value
 
 

@@ -11,7 +11,7 @@ of the backgrounds and, where asked for, β.  Only ratios of species count: how 
 has depends on the surface as well and says nothing here.
 
 The interval of K_D is where the likelihood, maximised over everything else, lies within 1.92 of its
-maximum (Venzon & Moolgavkar, Appl. Stat. 37, 87, 1988).  The model is tested against one whose
+maximum (James & Roos, Comput. Phys. Commun. 10, 343, 1975).  The model is tested against one whose
 weights are free in every table, with the same masses and width: twice the gain is χ² with as many
 degrees of freedom as there are weights more.  Proteins that do not bind, concentrations that are
 not as labelled and replicates that disagree show there.  An inactive part, which shifts all tables
@@ -22,15 +22,18 @@ of freedom, where there is none (Self & Liang, J. Am. Stat. Assoc. 82, 605, 1987
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-import scipy
+from iminuit import Minuit
+from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
+from iscat_analysis.species.intervals import interval
 from iscat_analysis.species.mass_action import COMPOSITION, LANDING_POWER, Model, landing_logits
 from iscat_analysis.species.structure import (
     LOGIT_REACH,
@@ -44,13 +47,16 @@ from iscat_analysis.species.structure import (
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
 _SIGMAS = 1.959964
-_SETTLED = 0.01  # of the signed root of the deviance at an end of the interval
-_STEPS = 30
+_FAST = 0  # strategy of Minuit without second derivatives, which take n²/2 values
+_FIRST_STEP = 0.1  # of ln K_D towards an end of its interval
+_PROFILE = 9  # points of the profile between the ends of the interval
 _MASS_RANGE = 0.2  # of the masses that were given
 _WIDEST = 0.3  # of the lightest
 _STEP = 1e-4  # of ln K_D and of β, for their slopes
-_TOLERANCE = 1e-10  # of the log-likelihood per event
+_TOLERANCE = 0.01  # of Minuit: 1e-5 of the log-likelihood
+_TOLERANCE_FREE = 1e-10  # of the log-likelihood per event
 _MOST_INACTIVE = 0.9
+_INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
 _FIRST_BACKGROUND = -3.0  # its logit
 
 
@@ -94,19 +100,19 @@ def fit_equilibrium(
     """
     series = _Series(tables, totals_nm, model, np.array(masses_kda, float), power, inactive)
     free, free_value = series.fit_free()
-    best, best_value = series.fit(free)
-    low, high, points = series.interval(best, best_value)
+    found = series.fit(free)
+    best, best_value = np.array(found.values), -float(found.fval)
+    low, high, points = _interval(found)
     chi2 = max(2 * (free_value - best_value), 0.0)
     dof = len(tables) * (series.kinds - 1) - series.constants
     logits, errors, complexes = series.observed(free)
     inactive_se = math.nan
     other = _Series(tables, totals_nm, model, np.array(masses_kda, float), power, not inactive)
-    other_value = other.fit(other.fit_free()[0])[1]
+    other_value = -float(other.fit(other.fit_free()[0]).fval)
     gain = max(2 * (best_value - other_value) * (1 if inactive else -1), 0.0)
     if inactive:
-        curvature = series.constants_information(best)
-        covariance = np.linalg.pinv(curvature)
-        inactive_se = math.sqrt(max(float(covariance[-1, -1]), 0.0))
+        found.hesse()
+        inactive_se = float(found.errors["inactive"])
     mixtures = [one.mixture(best[: series.linear]) for one in series.structures(best)]
     predicted = np.array([_complexes(m.weight[: series.kinds]) for m in mixtures])
     reach = _SIGMAS * errors
@@ -245,11 +251,11 @@ class _Series:
             np.concatenate([self.first, np.zeros(own.size)]),
             self._free_limits,
             evaluations=1000,
-            tolerance=_TOLERANCE,
+            tolerance=_TOLERANCE_FREE,
         )
         return found.theta, found.log_likelihood
 
-    def fit(self, free: FloatArray) -> tuple[FloatArray, float]:
+    def fit(self, free: FloatArray) -> Minuit:
         """Maximise over everything, from the best of a grid of K_D."""
         grid = np.linspace(self.limits.low[self.linear], self.limits.high[self.linear], _GRID)
         begun = np.concatenate([free[: self.linear], [0.0], [0.05]])[: self.limits.low.size]
@@ -263,74 +269,23 @@ class _Series:
             theta = begun.copy()
             theta[self.linear] = ln_kd
             starts.append((self.value(theta)[0], theta))
-        return self._climb(max(starts, key=lambda one: one[0])[1], np.ones(begun.size, bool))
+        return self._maximum(max(starts, key=lambda one: one[0])[1])
 
-    def _climb(self, start: FloatArray, moves: FloatArray) -> tuple[FloatArray, float]:
-        """Maximise over the parameters that may move."""
-        scale = self.limits.scale
-        moving = np.flatnonzero(moves)
-
-        def loss(scaled: FloatArray) -> tuple[float, FloatArray]:
-            theta = start.copy()
-            theta[moving] = scaled * scale[moving]
-            value, slope = self.value(theta)
-            return -value / self.events, -(slope * scale)[moving] / self.events
-
-        low, high = (end[moving] / scale[moving] for end in (self.limits.low, self.limits.high))
-        found = scipy.optimize.minimize(
-            loss, np.clip(start[moving] / scale[moving], low, high), jac=True, method="TNC",
-            bounds=list(zip(low, high, strict=True)),
-            options={"maxfun": 600, "ftol": _TOLERANCE, "gtol": 1e-7},
-        )  # fmt: skip
-        theta = start.copy()
-        theta[moving] = np.asarray(found.x) * scale[moving]
-        return theta, -float(found.fun) * self.events
-
-    def interval(self, best: FloatArray, value: float) -> tuple[float, float, FloatArray]:
-        """Follow the profile of ln K_D to where it has fallen by 1.92."""
-        others = np.ones(best.size, bool)
-        others[self.linear] = False
-        points = [(float(best[self.linear]), 0.0)]
-
-        def root(ln_kd: float, near: FloatArray) -> tuple[float, FloatArray]:
-            start = near.copy()
-            start[self.linear] = ln_kd
-            theta, found = self._climb(start, others)
-            deviance = max(2 * (value - found), 0.0)
-            points.append((ln_kd, deviance))
-            return math.sqrt(deviance), theta
-
-        curvature = float(self.constants_information(best)[0, 0])
-        step = _SIGMAS / math.sqrt(curvature) if curvature > 0 else 1.0
-        ends = []
-        for sign in (-1.0, 1.0):
-            limit = float((self.limits.low if sign < 0 else self.limits.high)[self.linear])
-            end = _end(root, best, float(best[self.linear]), sign * min(step, 3.0), limit)
-            ends.append(math.exp(end) if math.isfinite(end) else (0.0 if sign < 0 else math.inf))
-        return ends[0], ends[1], np.array(sorted(points))
-
-    def constants_information(self, theta: FloatArray) -> FloatArray:
-        """Information on ln K_D and β, with everything else fitted."""
-        step = np.concatenate(
-            [0.1 * self.limits.scale[: self.linear] / math.sqrt(self.events),
-             np.full(self.constants, 1e-3)]
-        )  # fmt: skip
-        rows = []
-        for place, h in enumerate(step):
-            shift = np.zeros(theta.size)
-            shift[place] = h
-            above = np.minimum(theta + shift, self.limits.high)
-            below = np.maximum(theta - shift, self.limits.low)
-            rise = self.value(above)[1] - self.value(below)[1]
-            rows.append(-rise / (above[place] - below[place]))
-        known = (np.array(rows) + np.array(rows).T) / 2
-        margin = 1e-9 * (self.limits.high - self.limits.low)
-        inside = (theta > self.limits.low + margin) & (theta < self.limits.high - margin)
-        other = np.flatnonzero(inside & (np.arange(theta.size) < self.linear))
-        ours = np.arange(self.linear, theta.size)
-        cross = known[np.ix_(ours, other)]
-        rest = cross @ np.linalg.pinv(known[np.ix_(other, other)]) @ cross.T
-        return np.asarray(known[np.ix_(ours, ours)] - rest)
+    def _maximum(self, start: FloatArray) -> Minuit:
+        """Maximise from a start."""
+        last = lru_cache(maxsize=1)(lambda theta: self.value(np.frombuffer(theta)))
+        inner = _INSIDE * (self.limits.high - self.limits.low)
+        names = [f"linear {place}" for place in range(self.linear)] + ["ln_kd", "inactive"]
+        search = Minuit(
+            lambda theta: -last(theta.tobytes())[0],
+            np.clip(start, self.limits.low + inner, self.limits.high - inner),
+            grad=lambda theta: -last(theta.tobytes())[1],
+            name=names[: start.size],
+        )
+        search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
+        search.limits = list(zip(self.limits.low, self.limits.high, strict=True))
+        search.errors = self.limits.scale / math.sqrt(self.events)
+        return search.migrad()
 
     def observed(self, free: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Logit of the complexes of each table, its standard error, and their fraction."""
@@ -351,39 +306,23 @@ class _Series:
         return logits, errors, _share(logits)
 
 
-def _end(
-    root: Callable[[float, FloatArray], tuple[float, FloatArray]],
-    best: FloatArray,
-    start: float,
-    step: float,
-    limit: float,
-) -> float:
-    """Find where the signed root of the deviance, nearly a line, reaches its 95 % value."""
-    inner, inner_value, near = start, 0.0, best
-    outer, outer_value = math.nan, math.nan
-    at = start + step
-    for _ in range(_STEPS):
-        if (limit - at) * step <= 0:
-            at = limit
-        value, theta = root(at, near)
-        if abs(value - _SIGMAS) < _SETTLED:
-            return at
-        if value < _SIGMAS:
-            if at == limit:
-                return math.nan
-            inner, inner_value, near = at, value, theta
-        else:
-            outer, outer_value = at, value
-        if math.isnan(outer):
-            slope = (inner_value / (inner - start)) if inner_value > 0 else 0.0
-            wanted = inner + (_SIGMAS - inner_value) / slope if slope else inner + 2 * step
-            farthest = inner + 2 * (inner - start)
-            at = wanted if abs(wanted - start) < abs(farthest - start) else farthest
-            at = at if abs(at - inner) > 1e-3 * abs(step) else inner + step / 4
-        else:
-            share = (_SIGMAS - inner_value) / (outer_value - inner_value)
-            at = inner + min(max(share, 0.05), 0.95) * (outer - inner)
-    return at
+def _interval(found: Minuit) -> tuple[float, float, FloatArray]:
+    """Give the interval of K_D, and points of the profile of ln K_D between its ends."""
+    best, (least, most) = float(found.values["ln_kd"]), found.limits["ln_kd"]
+
+    def deviance(grid: ArrayLike) -> FloatArray:
+        heights = found.mnprofile("ln_kd", grid=np.atleast_1d(grid))[1]
+        return np.asarray(2 * np.maximum(heights - float(found.fval), 0.0))
+
+    low, high = interval(
+        lambda ln_kd: float(deviance(ln_kd)[0]), best, least, most, step=_FIRST_STEP
+    )
+    grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
+    return (
+        math.exp(low) if low > least else 0.0,
+        math.exp(high) if high < most else math.inf,
+        np.column_stack([grid, deviance(grid)]),
+    )
 
 
 def _complexes(weight: FloatArray) -> float:

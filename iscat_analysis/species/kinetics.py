@@ -22,7 +22,6 @@ for.  How many pairs are chance is told by leavings whose places are moved by ha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -32,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, kolmogorov
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.species.intervals import interval
 
 IndexArray: TypeAlias = NDArray[np.int64]
 """Rows of a table."""
@@ -39,9 +39,10 @@ IndexArray: TypeAlias = NDArray[np.int64]
 LEAST_LANDINGS = 10
 """Fewer landings have no rate that depends on time."""
 
-_DROP = 1.920729  # of the log-likelihood at the ends of a 95 % interval
 _TWO_SIDED_95 = 1.959964
 _STEEPEST = 200.0  # of kT
+_GRID = 400  # rates among which the maximum is looked for
+_PRECISE = 1e-7  # of its logarithm
 _SMALL = 1e-6  # of kT, below which series take over
 _ALIKE = 4.0  # standard errors between the masses of a pair
 
@@ -92,8 +93,9 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
         return _middle(x) - mean
 
     best = float(scipy.optimize.brentq(rise, -_STEEPEST, _STEEPEST, xtol=1e-10))
-    ends = _ends(height, best, -_STEEPEST, _STEEPEST)
-    flat = 2 * (height(best) - height(0.0))
+    top = height(best)
+    ends = interval(lambda x: 2 * (top - height(x)), best, -_STEEPEST, _STEEPEST, step=1.0)
+    flat = 2 * (top - height(0.0))
     # Information on ln λ₀ and x = kT: n, −n g', and that of ∫λ.
     slope = -_middle(best)
     curvature = (_middle(best + 1e-4) - _middle(best - 1e-4)) / -2e-4
@@ -159,23 +161,31 @@ def unbinding_rate(
     if not longest > 0:
         return UnbindingRate(stay_s.size, number, chance_pairs, math.nan, math.nan, math.nan)
 
+    with np.errstate(divide="ignore"):  # none is missed, or none seen
+        missed, seen = np.log1p(-chance), np.log(chance)
+
     def height(ln_rate: float) -> float:
         rate = math.exp(ln_rate)
-        with np.errstate(divide="ignore"):  # none can still be there
-            missing = float(np.sum(np.log1p(chance * np.expm1(-rate * left))))
-        return number * ln_rate - rate * stayed + missing
+        still = float(np.sum(np.logaddexp(missed, seen - rate * left)))
+        return number * ln_rate - rate * stayed + still
 
     low, high = math.log(1e-6 / longest), math.log(1e6 / longest)
+    best = low
+    if number:
+        grid = np.linspace(low, high, _GRID)
+        near = int(np.argmax([height(x) for x in grid]))
+        around = float(grid[max(near - 1, 0)]), float(grid[min(near + 1, grid.size - 1)])
+        best = float(
+            scipy.optimize.minimize_scalar(
+                lambda x: -height(x), bounds=around, method="bounded", options={"xatol": _PRECISE}
+            ).x
+        )
+    top = height(best)
+    ends = interval(lambda x: 2 * (top - height(x)), best, low, high, step=1.0)
+    rate, least, most = (math.exp(x) for x in (best, *ends))
     if not number:
-        end = _crossing(height, height(low), low, high)
-        return UnbindingRate(stay_s.size, 0, chance_pairs, 0.0, 0.0, math.exp(end))
-    grid = np.linspace(low, high, 400)
-    near = int(np.argmax([height(x) for x in grid]))
-    best = _peak(height, grid[max(near - 1, 0)], grid[min(near + 1, grid.size - 1)])
-    ends = _ends(height, best, low, high)
-    return UnbindingRate(
-        stay_s.size, number, chance_pairs, math.exp(best), math.exp(ends[0]), math.exp(ends[1])
-    )
+        rate = least = 0.0
+    return UnbindingRate(stay_s.size, number, chance_pairs, rate, least, most)
 
 
 def _log_slope(x: float) -> float:
@@ -186,30 +196,3 @@ def _log_slope(x: float) -> float:
 def _middle(x: float) -> float:
     """Mean of a time in [0, 1] whose density is as e^(−xt)."""
     return 0.5 - x / 12 if abs(x) < 1e-3 else 1 / x - 1 / math.expm1(x)
-
-
-def _peak(height: Callable[[float], float], low: float, high: float) -> float:
-    """Golden section; the function has one maximum between."""
-    part = (math.sqrt(5) - 1) / 2
-    while high - low > 1e-7:
-        left, right = high - part * (high - low), low + part * (high - low)
-        if height(left) < height(right):
-            low = left
-        else:
-            high = right
-    return (low + high) / 2
-
-
-def _ends(
-    height: Callable[[float], float], best: float, low: float, high: float
-) -> tuple[float, float]:
-    """Where a likelihood has fallen by 1.92 on both sides."""
-    top = height(best)
-    return _crossing(height, top, best, low), _crossing(height, top, best, high)
-
-
-def _crossing(height: Callable[[float], float], top: float, start: float, far: float) -> float:
-    """Where it has, between a place where it has not and an end of the range."""
-    if top - height(far) < _DROP:
-        return far
-    return float(scipy.optimize.brentq(lambda x: top - height(x) - _DROP, start, far, xtol=1e-9))

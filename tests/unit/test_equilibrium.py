@@ -12,6 +12,7 @@ from event_tables import draw_series
 from scipy.optimize import approx_fprime, brentq
 
 import iscat_analysis as ia
+from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.day.table import read_table
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.equilibrium import _Series
@@ -90,11 +91,31 @@ def test_kd_is_found_and_its_ends_are_where_the_profile_says(dimers) -> None:
     assert fit.masses_kda == pytest.approx([66.0, 132.0], abs=1.0)
     assert fit.p_value > 0.01
     assert fit.dof == 3
-    ends = np.isin(fit.profile_ln_kd, np.log([fit.kd_low, fit.kd_high]))
-    assert np.allclose(fit.profile_deviance[ends], 3.84, atol=0.06)
+    assert fit.profile_ln_kd[[0, -1]] == pytest.approx(np.log([fit.kd_low, fit.kd_high]))
+    assert fit.profile_deviance[[0, -1]] == pytest.approx(3.8415, abs=0.01)
+    assert fit.profile_deviance.min() == pytest.approx(0.0, abs=1e-3)
     assert found.samples["complexes"].is_monotonic_increasing
     assert np.all(np.abs(found.samples["pull"]) < 4)
     assert found.curve["complexes"].is_monotonic_increasing
+
+
+@pytest.mark.parametrize("seed", [2, 4, 15])
+def test_ends_are_on_the_profile_where_events_are_few(seed: int) -> None:
+    """Sixty events a table, for which the errors of MINOS end elsewhere."""
+    totals = DIMER.to_numpy(float)
+    random = np.random.default_rng([91, seed])
+    tables = draw_series(random, "dimer", totals, 10.0, [66.0], number=60)
+    fit = ia.fit_kd(DIMER, tables=tables, model="dimer", masses_kda=[64.0]).fit
+    assert fit.kd_low < fit.kd_nm < fit.kd_high
+    assert fit.profile_ln_kd[[0, -1]] == pytest.approx(np.log([fit.kd_low, fit.kd_high]))
+    assert fit.profile_deviance[[0, -1]] == pytest.approx(3.8415, abs=0.01)
+
+
+def test_parameters_that_are_no_numbers_have_no_likelihood() -> None:
+    x, noise, weight = np.linspace(50, 80, 40), np.full(40, 25.0), np.ones(1)
+    value, slopes = mixture_score(x, noise, weight, np.array([np.nan]), np.array([4.0]))
+    assert np.isnan(value)
+    assert np.isnan(slopes).any()
 
 
 def test_landings_that_are_taken_alike_change_kd(dimers) -> None:

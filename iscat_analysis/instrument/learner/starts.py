@@ -31,6 +31,8 @@ FOCUS_STEP_NM = 80.0
 
 _FOCI = 7  # of a scan, whose averages are searched
 _ROUNDS = 3  # of registration
+_WINDOWS = 5  # standard deviations of the window of registration in a picture
+_PARTS = 20  # of a pixel, to which it is found
 _UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
 _TURNS = 24  # of half a circle of phases, for strong particles
 _FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
@@ -124,20 +126,20 @@ def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
 
 
 def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> FloatArray:
-    """Shift of a picture from a template: where the correlation is largest, of either sign."""
-    correlation = fft.irfft2(fft.rfft2(contrast) * np.conj(fft.rfft2(template)), s=contrast.shape)
-    reach = math.ceil(_SHIFT_PX)
-    around = np.abs(np.roll(correlation, (reach, reach), (0, 1)))
-    offset = np.rint(shift).astype(int)
-    around = np.roll(around, tuple(-offset), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
-    row, column = np.unravel_index(int(np.argmax(around)), around.shape)
-    out = np.array([row - reach, column - reach], dtype=float) + offset
-    for axis, (line, index) in enumerate(((around[:, column], row), (around[row], column))):
-        if 0 < index < line.size - 1:
-            low, mid, high = line[index - 1 : index + 2]
-            bend = low - 2 * mid + high
-            out[axis] += 0.5 * (low - high) / bend if bend < 0 else 0.0
-    return np.asarray(out)
+    """Shift of a picture from a template of either sign; the window about the last leaves others.
+
+    It pulls towards the last shift, and less in every round.
+    """
+    from skimage.registration import phase_cross_correlation  # only the learner needs it
+
+    along = (
+        np.exp(-0.5 * ((np.arange(n) - (n - 1) / 2 - at) * _WINDOWS / n) ** 2)
+        for n, at in zip(contrast.shape, shift, strict=True)
+    )
+    found, *_ = phase_cross_correlation(
+        template, contrast * np.outer(*along), normalization=None, upsample_factor=_PARTS
+    )
+    return np.asarray(-found)
 
 
 def with_masses(
