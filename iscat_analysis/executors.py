@@ -219,6 +219,8 @@ _ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)
 def _end_with(watched: Connection) -> None:
     """Let this process end when the other end of a pipe is closed; Ctrl-C is the other's to see."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):  # what the other blocks is blocked here as well
+        signal.pthread_sigmask(signal.SIG_SETMASK, ())
 
     def watch() -> None:
         watched.poll(None)
