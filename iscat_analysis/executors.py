@@ -193,9 +193,10 @@ class SecondProcess:
     def __init__(self, modules: Sequence[str]) -> None:
         context = get_context("spawn")
         watched, self._held = context.Pipe(duplex=False)
-        self._pool = ProcessPoolExecutor(
-            1, mp_context=context, initializer=_end_with, initargs=(watched,)
-        )
+        with _signals_kept():
+            self._pool = ProcessPoolExecutor(
+                1, mp_context=context, initializer=_end_with, initargs=(watched,)
+            )
         self._pool.submit(_import_all, modules)
 
     def call(self, job: Callable[..., R], /, *arguments: Any) -> R:
@@ -214,6 +215,17 @@ class SecondProcess:
 
 _ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)
 """Whether the thread sends its jobs to the second process."""
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """Leave signals blocked that multiprocessing unblocks when it makes its first lock."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _end_with(watched: Connection) -> None:
