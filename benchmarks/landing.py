@@ -50,6 +50,8 @@ WINDOW = 100
 LOOK_S = 0.1
 """Between two looks at how much memory a job has."""
 PROGRAM = "import sys; sys.argv[0] = 'iscat'; from iscat_cli import main; sys.exit(main())"
+INSTALLED = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+"""The environment of a job: Python keeps the modules that it has compiled, as an installer does."""
 PEER_PACKAGES = ("piscat==0.2.5", "PyWavelets")
 
 PEER = """
@@ -81,7 +83,7 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
     def run(*, watched: bool) -> tuple[float, float, float]:
         start = time.perf_counter()
         with answer.open("w", encoding="utf-8") as out:
-            job = subprocess.Popen(command, stdout=out)
+            job = subprocess.Popen(command, stdout=out, env=INSTALLED)
             watch = _Memory(job.pid, movie)
             if watched:
                 watch.start()

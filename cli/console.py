@@ -20,7 +20,7 @@ from rich.console import Console, RenderableType
 from rich.text import Text
 
 from iscat_cli import INTERRUPTED
-from iscat_cli.ending import ending_in_time, interrupts_kept, termination_interrupts
+from iscat_cli.ending import interrupts
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
@@ -186,12 +186,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
         messages.notify(f"warning: {message}{where}")
 
-    with (
-        warnings.catch_warnings(),
-        ending_in_time(messages),
-        termination_interrupts(),
-        interrupts_kept() as swallowed,
-    ):
+    with warnings.catch_warnings(), interrupts(messages) as watched:
         warnings.showwarning = show
         try:
             yield
@@ -202,7 +197,7 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
             messages.error(f"interrupted: {said}" if said else "interrupted")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            if swallowed:  # and this is what the compiler made of it
+            if watched is not None and watched.lost:  # and this is what the compiler made of it
                 messages.error("interrupted")
                 raise typer.Exit(INTERRUPTED) from None
             if debug:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import os
 import signal
 import sys
@@ -13,8 +12,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from iscat_cli import INTERRUPTED
-
 if TYPE_CHECKING:
     from iscat_cli.console import Messages
 
@@ -24,53 +21,125 @@ GRACE_S = 1.5
 WRITING_GRACE_S = 30.0
 """The same while results are being written, which a second signal cuts short."""
 
-_AFTER_S = 0.05  # until the callback has returned: what is raised in its wake is lost as well
+_LOOK_S = 0.05  # between two looks at what has become of an interrupt
+
+
+class Interrupts:
+    """Interrupts the main thread when a signal asks the command to end, and sees that it ends.
+
+    Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
+    compiled code delays it, and so do threads that must finish first.  The signals are therefore
+    blocked, and a thread waits for them, as POSIX provides for programs of many threads
+    (``sigwait``).  It interrupts the main thread by SIGUSR1.  Where the command does not end in
+    time, it unblocks SIGINT, whose action is the system's: the process ends, with 130 in a shell.
+    """
+
+    def __init__(self, messages: Messages, numbers: set[signal.Signals]) -> None:
+        self._messages = messages
+        self._numbers = numbers
+        self._received = signal.SIGINT
+        self._ended = threading.Event()
+        self._main = threading.get_ident()
+        self._swallowed = False
+        self.lost = False
+        self._thread = threading.Thread(target=self._watch, daemon=True, name="signals")
+
+    def begin(self) -> None:
+        """Begin to wait for signals, all of which are blocked."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Wait for signals no longer: the command has ended."""
+        self._ended.set()
+        signal.pthread_kill(self._thread.ident or 0, signal.SIGUSR1)
+        self._thread.join()
+
+    def handle(self, number: int, frame: FrameType | None) -> None:
+        """Raise the interrupt, in the main thread."""
+        del number, frame
+        if self._received == signal.SIGINT:
+            raise KeyboardInterrupt
+        raise KeyboardInterrupt(f"{self._received.name} was received")
+
+    def note_unraisable(self, told: sys.UnraisableHookArgs) -> None:
+        """Have an interrupt raised again that was raised where Python can only print it.
+
+        A callback of compiled code is such a place: the compiler's look into its cache, for one.
+        The interrupt would be lost, or end as an error of whoever made the call.
+        """
+        if isinstance(told.exc_value, KeyboardInterrupt):
+            self._swallowed = self.lost = True
+        else:
+            sys.__unraisablehook__(told)
+
+    def _watch(self) -> None:
+        number = signal.Signals(signal.sigwait(self._numbers | {signal.SIGUSR1}))
+        if number == signal.SIGUSR1:  # from `stop`
+            return
+        self._received = number
+        self._interrupt_main()
+        if self._ends_in_time():
+            signal.sigwait({signal.SIGUSR1})
+            return
+        _discard_unfinished()
+        self._messages.error(f"interrupted: {number.name} was received")
+        last = signal.SIGINT if signal.SIGINT in self._numbers else number
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {last})
+        signal.raise_signal(last)
+
+    def _interrupt_main(self) -> None:
+        signal.pthread_kill(self._main, signal.SIGUSR1)
+
+    def _ends_in_time(self) -> bool:
+        """Tell whether the command ends within the time that it has."""
+        begun = time.monotonic()
+        while not self._ended.wait(_LOOK_S):
+            if self._swallowed:
+                self._swallowed = False
+                self._interrupt_main()
+            passed = time.monotonic() - begun
+            again = signal.sigpending() & self._numbers
+            if passed > GRACE_S and (
+                again or not self._messages.writing or passed > GRACE_S + WRITING_GRACE_S
+            ):
+                return False
+        return True
 
 
 @contextmanager
-def ending_in_time(messages: Messages) -> Iterator[None]:
-    """End the process where the answer to a signal takes too long.
+def interrupts(messages: Messages) -> Iterator[Interrupts | None]:
+    """Answer a signal to end in time, until the block ends.
 
-    Python raises `KeyboardInterrupt` between two of its own instructions, so a long call into
-    compiled code delays it, and so do threads that must finish first.  The operating system's
-    handler writes each signal's number into a pipe at once; a thread reads it and keeps the time.
+    SIGTERM and SIGHUP are answered as Ctrl-C is; what is ignored, as SIGHUP under nohup, stays so.
+    In a process that has threads already, which do not block the signals, nothing is changed.
     """
-    if threading.current_thread() is not threading.main_thread() or os.name == "nt":
-        yield
+    if os.name == "nt" or threading.active_count() > 1:
+        yield None
         return
-    reader, writer = os.pipe()
-    os.set_blocking(writer, False)
-    ended = threading.Event()
-
-    def watch() -> None:
-        with open(reader, "rb", buffering=0) as signals:  # noqa: PTH123  (a descriptor)
-            while (number := signals.read(1)) and number[0] not in _ENDING:
-                pass
-            if not number:
-                return
-            if ended.wait(GRACE_S):
-                return
-            if messages.writing:
-                os.set_blocking(reader, False)
-                due = time.monotonic() + WRITING_GRACE_S
-                while messages.writing and time.monotonic() < due:
-                    if ended.wait(0.1):
-                        return
-                    again = signals.read(1)
-                    if again and again[0] in _ENDING:
-                        break
-        _discard_unfinished()
-        messages.error(f"interrupted: {signal.Signals(number[0]).name} was received")
-        os._exit(INTERRUPTED)
-
-    earlier = signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-    threading.Thread(target=watch, daemon=True, name="signals").start()
+    numbers = {
+        number
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler)
+    }
+    handlers = {number: signal.getsignal(number) for number in (*numbers, signal.SIGUSR1)}
+    hook = sys.unraisablehook
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, handlers)
+    watched = Interrupts(messages, numbers)
+    for number in numbers:
+        signal.signal(number, signal.SIG_DFL)
+    signal.signal(signal.SIGUSR1, watched.handle)
+    sys.unraisablehook = watched.note_unraisable
+    watched.begin()
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGUSR1})
     try:
-        yield
+        yield watched
     finally:
-        signal.set_wakeup_fd(earlier)
-        ended.set()
-        os.close(writer)
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})
+        watched.stop()
+        sys.unraisablehook = hook
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _discard_unfinished() -> None:
@@ -78,69 +147,3 @@ def _discard_unfinished() -> None:
     files = sys.modules.get("iscat_analysis.files")
     if files is not None:
         files.discard_unfinished()
-
-
-_ENDING = {
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-}
-
-
-@contextmanager
-def termination_interrupts() -> Iterator[None]:
-    """Let a request to end (SIGTERM, SIGHUP) end the command as Ctrl-C does: tidied up."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        del frame
-        raise KeyboardInterrupt(f"{signal.Signals(number).name} was received")
-
-    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
-    ours = [
-        number
-        for number in numbers
-        if threading.current_thread() is threading.main_thread()
-        and signal.getsignal(number) is signal.SIG_DFL  # SIGHUP is ignored under nohup
-    ]
-    for number in ours:
-        signal.signal(number, interrupt)
-    try:
-        yield
-    finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
-
-
-@contextmanager
-def interrupts_kept() -> Iterator[list[BaseException]]:
-    """Raise again an interrupt that a callback of compiled code swallowed.
-
-    Python can only print what is raised where compiled code called it: the compiler's look into its
-    cache, for one.  The interrupt would be lost, or end as an error of whoever made the call.
-    """
-    earlier = sys.unraisablehook
-    swallowed: list[BaseException] = []
-    again: list[threading.Timer] = []
-
-    def hook(told: sys.UnraisableHookArgs) -> None:
-        if not isinstance(told.exc_value, KeyboardInterrupt):
-            earlier(told)
-            return
-        swallowed.append(told.exc_value)
-        again.append(threading.Timer(_AFTER_S, _interrupt_main))
-        again[-1].daemon = True
-        again[-1].start()
-
-    sys.unraisablehook = hook
-    try:
-        yield swallowed
-    finally:
-        for timer in again:
-            timer.cancel()
-        sys.unraisablehook = earlier
-
-
-def _interrupt_main() -> None:
-    """Interrupt the main thread, also where it waits for the operating system."""
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-    else:
-        _thread.interrupt_main()

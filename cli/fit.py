@@ -131,12 +131,17 @@ def fit(
 
         from iscat_analysis.executors import open_place
         from iscat_analysis.movie.addresses import MARK, beside
-        from iscat_analysis.pipeline import fit_stack
 
+        movie, many = stack, resolved.compute.workers
         if raw is not None:
             stack = Path(f"{stack}{MARK}{raw}")
         folder = beside(stack, ".iscat") if out is None else out
-        with open_place(scheduler, scheduler_file) as place, messages.progress() as progress:
+        with (
+            open_place(scheduler, scheduler_file, shared=movie, workers=many) as place,
+            messages.progress() as progress,
+        ):
+            from iscat_analysis.pipeline import fit_stack  # while the second process imports
+
             analysis = fit_stack(
                 stack,
                 resolved,

@@ -103,9 +103,7 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first, not_run, keep = [], None, None
 
 
-def run_page(
-    page: Path, folder: Path, bin_folder: Path, prepared: Path | None = None
-) -> list[Outcome]:
+def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
     """Run a page's blocks in a folder and stop at the first that fails.
 
     Parameters
@@ -116,19 +114,16 @@ def run_page(
         Where; it should hold what the page takes for granted.
     bin_folder : Path
         Where `iscat` and `python` are.
-    prepared : Path, optional
-        Where the programs of `prepared.prepared` are, which start sooner.
 
     Returns
     -------
     list of Outcome
         One for each block that was run.
     """
-    path = [*([prepared] if prepared else []), bin_folder, os.environ["PATH"]]
-    environment = os.environ | SURROUNDINGS | {"PATH": os.pathsep.join(map(str, path))}
-    python = [str(prepared / "interpreter")] if prepared else [str(bin_folder / "python"), "-c"]
+    path = os.pathsep.join([str(bin_folder), os.environ["PATH"]])
+    environment = os.environ | SURROUNDINGS | {"PATH": path}
     outcomes = []
-    with _Interpreter(python, folder, environment) as interpreter:
+    with _Interpreter(bin_folder / "python", folder, environment) as interpreter:
         for block in blocks_of(page):
             if block.not_run is not None:
                 continue
@@ -168,8 +163,8 @@ for line in sys.stdin:
     print(json.dumps([said.getvalue(), failed]), flush=True)
 """
 
-    def __init__(self, python: list[str], folder: Path, environment: dict[str, str]) -> None:
-        self._arguments = ([*python, self.LOOP], folder, environment)
+    def __init__(self, python: Path, folder: Path, environment: dict[str, str]) -> None:
+        self._arguments = ([str(python), "-c", self.LOOP], folder, environment)
         self._process: subprocess.Popen[str] | None = None
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the interpreter
 

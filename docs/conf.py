@@ -14,7 +14,6 @@ import shutil
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,6 @@ sys.path.insert(0, str(HERE))
 
 from blocks import blocks_of, prepare, run_page  # noqa: E402
 from kernel_cache import share_kernels  # noqa: E402
-from prepared import prepared  # noqa: E402
 
 share_kernels(HERE.parent)
 
@@ -172,8 +170,8 @@ def _run_pages() -> None:
         if "_build" not in page.parts and any(block.not_run is None for block in blocks_of(page))
     ]
     pages.sort(key=_commands_of, reverse=True)
-    with prepared() as programs, ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(partial(_run_one_page, prepared=programs), pages))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        list(pool.map(_run_one_page, pages))
 
 
 def _commands_of(page: Path) -> int:
@@ -181,7 +179,7 @@ def _commands_of(page: Path) -> int:
     return sum(len(block.first) + max(1, len(block.commands)) for block in run)
 
 
-def _run_one_page(page: Path, prepared: Path) -> None:
+def _run_one_page(page: Path) -> None:
     """Run a page's blocks and keep what they print or draw."""
     target = GENERATED / page.stem
     if target.is_dir() and os.environ.get("DOCS_REUSE"):  # while writing
@@ -191,7 +189,7 @@ def _run_one_page(page: Path, prepared: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         prepare(HERE.parent, folder)
-        for outcome in run_page(page, folder, PROGRAMS, prepared):
+        for outcome in run_page(page, folder, PROGRAMS):
             if outcome.failed:
                 raise RuntimeError(f"{page}:{outcome.block.line}: {outcome.failed}")
             if outcome.block.keep:

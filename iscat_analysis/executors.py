@@ -1,4 +1,4 @@
-"""Where work runs: in this process, or on the workers of a Dask cluster.
+"""Where work runs: in this process, in a second one beside it, or on the workers of a Dask cluster.
 
 A job is a function at module level whose arguments can be pickled.  Movies of a day are jobs, and
 chunks of a landing movie.  A worker does one job at a time with all of its threads, so that its
@@ -16,15 +16,24 @@ import uuid
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.threads import allotted
+from iscat_analysis.second_process import SecondProcess
+from iscat_analysis.threads import allotted, processors
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -44,6 +53,12 @@ _BUSY_S = 1.0  # that a job waits where its worker is busy, before it goes to an
 _MOST_AT_ONCE = 1000
 _BASE_MB = 400  # of a process, beside the pixels
 _LIBRARIES = "iscat-analysis[dask]"
+_LARGE_BYTES = 200e6  # of a movie of which half is worth the start of a process
+_IMPORTED = ("iscat_analysis.landing.chunk_work", "iscat_analysis.report.drawing")
+_LOST = (
+    "the second process was ended from outside, most likely because memory ran out; its part is "
+    "done again in the first"
+)
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -65,11 +80,18 @@ class Executor(Protocol):
     def distant(self) -> bool:
         """Whether jobs run in other processes, which read movies by their paths."""
 
-    def threads(self, wanted: int) -> int:
-        """Say how many threads this process may use."""
+    def threads(self, wanted: int, jobs: int) -> int:
+        """Say how many threads this process may use while there are so many jobs."""
 
-    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
-        """Do a job and wait for it."""
+    def call(
+        self,
+        job: Callable[..., R],
+        /,
+        *arguments: Any,
+        progress: Progress = silent,
+        here: Callable[[], R] | None = None,
+    ) -> R:
+        """Do a job and wait for it; `here` does the same with what this process holds already."""
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
         """Do something with every item, several at a time where jobs run elsewhere."""
@@ -79,27 +101,92 @@ class Executor(Protocol):
 
 
 class LocalExecutor:
-    """The process that asks: one job after the other."""
+    """The process that asks, which does one job after the other or shares them with a second one.
+
+    Results do not depend on which process does a job.  The jobs of a second process that is lost
+    are done here.
+    """
 
     distant = False
 
-    def threads(self, wanted: int) -> int:
-        """Use as many as are wanted; see `Executor`."""
-        return wanted
+    def __init__(self, second: SecondProcess | None = None) -> None:
+        self._second = second
 
-    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
+    def threads(self, wanted: int, jobs: int) -> int:
+        """Use as many as are wanted, or half where a second process works; see `Executor`."""
+        return max(1, wanted // 2) if self._second is not None and jobs > 1 else wanted
+
+    def call(
+        self,
+        job: Callable[..., R],
+        /,
+        *arguments: Any,
+        progress: Progress = silent,
+        here: Callable[[], R] | None = None,
+    ) -> R:
         """Do a job; see `Executor`."""
-        return job(*arguments, progress=progress)
+        if self._second is not None and _ELSEWHERE.get():
+            return self._second.call(job, *arguments)
+        return here() if here is not None else job(*arguments, progress=progress)
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, in order; see `Executor`."""
-        for number, item in enumerate(items):
+        """Do something with every item, in order or two at a time; see `Executor`."""
+        waiting = deque(enumerate(items))
+        if self._second is not None and len(waiting) > 1:
+            yield from self._two_at_a_time(self._second, work, waiting)
+        while waiting:
+            number, item = waiting.popleft()
             yield number, work(item)
+
+    def _two_at_a_time(
+        self,
+        second: SecondProcess,
+        work: Callable[[T], R],
+        waiting: deque[tuple[int, T]],
+    ) -> Generator[tuple[int, R]]:
+        """Do an item here and one in the second process, until none waits or that is lost."""
+        sent: tuple[int, T, Future[R]] | None = None
+        with ThreadPoolExecutor(1, initializer=_ELSEWHERE.set, initargs=(True,)) as sender:
+            try:
+                while waiting or sent:
+                    own = waiting.popleft() if waiting else None
+                    if sent is None and waiting:
+                        number, item = waiting.popleft()
+                        sent = number, item, sender.submit(work, item)
+                    if own is not None:
+                        yield own[0], work(own[1])
+                    if sent is not None and (sent[2].done() or not waiting):
+                        number, item, future = sent
+                        try:
+                            result = future.result()
+                        except BrokenProcessPool:
+                            warnings.warn(_LOST, stacklevel=2)
+                            self._second = None
+                            waiting.append((number, item))
+                            return
+                        finally:
+                            sent = None if future.done() else sent
+                        yield number, result
+            finally:
+                if sent is not None:  # nobody waits for it any more
+                    second.end()
+                    self._second = None
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
         """Say nothing; see `Executor`."""
         del memory_limit_mb
         return []
+
+
+_ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)
+"""Whether the thread sends its jobs to the second process."""
+
+
+def _second_for(movie: Path | None, workers: int) -> SecondProcess | None:
+    """Start a second process where a movie is large enough to be worth it."""
+    if movie is None or min(workers, processors()) < 2 or not movie.is_file():
+        return None
+    return SecondProcess(_IMPORTED) if movie.stat().st_size > _LARGE_BYTES else None
 
 
 class DaskExecutor:
@@ -130,8 +217,9 @@ class DaskExecutor:
             _compare(self._versions, found["versions"], worker)
             self._memory[worker] = found["memory"]
 
-    def threads(self, wanted: int) -> int:
+    def threads(self, wanted: int, jobs: int) -> int:
         """Use as many as are wanted; see `Executor`."""
+        del jobs
         return wanted
 
     def remarks(self, memory_limit_mb: int) -> list[str]:
@@ -149,11 +237,18 @@ class DaskExecutor:
             f"{needed}: start workers with more, or lower compute.memory_limit_mb"
         ]
 
-    def call(self, job: Callable[..., R], /, *arguments: Any, progress: Progress = silent) -> R:
+    def call(
+        self,
+        job: Callable[..., R],
+        /,
+        *arguments: Any,
+        progress: Progress = silent,
+        here: Callable[[], R] | None = None,
+    ) -> R:
         """Do a job on a worker; see `Executor`."""
         from distributed import KilledWorker
 
-        del progress
+        del progress, here
         sent = pickle.dumps((job, arguments))
         name = job.__name__.strip("_")
         with self._lock:
@@ -261,9 +356,17 @@ def _work(expected: dict[str, str], sent: bytes) -> bytes:
 
 @contextmanager
 def open_place(
-    scheduler: str = THREADS, scheduler_file: str | Path | None = None
+    scheduler: str = THREADS,
+    scheduler_file: str | Path | None = None,
+    *,
+    shared: Path | None = None,
+    workers: int = 1,
 ) -> Iterator[Executor]:
-    """Connect to where work shall run."""
+    """Connect to where work shall run.
+
+    Where this process does it, and with more than one worker, a second one helps with a large
+    movie, `shared`.  Only a program may ask for that, whose main module can be imported again.
+    """
     for name, value in (("scheduler", scheduler), ("scheduler_file", scheduler_file)):
         if value is not None and not isinstance(value, (str, Path)):
             raise ConfigError(f"`{name}` = {value!r}: give a text or a path")
@@ -275,7 +378,16 @@ def open_place(
             )
         scheduler = _address_in(Path(scheduler_file))
     elif scheduler == THREADS:
-        yield LocalExecutor()
+        second = _second_for(shared, workers)
+        if second is None:
+            yield LocalExecutor()
+            return
+        try:
+            yield LocalExecutor(second)
+        except BaseException:
+            second.end()
+            raise
+        second.close()
         return
     elif ":" not in scheduler:
         raise ConfigError(

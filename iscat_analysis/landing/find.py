@@ -112,7 +112,7 @@ def analyse_landings(
     )  # fmt: skip
     merged = Merged(reader.shape)
     interrupted = False
-    with threads(place.threads(config.compute.workers)) as pool:
+    with threads(place.threads(config.compute.workers, len(plan))) as pool:
 
         def finish(number: int) -> Done:
             done = None if posterior else store.load(number)
@@ -122,12 +122,14 @@ def analyse_landings(
                 earlier = merged.earlier(number, core[0] - window)  # before all of this chunk
                 if place.distant:
                     reader.forget()  # whoever does it has a reader of its own
-                    done = place.call(chunk_job, movie_job, core, span, budget, earlier)
-                else:
+
+                def here() -> Done:
                     chunk = reader.chunk(span, stride, pool)
-                    done = analyse_chunk(
+                    return analyse_chunk(
                         scene, chunk, core, window, pool, budget, noise.excess, earlier
                     )
+
+                done = place.call(chunk_job, movie_job, core, span, budget, earlier, here=here)
                 store.save(number, done)
             merged.note(number, done)
             return done

@@ -123,7 +123,7 @@ def fit_stack(
                 place=place,
             )
         with parts_kept(None if way == "fixed" else partial):
-            write_report(analysis, folder, overwrite=overwrite, event_figures=figures)
+            write_report(analysis, folder, overwrite=overwrite, event_figures=figures, place=place)
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:

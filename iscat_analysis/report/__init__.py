@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.posterior import write_posterior
@@ -50,6 +51,7 @@ def write_report(
     *,
     overwrite: bool = False,
     event_figures: int = EVENT_FIGURES,
+    place: Executor | None = None,
 ) -> Path:
     """Write everything one analysis found into a folder.
 
@@ -59,11 +61,13 @@ def write_report(
     all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building, event_figures=event_figures)
+        fill_report(analysis, building, event_figures=event_figures, place=place)
     return folder
 
 
-def fill_report(analysis: Analysis, folder: Path, *, event_figures: int) -> None:
+def fill_report(
+    analysis: Analysis, folder: Path, *, event_figures: int, place: Executor | None = None
+) -> None:
     """Write a report into a folder of its own."""
     pictures = folder / "figures"
     pictures.mkdir(exist_ok=True)
@@ -71,5 +75,6 @@ def fill_report(analysis: Analysis, folder: Path, *, event_figures: int) -> None
     write_posterior(analysis, folder / "posterior.nc")
     from iscat_analysis.report.drawing import draw  # Matplotlib takes long to load
 
-    page = draw(analysis, pictures, event_figures)
+    nearby = LocalExecutor() if place is None or place.distant else place  # it writes here
+    page = draw(analysis, pictures, event_figures, nearby)
     (folder / "report.html").write_text(page, encoding="utf-8")

@@ -247,17 +247,13 @@ def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
 
 @cache
 def load_linker() -> Any:
-    """Import trackpy, silenced, which reports every frame, and let it keep what it compiles.
+    """Import trackpy, silenced, which reports every frame.
 
-    That takes a third of a second, which is better taken beside something else.
+    That takes a second or so, which is better taken beside something else.
     """
     import trackpy
-    from trackpy.linking import subnetlinker
 
     logging.getLogger("trackpy").setLevel(logging.WARNING)
-    compiled = getattr(subnetlinker, "_numba_subnet_norecur", None)
-    if compiled is not None:
-        compiled.enable_caching()
     return trackpy
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import signal
 import subprocess
 import sys
@@ -64,7 +63,7 @@ def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Sign
         seconds = time.monotonic() - begun
     finally:
         process.kill()
-    assert process.returncode == 130
+    assert process.returncode == -signal.SIGINT
     assert "interrupted" in err
     assert len(err.splitlines()) == 1
     assert seconds < SECONDS + LOADED
@@ -127,27 +126,58 @@ def test_impossible_lengths_end_at_once_and_small(setting: str, expected: str) -
     assert len(done.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("late", [False, True])
-def test_an_interrupt_in_a_callback_of_compiled_code_is_one(
-    capsys: pytest.CaptureFixture[str], *, late: bool
-) -> None:
-    """Python prints and forgets it there; the compiler then misses what it had asked for."""
+CALLBACK = """
+import ctypes, os, signal, sys, time
+import typer, iscat_cli
+from iscat_cli import app
+from iscat_cli.console import Messages, failures
 
-    @ctypes.CFUNCTYPE(None)
-    def callback() -> None:
-        raise KeyboardInterrupt
+@ctypes.CFUNCTYPE(None)
+def callback():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(1)
 
-    def run() -> None:
-        with failures(Messages("iscat", quiet=False), debug=False):
+def run(program, arguments):
+    try:
+        with failures(Messages("iscat"), debug=False):
             callback()
-            if not late:
-                time.sleep(5)
-            raise RuntimeError("no compiled object yet")
+            {then}
+    except typer.Exit as end:
+        return end.exit_code
+    return 0
 
-    with pytest.raises(typer.Exit) as ended:
-        run()
-    assert ended.value.exit_code == INTERRUPTED
-    said = capsys.readouterr().err
-    assert "interrupted" in said
-    assert "Traceback" not in said
-    assert "no compiled object" not in said
+app.run = run
+sys.exit(iscat_cli.main())
+"""
+
+
+@pytest.mark.parametrize("then", ["time.sleep(60)", 'raise RuntimeError("no compiled object yet")'])
+def test_an_interrupt_in_a_callback_of_compiled_code_is_one(then: str) -> None:
+    """Python forgets it there; the compiler then misses what it had asked for."""
+    code = CALLBACK.replace("{then}", then)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False
+    )
+    assert done.returncode == INTERRUPTED
+    assert done.stderr == "iscat: error: interrupted\n"
+
+
+def test_a_process_that_is_ended_reports_130_to_a_shell() -> None:
+    """The control ends by another signal."""
+    code = BUSY.replace("{where}", "compiled").replace(
+        "hashlib.pbkdf2", "import os, signal; os.kill(os.getpid(), signal.{name}); hashlib.pbkdf2"
+    )
+    for name, status in (("SIGTERM", 130), ("SIGKILL", 137)):
+        shell = ["sh", "-c", '"$0" -c "$1"; exit $?', sys.executable, code.replace("{name}", name)]
+        assert subprocess.run(shell, capture_output=True, check=False).returncode == status
+
+
+def test_signals_are_as_before_when_a_command_has_ended() -> None:
+    def state() -> list[object]:
+        numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
+        return [*map(signal.getsignal, numbers), signal.pthread_sigmask(signal.SIG_BLOCK, ())]
+
+    before = state()
+    with failures(Messages("iscat"), debug=False):
+        pass
+    assert state() == before

@@ -25,7 +25,6 @@ def _load(name: str) -> ModuleType:
 
 
 BLOCKS = _load("blocks")
-PREPARED = _load("prepared")
 
 
 def test_a_block_that_is_not_run_says_why_and_few_are() -> None:
@@ -57,20 +56,4 @@ def test_the_runner_finds_fails_and_stops(tmp_path: Path) -> None:
     outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent)
     assert [outcome.out for outcome in outcomes] == ["hidden\none two\n", "1\n", "2\n", ""]
     assert outcomes[0].block.keep == "said"
-    assert "ValueError: oh" in outcomes[-1].failed
-
-
-def test_copies_of_a_prepared_process_are_programs(tmp_path: Path) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(
-        "```python\nx = open('a.txt', 'w').write('here')\nprint(x)\n```\n"
-        "```console\n$ cat a.txt | interpreter 'print(input(), open(\"a.txt\").read())'\n```\n"
-        "```python\nprint(x + 1)\n```\n"
-        "```console\n$ interpreter 'raise ValueError(\"oh\")'\n```\n",
-        encoding="utf-8",
-    )
-    with PREPARED.prepared(loads=False) as programs:
-        outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent, programs)
-    assert [outcome.out for outcome in outcomes] == ["4\n", "here here\n", "5\n", ""]
-    assert [bool(outcome.failed) for outcome in outcomes] == [False, False, False, True]
     assert "ValueError: oh" in outcomes[-1].failed

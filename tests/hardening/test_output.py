@@ -9,7 +9,11 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -80,57 +84,68 @@ species = [600.0]
 FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
 
 
-class Forker:
-    """Speaks with `forker.py`."""
+class Runner:
+    """Runs `runner.py`: one order or several at the same time, each in a process of its own.
+
+    An order is one of `runner.py` with ``"cwd": folder``, and ``"kill": [signal, share]`` to be
+    ended after that share of an undisturbed run's duration, which is the first order's or
+    ``"duration": seconds``.  An answer is ``{"status": …, "err": …, "seconds": …}``; a signal's
+    status is negative.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.bench = folder
-        script = Path(__file__).with_name("forker.py")
-        environment = {**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
-        self.process = subprocess.Popen(
-            [sys.executable, str(script)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=environment,
-        )
+        self.duration = 0.0
 
     def run(self, *orders: dict[str, Any]) -> list[dict[str, Any]]:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.write(json.dumps(orders) + "\n")
-        self.process.stdin.flush()
-        answer = self.process.stdout.readline()
-        assert answer, "the forking process has died"
-        return json.loads(answer)
+        with ThreadPoolExecutor(len(orders)) as pool:
+            return list(pool.map(self._one, orders))
 
-    def close(self) -> None:
-        assert self.process.stdin is not None
-        assert self.process.stdout is not None
-        self.process.stdin.close()
-        self.process.wait(timeout=60)
-        self.process.stdout.close()
+    def _one(self, order: dict[str, Any]) -> dict[str, Any]:
+        script = Path(__file__).with_name("runner.py")
+        begun, ready = os.pipe()
+        told = json.dumps({**order, "ready": ready})
+        with tempfile.TemporaryFile() as err:
+            process = subprocess.Popen(
+                [sys.executable, str(script), told], cwd=order["cwd"], pass_fds=[ready],
+                stdout=subprocess.DEVNULL, stderr=err,
+                env={**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"},
+            )  # fmt: skip
+            os.close(ready)
+            os.read(begun, 1)
+            os.close(begun)
+            begin = time.monotonic()
+            if "kill" in order:
+                number, share = order["kill"]
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(share * order.get("duration", self.duration))
+                process.send_signal(number)
+            status = process.wait()
+            seconds = time.monotonic() - begin
+            err.seek(0)
+            said = err.read().decode("utf-8", "backslashreplace")
+        return {"status": status, "err": said, "seconds": seconds}
 
 
 @pytest.fixture(scope="module")
-def forker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forker]:
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
+    """Return what runs programs, once it knows how long one takes."""
     bench = tmp_path_factory.mktemp("bench")
     (bench / "setup.toml").write_text(SETUP)
     write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
-    forker = Forker(bench)
-    try:
-        (first,) = forker.run({"run": FIT, "cwd": str(bench)})
+    runner = Runner(bench)
+    for _ in range(2):  # the first compiles
+        (first,) = runner.run({"run": FIT, "cwd": str(bench)})
         assert first["status"] == 0, first["err"]
-        yield forker
-    finally:
-        forker.close()
+    runner.duration = first["seconds"]
+    return runner
 
 
 @pytest.fixture
-def place(forker: Forker, tmp_path: Path) -> Path:
+def place(runner: Runner, tmp_path: Path) -> Path:
     """Return a folder with the movie and its configuration."""
     for name in ("movie.tif", "setup.toml"):
-        shutil.copy(forker.bench / name, tmp_path)
+        shutil.copy(runner.bench / name, tmp_path)
     return tmp_path
 
 
@@ -186,10 +201,10 @@ def contents(result: Path) -> dict[str, bytes]:
     return files
 
 
-def test_repeats_are_identical(forker: Forker, place: Path) -> None:
+def test_repeats_are_identical(runner: Runner, place: Path) -> None:
     found = []
     for _ in range(2):
-        (answer,) = forker.run({"run": FIT, "cwd": str(place), "figures": True})
+        (answer,) = runner.run({"run": FIT, "cwd": str(place), "figures": True})
         assert answer["status"] == 0
         assert_whole(place / "result")
         found.append(contents(place / "result"))
@@ -210,9 +225,9 @@ def differing(one: dict[str, bytes], two: dict[str, bytes]) -> list[str]:
 
 
 @pytest.mark.large
-def test_killed_at_random_moments(forker: Forker, place: Path, share: float) -> None:
+def test_killed_at_random_moments(runner: Runner, place: Path, share: float) -> None:
     rng = np.random.default_rng(SEED)
-    expected = contents(forker.bench / "result")
+    expected = contents(runner.bench / "result")
     result = place / "result"
     for number in range(max(10, round(share * KILLS))):
         if rng.random() < 0.5:
@@ -222,14 +237,14 @@ def test_killed_at_random_moments(forker: Forker, place: Path, share: float) -> 
             "cwd": str(place),
             "kill": [signal.SIGKILL, float(rng.uniform(0, 1.1))],
         }
-        (answer,) = forker.run(order)
+        (answer,) = runner.run(order)
         assert answer["status"] in (0, -signal.SIGKILL)
         hidden = [name for name in names(place) if name.startswith(".iscat-")]
         assert len(hidden) <= 3  # what the last run left; what earlier ones left is gone
         if result.exists():
             assert_whole(result)
         if number % 10 == 9:
-            (again,) = forker.run({"run": FIT, "cwd": str(place)})
+            (again,) = runner.run({"run": FIT, "cwd": str(place)})
             assert again["status"] == 0, again["err"]
             assert differing(contents(result), expected) == []
             assert names(place) == ["movie.tif", "result", "setup.toml"]
@@ -237,15 +252,15 @@ def test_killed_at_random_moments(forker: Forker, place: Path, share: float) -> 
 
 @pytest.fixture(scope="module")
 def landing(
-    forker: Forker, tmp_path_factory: pytest.TempPathFactory
+    runner: Runner, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[dict[str, Any], float, dict[str, bytes]]:
     """Return the order for a landing movie of several chunks, its duration and its result."""
     place = tmp_path_factory.mktemp("landing")
     (place / "setup.toml").write_text(LANDING)
     write_stack(load_config(place / "setup.toml"), place / "movie.tif")
     order = {"run": FIT, "cwd": str(place), "memory_share": 0.0031}
-    forker.run(order)  # compiles what landing movies need
-    (whole,) = forker.run(order)
+    runner.run(order)  # compiles what landing movies need
+    (whole,) = runner.run(order)
     assert whole["status"] == 0, whole["err"]
     assert not (place / ".result.partial").exists()
     summary = json.loads((place / "result" / "summary.json").read_text(encoding="utf-8"))
@@ -256,15 +271,15 @@ def landing(
 
 @pytest.mark.parametrize("chunks", [1, 3])
 def test_a_landing_movie_killed_between_chunks_resumes(
-    forker: Forker, landing: tuple[dict[str, Any], float, dict[str, bytes]], chunks: int
+    runner: Runner, landing: tuple[dict[str, Any], float, dict[str, bytes]], chunks: int
 ) -> None:
     order, _, expected = landing
     place = Path(order["cwd"])
     shutil.rmtree(place / "result", ignore_errors=True)
-    (answer,) = forker.run({**order, "die": ["after", chunks]})
+    (answer,) = runner.run({**order, "die": ["after", chunks]})
     assert answer["status"] == -signal.SIGKILL
     assert len(list((place / ".result.partial").glob("*.npz"))) == chunks
-    (again,) = forker.run(order)
+    (again,) = runner.run(order)
     assert again["status"] == 0, again["err"]
     assert differing(contents(place / "result"), expected) == []
     assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
@@ -272,7 +287,7 @@ def test_a_landing_movie_killed_between_chunks_resumes(
 
 @pytest.mark.large
 def test_a_landing_movie_killed_at_random_moments_resumes(
-    forker: Forker, landing: tuple[dict[str, Any], float, dict[str, bytes]], share: float
+    runner: Runner, landing: tuple[dict[str, Any], float, dict[str, bytes]], share: float
 ) -> None:
     order, seconds, expected = landing
     place = Path(order["cwd"])
@@ -281,13 +296,13 @@ def test_a_landing_movie_killed_at_random_moments_resumes(
     for number in range(max(10, round(share * KILLS / 2))):
         shutil.rmtree(result, ignore_errors=True)
         kill = [signal.SIGKILL, float(rng.uniform(0, 1))]
-        (answer,) = forker.run({**order, "kill": kill, "duration": seconds})
+        (answer,) = runner.run({**order, "kill": kill, "duration": seconds})
         assert answer["status"] in (0, -signal.SIGKILL)
         if result.exists():
             assert_whole(result, extra=("frame_ci95",))
         if number % 5 == 4:
             shutil.rmtree(result, ignore_errors=True)
-            (again,) = forker.run(order)
+            (again,) = runner.run(order)
             assert again["status"] == 0, again["err"]
             assert differing(contents(result), expected) == []
             assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
@@ -295,31 +310,31 @@ def test_a_landing_movie_killed_at_random_moments_resumes(
 
 @pytest.mark.parametrize("word", ["before", "after"])
 @pytest.mark.parametrize("number", [1, 2])
-def test_killed_between_two_renamings(forker: Forker, place: Path, word: str, number: int) -> None:
+def test_killed_between_two_renamings(runner: Runner, place: Path, word: str, number: int) -> None:
     """The one moment at which neither result has the final name: the next run puts one back."""
-    shutil.copytree(forker.bench / "result", place / "result")
+    shutil.copytree(runner.bench / "result", place / "result")
     (place / "result" / "summary.json").write_text('{"earlier": true}')
-    (answer,) = forker.run({"run": FIT, "cwd": str(place), "die": [word, number]})
+    (answer,) = runner.run({"run": FIT, "cwd": str(place), "die": [word, number]})
     assert answer["status"] == -signal.SIGKILL
     refused = {"run": [*FIT[:-1]], "cwd": str(place)}  # without --overwrite
-    (again,) = forker.run(refused)
+    (again,) = runner.run(refused)
     assert again["status"] == 1
     assert "holds an earlier result" in one_line(again)
     summary = json.loads((place / "result" / "summary.json").read_text())
     assert ("earlier" in summary) == ((word, number) != ("after", 2))
-    (again,) = forker.run({"run": FIT, "cwd": str(place)})
+    (again,) = runner.run({"run": FIT, "cwd": str(place)})
     assert again["status"] == 0
     assert_whole(place / "result")
     assert names(place) == ["movie.tif", "result", "setup.toml"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
-def test_asked_to_end(forker: Forker, place: Path, number: int) -> None:
+def test_asked_to_end(runner: Runner, place: Path, number: int) -> None:
     rng = np.random.default_rng(SEED)
     for _ in range(3):
         order = {"run": FIT, "cwd": str(place), "kill": [number, float(rng.uniform(0, 1))]}
-        (answer,) = forker.run(order)
-        assert answer["status"] in (0, 130, -number, 70)  # the last two: before it has begun
+        (answer,) = runner.run(order)
+        assert answer["status"] in (0, 130, -number, -signal.SIGINT)  # before it began; too slow
         assert set(names(place)) - {"result"} == {"movie.tif", "setup.toml"}, answer
         if answer["status"] == 130 and answer["err"]:  # quiet before the command has begun
             assert "interrupted" in one_line(answer)
@@ -327,10 +342,10 @@ def test_asked_to_end(forker: Forker, place: Path, number: int) -> None:
             assert_whole(place / "result")
 
 
-def test_two_runs_into_one_folder(forker: Forker, place: Path) -> None:
+def test_two_runs_into_one_folder(runner: Runner, place: Path) -> None:
     for options in (FIT, FIT[:-1]):
         shutil.rmtree(place / "result", ignore_errors=True)
-        answers = forker.run(*[{"run": options, "cwd": str(place)}] * 3)
+        answers = runner.run(*[{"run": options, "cwd": str(place)}] * 3)
         statuses = sorted(answer["status"] for answer in answers)
         assert statuses[0] == 0
         assert set(statuses) <= {0, 1}
@@ -341,16 +356,16 @@ def test_two_runs_into_one_folder(forker: Forker, place: Path) -> None:
         assert names(place) == ["movie.tif", "result", "setup.toml"]
 
 
-def test_a_run_that_is_under_way_is_respected(forker: Forker, place: Path) -> None:
+def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> None:
     with claim_output(place / "result"):
         with claim_output(place / "result"):  # the same process may: it is the same run
             pass
-        (answer,) = forker.run({"run": FIT, "cwd": str(place)})
+        (answer,) = runner.run({"run": FIT, "cwd": str(place)})
     assert answer["status"] == 1
     expected = f"result: another run (process {os.getpid()}) is about to write there"
     assert expected in one_line(answer)
     assert not (place / "result").exists()
-    (answer,) = forker.run({"run": FIT, "cwd": str(place)})
+    (answer,) = runner.run({"run": FIT, "cwd": str(place)})
     assert answer["status"] == 0
 
 
@@ -358,16 +373,16 @@ def test_a_run_that_is_under_way_is_respected(forker: Forker, place: Path) -> No
 
 
 @pytest.mark.parametrize("limit", [600, 8_000, 30_000])
-def test_a_file_that_cannot_grow(forker: Forker, place: Path, limit: int) -> None:
-    (answer,) = forker.run({"run": FIT, "cwd": str(place), "limit": limit})
+def test_a_file_that_cannot_grow(runner: Runner, place: Path, limit: int) -> None:
+    (answer,) = runner.run({"run": FIT, "cwd": str(place), "limit": limit})
     assert answer["status"] == 1
     assert re.search(r"result: cannot be written \(.*File too large\)", one_line(answer))
     assert names(place) == ["movie.tif", "setup.toml"]
 
 
-def test_a_simulated_movie_that_cannot_grow(forker: Forker, place: Path) -> None:
+def test_a_simulated_movie_that_cannot_grow(runner: Runner, place: Path) -> None:
     run = ["simulate", "--config", "setup.toml", "--out", "new.tif"]
-    (answer,) = forker.run({"run": run, "cwd": str(place), "limit": 50_000})
+    (answer,) = runner.run({"run": run, "cwd": str(place), "limit": 50_000})
     assert answer["status"] == 1
     assert "new.tif: cannot be written" in one_line(answer)
     assert names(place) == ["movie.tif", "setup.toml"]
@@ -405,12 +420,12 @@ def test_a_full_disk(mount: Path) -> None:
         assert names(earlier) == [".iscat-files", "fits.csv"]
 
 
-def test_a_read_only_disk(mount: Path, forker: Forker) -> None:
-    shutil.copy(forker.bench / "movie.tif", mount)
-    shutil.copy(forker.bench / "setup.toml", mount)
+def test_a_read_only_disk(mount: Path, runner: Runner) -> None:
+    shutil.copy(runner.bench / "movie.tif", mount)
+    shutil.copy(runner.bench / "setup.toml", mount)
     subprocess.run(["mount", "-o", "remount,ro", str(mount)], check=True)
     run = ["fit", "movie.tif", "--config", "setup.toml"]
-    (answer,) = forker.run({"run": run, "cwd": str(mount)})
+    (answer,) = runner.run({"run": run, "cwd": str(mount)})
     assert answer["status"] == 1
     assert "movie.iscat: cannot be made (Read-only file system); choose another --out" in one_line(
         answer
@@ -442,24 +457,24 @@ NAMES = [
 
 
 @pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
-def test_names(forker: Forker, tmp_path: Path, name: str) -> None:
+def test_names(runner: Runner, tmp_path: Path, name: str) -> None:
     folder = tmp_path / (name if len(name) < 200 else "y" * 200)
     folder.mkdir()
-    shutil.copy(forker.bench / "movie.tif", folder / f"{name}.tif")
-    shutil.copy(forker.bench / "setup.toml", folder / f"{name}.toml")
+    shutil.copy(runner.bench / "movie.tif", folder / f"{name}.tif")
+    shutil.copy(runner.bench / "setup.toml", folder / f"{name}.toml")
     config = f"--config={name}.toml"
-    (answer,) = forker.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    (answer,) = runner.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
     assert answer["status"] == 0, answer["err"]
     assert_whole(folder / f"{name}.iscat")
     assert names(folder) == sorted(f"{name}.{end}" for end in ("tif", "toml", "iscat"))
-    (answer,) = forker.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    (answer,) = runner.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
     assert answer["status"] == 1
     assert "holds an earlier result" in one_line(answer)
 
 
-def test_a_name_that_is_too_long_is_refused_early(forker: Forker, place: Path) -> None:
+def test_a_name_that_is_too_long_is_refused_early(runner: Runner, place: Path) -> None:
     run = ["fit", "movie.tif", "--config", "setup.toml", "--out", "z" * 300]
-    (answer,) = forker.run({"run": run, "cwd": str(place)})
+    (answer,) = runner.run({"run": run, "cwd": str(place)})
     assert answer["status"] == 1
     assert "File name too long" in one_line(answer)
 

@@ -27,9 +27,8 @@ def kernel(name: str) -> dict[str, SimpleNamespace]:
     return {"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=name))}
 
 
-def test_compilation_is_announced_once_and_its_stages_are_named(monkeypatch):
+def test_compilation_is_announced_in_one_line_once(monkeypatch):
     monkeypatch.setattr(module, "_PATIENCE_S", 0.0)
-    monkeypatch.setattr(module, "_BETWEEN_S", 0.0)
     said = []
     with compiling(said.append):
         with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.radial")):
@@ -39,13 +38,10 @@ def test_compilation_is_announced_once_and_its_stages_are_named(monkeypatch):
                 pass
         for _ in range(2):
             with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.scoring")):
-                pass
+                time.sleep(0.05)
     with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.moving")):
         pass
-    assert said == [
-        "compiling the numerical kernels, once per installation: the tables of the microscope…",
-        "still compiling: fits…",
-    ]
+    assert said == ["compiling the numerical kernels, once per installation…"]
 
 
 def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
@@ -81,7 +77,7 @@ import numpy as np
 from iscat_analysis._kernels.support import supported
 from iscat_analysis.fitting import compilation
 
-compilation._PATIENCE_S = 600.0
+compilation._PATIENCE_S = 3600.0  # a busy machine takes longer, and says so
 with compilation.compiling(print):
     edge = np.array([-100.0, 100.0])
     places = np.array([[0, 0, 50, 1, 0], [900, 0, 50, 1, 0]], dtype=float)
