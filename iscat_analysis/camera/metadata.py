@@ -23,6 +23,7 @@ from iscat_analysis.camera.pattern_jitter import (
 from iscat_analysis.config import Config, plausible_pixel
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
+from iscat_analysis.units import count
 
 _DISAGREEMENT = 0.01  # relative, between configuration and metadata
 _GAIN_TOLERANCE = 0.10  # of the noise variance, before the user is told
@@ -54,6 +55,13 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
                 f"{read:g} {unit} in the movie's {metadata.source} metadata; "
                 "the configuration is used"
             )
+    if metadata.ticks is not None:
+        missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
+        notes.append(
+            f"the camera dropped {count(missing, 'frame')}, by the times in the movie's "
+            f"{metadata.source} metadata; diffusion coefficients and rates count the time that "
+            "passed"
+        )
     if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
         raise DataError(
             "the pixel size is neither in the configuration nor in the movie's metadata; "

@@ -24,7 +24,7 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.records import Analysis, Film, Provenance, silent
+from iscat_analysis.records import Analysis, Film, Provenance, make_rows, silent
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
 from iscat_analysis.tracking.common_motion import warnings_of
@@ -56,6 +56,10 @@ def gather(
         further["optics"] = found.optics
     further |= extra
     table, achieved = reported_rows(found)
+    recorded = ready.movie.metadata.ticks
+    ticks = None if recorded is None else np.array(recorded)
+    if ticks is not None and table["frame"].notna().all():
+        table = make_rows(table, tick=ticks[table["frame"].to_numpy(int)])
     for doubt in (
         line_warning(config, table),
         bend_warning(scene.model.scale, table),
@@ -82,8 +86,6 @@ def gather(
     films: tuple[Film, ...] = ()
     if found.followed is not None:
         followed = found.followed
-        recorded = ready.movie.metadata.ticks
-        ticks = None if recorded is None else np.array(recorded)
         tracks, said = tracks_of(
             scene, table, followed.windows,
             masses=followed.masses, ticks=ticks, tell=run.tell, progress=progress,

@@ -134,6 +134,11 @@ EVENTS = (
         "Half-width of the 95 % interval of frame [frames]; landing movies only", optional=True,
     ),
     Column("track", "count", "Number of the track that the row belongs to", optional=True),
+    Column(
+        "tick", "count",
+        "Intervals of the camera from the movie's first frame to frame; where the file's times "
+        "show that frames are missing", optional=True,
+    ),
     *_of_each_parameter(
         "repeat",
         "Standard error from eight disjoint parts of the event's own frames, itself to 19 %; in "

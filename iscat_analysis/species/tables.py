@@ -258,6 +258,8 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         _numbers(good, column, name)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
     )
+    if "tick" in good:  # the camera dropped frames, and time went on
+        frame = _numbers(good, "tick", name)
     known = np.isfinite(mass) & (mass != 0)
     notes = []
     if sigma_kda is not None:
