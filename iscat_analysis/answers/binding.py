@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import choice_in, number_in, path_in, truth_in
+from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie.text_tables import separator, without_remarks
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
@@ -26,7 +26,7 @@ from iscat_analysis.species.choices import Ladder
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
-from iscat_analysis.species.tables import EventTable, event_table, refuse_far
+from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
 from iscat_analysis.units import count
 
 BINDING_FILES = frozenset({"kd.csv", "kd.json", "figures"})
@@ -274,7 +274,7 @@ def check_reaction(
         )
         raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa]")
     for mass in masses_kda:
-        number_in(f"`{names[1]}`", mass, above=0.0, what="mass in kDa")
+        mass_in(f"`{names[1]}`", mass)
 
 
 def _read_samples(path: Path) -> pd.DataFrame:
@@ -345,7 +345,8 @@ def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:
         totals = rows[list(columns)].to_numpy(dtype=np.float64)
     except ValueError as error:
         raise DataError(f"{name}: a concentration is no number ({error})") from None
-    bad = ~np.isfinite(totals).all(axis=1) | (totals < 0).any(axis=1) | (totals.sum(axis=1) <= 0)
+    possible = (totals == 0) | ((totals >= 1 / LARGEST) & (totals <= LARGEST))
+    bad = ~possible.all(axis=1) | (totals.sum(axis=1) <= 0)
     if bad.any():
         raise DataError(
             f"{name}: row {int(np.argmax(bad)) + 1} has no concentration above 0 in "

@@ -23,7 +23,7 @@ import pandas as pd
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.text_tables import decimal_mark, separator
+from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -293,6 +293,7 @@ def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
 def _places(header: list[str], path: Path) -> dict[str, int]:
     places = {}
     for column, names in _NAMES.items():
+        refuse_twice(header, names, path)
         found = next((name for name in names if name in header), None)
         if found is not None:
             places[column] = header.index(found)
