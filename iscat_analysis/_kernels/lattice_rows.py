@@ -58,7 +58,8 @@ def _ends(values: FloatArray) -> tuple[float, float]:
 def _node(lens: LatticeLens, away: float) -> float:
     """Place on the lattice at a distance from the particle, in nodes; all of its taps are there."""
     last = 2 * lens.half + 1 - TAPS + BEFORE
-    return within(away * lens.inv_step + lens.half, float(BEFORE), float(last))
+    place: float = within(away * lens.inv_step + lens.half, float(BEFORE), float(last))
+    return place
 
 
 @kernel()

@@ -41,7 +41,9 @@ def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, mo
     x, y, margin = pixels.x, pixels.y, abs(pixels.offsets[-1])
     dx = max(abs(x[0] - x_p), abs(x[-1] - x_p)) + margin
     dy = max(abs(y[0] - y_p), abs(y[-1] - y_p)) + margin
-    return min(whole(np.sqrt(dx * dx + dy * dy) * lens.inv_step, 0, most) + 2, most)
+    distance = np.sqrt(dx * dx + dy * dy) * lens.inv_step
+    needed: int = min(whole(distance, 0, most) + 2, most)
+    return needed
 
 
 @kernel(fastmath=FAST)

@@ -15,6 +15,7 @@ import pandas as pd
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie.text_tables import separator, without_remarks
+from iscat_analysis.reading import is_file, is_folder, read_text
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.binding import binding_figure
@@ -279,7 +280,7 @@ def check_reaction(
 
 def _read_samples(path: Path) -> pd.DataFrame:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
         return pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else ".")
     except OSError as error:
@@ -366,10 +367,11 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
     for given in rows[column].fillna("").astype(str):
         path = Path(given.strip())
         path = path.parent if column == "report" else path
-        if base is not None and not path.is_absolute() and (base / path).exists():
-            path = base / path
+        there = path if base is None else base / path
+        if is_file(there) or is_folder(there):
+            path = there
         folder = path.with_suffix(".iscat")
-        found.append(folder if path.suffix in _MOVIES and folder.is_dir() else path)
+        found.append(folder if path.suffix in _MOVIES and is_folder(folder) else path)
     return found
 
 

@@ -21,6 +21,7 @@ from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.values import ALL
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.reading import toml_of
 
 _RIVALS = {
     ("particle", "mass_kda"): ("diameter_nm",),
@@ -169,7 +170,7 @@ def _parsed(text: str) -> Change:
             f"`settings` = {text}: write it as section.key=value, as in optics.na=1.42"
         )
     try:
-        value = tomllib.loads(f"value = {written}")["value"]
+        value = toml_of(f"value = {written}")["value"]
     except tomllib.TOMLDecodeError:
         value = written.strip()
     return section, key, value

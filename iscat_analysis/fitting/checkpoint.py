@@ -18,6 +18,7 @@ import pandas as pd
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.files import whole_file
+from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 
 GOES_ON = "what was finished is kept, and the same command goes on from there"
@@ -59,7 +60,7 @@ class Checkpoint:
         table_path, path = self._paths(number)
         try:
             with np.load(path, allow_pickle=False) as data:
-                found = pd.read_parquet(table_path), dict(data)
+                found = read_parquet(table_path), dict(data)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
         self.kept += 1
@@ -177,7 +178,7 @@ def parts_kept(folder: Path | None) -> Iterator[None]:
 def is_resumable(folder: Path) -> bool:
     """Whether a folder holds what an interrupted run left, and its chunks, if it finished any."""
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(folder / "summary.json")
         goes_on = partial_folder(folder).is_dir() or not summary["events"]
         return bool(summary["interrupted"]) and goes_on
     except (OSError, ValueError, KeyError, TypeError):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from array import array
 from collections.abc import Mapping
 from contextlib import closing
@@ -24,6 +25,7 @@ import pandas as pd
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
+from iscat_analysis.reading import open_regular
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -95,9 +97,9 @@ def read_events(path: Path) -> pd.DataFrame:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             signature = file.read(len(HDF5_SIGNATURE))
-        size = path.stat().st_size
+            size = file.seek(0, os.SEEK_END)
     except OSError as error:
         what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give the path of one event table") from None

@@ -14,6 +14,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import merge
 from iscat_analysis.movie.ome import OmeSet
 from iscat_analysis.movie.stack import Frames
+from iscat_analysis.reading import is_file
 from iscat_analysis.records import StackMetadata
 
 
@@ -56,7 +57,7 @@ class FileSet:
 def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
     """Open the files of a set, which lie beside each other."""
     files = [path.with_name(name) if name else path for name in described.files]
-    missing = [file.name for file in files if not file.is_file()]
+    missing = [file.name for file in files if not is_file(file)]
     if missing:
         raise DataError(
             f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
@@ -67,10 +68,12 @@ def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames
         for file in files:
             members.append(open_member(file))
             opened.callback(members[-1].close)
+        last = np.full(len(files), -1)
+        np.maximum.at(last, described.where[:, 0], described.where[:, 1])
         for number, (file, member) in enumerate(zip(files, members, strict=True)):
             if (member.shape[1:], member.dtype) != (members[0].shape[1:], members[0].dtype):
                 raise DataError(f"{file}: has other pixels than {files[0].name}; export it again")
-            needed = int(described.where[described.where[:, 0] == number, 1].max(initial=-1)) + 1
+            needed = int(last[number]) + 1
             if needed > member.shape[0]:
                 raise DataError(
                     f"{file}: holds {member.shape[0]} images, but the description of its set says "

@@ -26,6 +26,7 @@ from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, 
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, read_bytes
 
 FloatArray = NDArray[np.float64]
 
@@ -58,7 +59,7 @@ class Template:
     def read(cls, path: Path) -> Template:
         """Read what `to_bytes` gave."""
         try:
-            content = path.read_bytes()
+            content = read_bytes(path, LARGEST_TEMPLATE_BYTES)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
         return _parsed(str(path), content)

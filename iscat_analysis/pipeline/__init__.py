@@ -34,7 +34,7 @@ from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, write_report
-from iscat_analysis.report.output import claim_output
+from iscat_analysis.report.output import check_output, claim_output
 from iscat_analysis.tracking.find import find_moving
 
 FIND: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
@@ -104,6 +104,7 @@ def fit_stack(
     overwrite = overwrite or is_resumable(folder)
     way = background_mode(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
+    check_output(folder, overwrite)
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
         with open_stack(stack) as movie:

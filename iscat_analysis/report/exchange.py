@@ -14,6 +14,7 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
+from iscat_analysis.reading import is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
@@ -166,7 +167,7 @@ def export_result(
     if layout not in get_args(Layout):
         raise ConfigError(f"layout = {layout!r}: choose one of {', '.join(get_args(Layout))}")
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out
-    if not (folder / "fits.csv").exists():
+    if not is_file(folder / "fits.csv"):
         raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
     beside = path.with_suffix(".yaml")
     for taken in [path, *([beside] if layout == "picasso" else [])]:
@@ -174,14 +175,15 @@ def export_result(
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
     if layout == "picasso" and path == beside:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
-    tracked = (folder / "tracks.csv").exists()
+    tracked = is_file(folder / "tracks.csv")
     if tracked and layout == "photomol":
         raise DataError(
             f"{folder}: holds tracks, and PhotoMol reads landings and leavings; tracks.csv has the "
             "mass of every track"
         )
     try:
-        fits = pd.read_csv(folder / "fits.csv", keep_default_na=False, na_values=[""])
+        with open_regular(folder / "fits.csv") as table:
+            fits = pd.read_csv(table, keep_default_na=False, na_values=[""])
         path.parent.mkdir(parents=True, exist_ok=True)
         if layout == "picasso":
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
@@ -253,7 +255,7 @@ def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
 def _summary(folder: Path) -> dict[str, Any]:
     """Read ``summary.json``; empty where it cannot be read."""
     try:
-        found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        found = read_json(folder / "summary.json")
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

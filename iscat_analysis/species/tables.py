@@ -15,7 +15,6 @@ instrument's; the width of a species then holds its error.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -31,6 +30,7 @@ from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
+from iscat_analysis.reading import is_file, is_folder, open_regular, read_json, read_parquet
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count
@@ -213,8 +213,8 @@ def shared_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | Non
 
 def _read(path: Path) -> tuple[pd.DataFrame, Path]:
     """Read a table of whichever program; the path of the file that was read."""
-    if path.is_dir():
-        inside = next((path / name for name in _OURS if (path / name).exists()), None)
+    if is_folder(path):
+        inside = next((path / name for name in _OURS if is_file(path / name)), None)
         if inside is None:
             raise DataError(
                 f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or a "
@@ -222,15 +222,13 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
             )
         path = inside
     try:
-        with path.open("rb") as file:
+        with open_regular(path, _LARGEST) as file:
             head = file.read(65536)
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: is too large for a table of events; check the path")
     except OSError:
         return read_events(path), path  # says what is wrong with it
     try:
         if head.startswith(b"PAR1"):
-            return pd.read_parquet(path), path
+            return read_parquet(path), path
         first = head.splitlines()[0].decode("utf-8", errors="replace") if head else ""
         between = separator(first)
         names = [name.strip() for name in first.lstrip("\ufeff").split(between)]
@@ -377,9 +375,9 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     threshold = _edge(snr)
     if path is not None:
         try:
-            text = (path.parent / "summary.json").read_text(encoding="utf-8")
-            stored = float(json.loads(text)["detection_threshold_snr"] or threshold)
+            summary = read_json(path.parent / "summary.json")
+            stored = float(summary["detection_threshold_snr"] or threshold)
             threshold = stored if 0 < stored < _RATIOS[1] else threshold
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (OSError, ValueError, KeyError, TypeError):
             pass  # no summary, or not ours: the table alone must do
     return filter_efficiency(good, threshold)

@@ -79,7 +79,7 @@ def test_masses_that_are_asked_for_are_bounded(value: float) -> None:
     for option in ("sigma_kda", "limit_kda", "above_kda", "ladder"):
         with pytest.raises(ia.ConfigError, match=f"`{option}` = .*: give one mass"):
             ia.find_species(events(), draws=0, **{option: value})
-    with pytest.raises(ia.ConfigError, match="`masses_kda` = .*: give one mass"):
+    with pytest.raises(ia.ConfigError, match=r"`masses_kda` = .*: give one mass"):
         ia.find_species(events(), draws=0, masses_kda=[66.0, value])
     samples = pd.DataFrame({"concentration_nm": [3.0, value]})
     with pytest.raises(ia.DataError, match="row 2 has no concentration"):
