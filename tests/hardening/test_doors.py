@@ -33,7 +33,7 @@ _HANGS_S = 100  # a guard; all of these take seconds at most, with what they imp
 
 @pytest.fixture(autouse=True)
 def never_waiting() -> Iterator[None]:
-    """End a test that waits for something that never comes, or that takes the square of its size."""
+    """End a test that waits for what never comes, or that takes the square of its size."""
 
     def give_up(*_: object) -> None:
         raise AssertionError("it hangs")
