@@ -7,17 +7,23 @@ stack.  Whatever cannot be read raises an `OSError` with a reason, or a `ValueEr
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import re
 import stat
+import struct
+import tokenize
 import tomllib
+import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.typing import NDArray
 
 LARGEST_TEXT_BYTES = 10_000_000
 """No configuration, list of samples or summary is longer."""
@@ -25,7 +31,12 @@ LARGEST_TEXT_BYTES = 10_000_000
 LARGEST_TEMPLATE_BYTES = 100_000_000
 """No measured picture of a particle is larger."""
 
+_OF_DAMAGE = (
+    OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, SyntaxError, MemoryError,
+    RuntimeError, ArithmeticError, tokenize.TokenError, struct.error,
+)  # fmt: skip
 _FLAGS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+_LONGEST_LINE = 200  # characters of what a library says
 _MOST_DOTS = 64  # of a key; tomllib takes the square of their number
 _DOT = re.compile(r"(?<!\.)\.(?!\.)")
 
@@ -106,6 +117,26 @@ def toml_of(text: str) -> dict[str, Any]:
         raise tomllib.TOMLDecodeError("its brackets are nested too deep") from None
 
 
+def npz_of(content: bytes, names: Sequence[str], most: int) -> dict[str, NDArray[Any]]:
+    """Read arrays of a ``.npz`` file, of so many bytes at most when they are unpacked."""
+    import numpy as np
+
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as file:
+            if sum(entry.file_size for entry in file.infolist()) > most:
+                raise ValueError(f"its arrays are larger than {most} bytes")
+        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+            return {name: stored[name] for name in names or stored.files}
+    except (zipfile.BadZipFile, zlib.error, *_OF_DAMAGE) as error:
+        raise ValueError(first_line(error)) from None
+
+
+def first_line(error: BaseException) -> str:
+    """Give the first line of what an error says, and no more than a line holds."""
+    line = next((line.strip() for line in str(error).splitlines() if line.strip()), "")
+    return line[:_LONGEST_LINE] or type(error).__name__
+
+
 def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFrame:
     """Read a table from a Parquet file."""
     import pandas as pd
@@ -114,8 +145,5 @@ def read_parquet(path: Path, columns: Sequence[str] | None = None) -> pd.DataFra
     with open_regular(path) as file:
         try:
             return pd.read_parquet(file, columns=None if columns is None else list(columns))
-        except (pa.ArrowException, MemoryError, LookupError, TypeError, AttributeError) as error:
-            said = next(iter(str(error).splitlines()), "") or type(error).__name__
-            raise ValueError(said) from None
-        except OSError as error:
-            raise ValueError(error.strerror or str(error).partition("\n")[0]) from None
+        except (pa.ArrowException, *_OF_DAMAGE) as error:
+            raise ValueError(first_line(error)) from None

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -18,12 +16,13 @@ import pandas as pd
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.files import whole_file
-from iscat_analysis.reading import read_json, read_parquet
+from iscat_analysis.reading import npz_of, read_bytes, read_json, read_parquet
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 
 GOES_ON = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
+_LARGEST_PART_BYTES = 2_000_000_000
 _NO_TRACE = (0.0,) * 9
 _NO_CLIP = (0,) * 4
 
@@ -59,9 +58,9 @@ class Checkpoint:
             return None
         table_path, path = self._paths(number)
         try:
-            with np.load(path, allow_pickle=False) as data:
-                found = read_parquet(table_path), dict(data)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+            arrays = npz_of(read_bytes(path, _LARGEST_PART_BYTES), (), _LARGEST_PART_BYTES)
+            found = read_parquet(table_path), arrays
+        except (OSError, ValueError):
             return None
         self.kept += 1
         return found

@@ -25,7 +25,7 @@ import pandas as pd
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import open_regular
+from iscat_analysis.reading import first_line, open_regular
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -286,7 +286,9 @@ def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
     except UnicodeDecodeError:
         raise DataError(f"{path}: is neither an HDF5 file nor a text file in UTF-8") from None
     except (ValueError, MemoryError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error}); export it again") from None
+        raise DataError(
+            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
+        ) from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     return {column: np.array(values) for column, values in columns.items()}

@@ -22,7 +22,7 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.reading import open_regular
+from iscat_analysis.reading import first_line, open_regular
 from iscat_analysis.records import InPlace, StackMetadata
 
 NPY_SIGNATURE = b"\x93NUMPY"
@@ -106,9 +106,8 @@ def open_npy(path: Path) -> MappedFrames:
             shape, last_first, stored = _HEADERS[version](file)
             offset = file.tell()
     except (SyntaxError, tokenize.TokenError, *WHAT_LIBRARIES_RAISE) as error:
-        said = next(iter(str(error).splitlines()), "") or type(error).__name__
         raise DataError(
-            f"{path}: begins like a NumPy array but is damaged ({said}); save it again"
+            f"{path}: begins like a NumPy array but is damaged ({first_line(error)}); save it again"
         ) from None
     return MappedFrames(path, shape, stored, offset=offset, last_first=last_first)
 

@@ -22,7 +22,7 @@ from iscat_analysis.movie.descriptions import (
 )
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.stack import ArrayFrames
-from iscat_analysis.reading import is_file
+from iscat_analysis.reading import first_line, is_file
 from iscat_analysis.records import StackMetadata
 
 _MARKS = ("zarr.json", ".zgroup", ".zarray")
@@ -58,8 +58,9 @@ def open_zarr(folder: Path, part: str) -> ArrayFrames:
     except DataError:
         raise
     except WHAT_LIBRARIES_RAISE as error:
-        said = next(iter(str(error).splitlines()), "") or type(error).__name__
-        raise DataError(f"{name}: cannot be read as Zarr ({said}); export it again") from None
+        raise DataError(
+            f"{name}: cannot be read as Zarr ({first_line(error)}); export it again"
+        ) from None
     return ArrayFrames(checked, name, metadata)
 
 

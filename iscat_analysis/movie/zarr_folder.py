@@ -22,7 +22,7 @@ from zarr.storage import LocalStore
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
-from iscat_analysis.reading import LARGEST_TEXT_BYTES
+from iscat_analysis.reading import LARGEST_TEXT_BYTES, first_line
 
 _TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
 _LARGEST_CHUNK_BYTES = 2**28
@@ -89,10 +89,9 @@ class CheckedArray:
         except DataError:
             raise
         except WHAT_LIBRARIES_RAISE as error:
-            said = next(iter(str(error).splitlines()), "") or type(error).__name__
             raise DataError(
                 f"{self._name}: frames {key.start} to {key.stop - 1} cannot be decompressed "
-                f"({said}); copy the movie again or export it again"
+                f"({first_line(error)}); copy the movie again or export it again"
             ) from None
 
 

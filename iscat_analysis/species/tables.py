@@ -26,11 +26,18 @@ import scipy
 from scipy.special import log_ndtr
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import number_in, shown
+from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import is_file, is_folder, open_regular, read_json, read_parquet
+from iscat_analysis.reading import (
+    first_line,
+    is_file,
+    is_folder,
+    open_regular,
+    read_json,
+    read_parquet,
+)
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count
@@ -240,8 +247,9 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
             )  # fmt: skip
             return table, path
     except (ValueError, OSError, MemoryError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"{path}: cannot be read as a table ({said}); export it again") from None
+        raise DataError(
+            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
+        ) from None
     try:
         return read_events(path), path
     except DataError:
@@ -335,7 +343,7 @@ def _numbers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
         return np.asarray(table[column].to_numpy(dtype=np.float64))
     except (ValueError, TypeError, OverflowError) as error:
         raise DataError(
-            f"{name}: holds in {column} what is no number ({shown(str(error))}); correct the table"
+            f"{name}: holds in {column} what is no number ({first_line(error)}); correct the table"
         ) from None
 
 
