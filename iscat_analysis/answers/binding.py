@@ -14,7 +14,7 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
-from iscat_analysis.movie.text_tables import separator, without_remarks
+from iscat_analysis.movie.text_tables import refuse_twice, separator, without_remarks
 from iscat_analysis.reading import is_file, is_folder, read_text
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
@@ -294,6 +294,8 @@ def _read_samples(path: Path) -> pd.DataFrame:
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     """Keep the rows that are samples, and give which ones they were."""
     rows = rows.rename(columns=lambda column: str(column).strip())
+    used = {column for columns in CONCENTRATIONS.values() for column in columns}
+    refuse_twice(list(rows.columns), ["path", "role", "report", "movie", *sorted(used)], name)
     kept = np.ones(len(rows), bool)
     if "role" in rows:
         role = rows["role"].fillna("sample").astype(str).str.strip()

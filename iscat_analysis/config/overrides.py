@@ -115,7 +115,7 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
     ConfigError
         As `configure` raises it.
     """
-    return configure(path, settings=list(overrides))
+    return configure(path, settings=overrides)
 
 
 def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:

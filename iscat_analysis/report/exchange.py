@@ -14,7 +14,8 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
-from iscat_analysis.reading import is_file, open_regular, read_json
+from iscat_analysis.movie.text_tables import refuse_twice
+from iscat_analysis.reading import first_line, is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
@@ -23,6 +24,8 @@ Layout = Literal["trackpy", "napari", "photomol", "picasso"]
 
 SUFFIXES = {"trackpy": ".csv", "napari": ".npy", "photomol": ".csv", "picasso": ".hdf5"}
 """Files that `export_result` writes; Picasso's has a second one, ``.yaml``, beside it."""
+
+_LARGEST_FRAME = 2**32
 
 
 @dataclass(frozen=True)
@@ -290,13 +293,13 @@ def _pixel_nm(rows: pd.DataFrame) -> float:
 
 def _events(fits: pd.DataFrame) -> pd.DataFrame:
     """Give the events that are fit to be used, by frame."""
-    _refuse_others(fits)
+    fits = _checked(fits)
     good = (fits["status"] == Status.OK) & fits["x_px"].notna() & fits["contrast"].notna()
-    return fits[good].sort_values("frame", kind="stable")
+    return _with_frames(fits[good]).sort_values("frame", kind="stable")
 
 
-def _refuse_others(fits: pd.DataFrame) -> None:
-    """Refuse what is no table of fits."""
+def _checked(fits: pd.DataFrame) -> pd.DataFrame:
+    """Refuse what is no table of fits, and give its columns of numbers as such."""
     if not isinstance(fits, pd.DataFrame):
         raise DataError(f"`fits`: is {type(fits).__name__}; give `Result.table`")
     missing = [name for name in EVENT_COLUMNS if name not in fits]
@@ -305,12 +308,42 @@ def _refuse_others(fits: pd.DataFrame) -> None:
             f"`fits`: has no column {', '.join(missing[:3])}; give `Result.table`, or fits.csv "
             "with all of its columns"
         )
+    names = [*(name for name in EVENT_COLUMNS if name not in ("status", "flags")), "track"]
+    refuse_twice(list(fits.columns), [*names, "status"], "`fits`")
+    checked = fits.copy() if fits.index.is_unique else fits.reset_index(drop=True)
+    for name in set(names) & set(fits.columns):
+        try:
+            values = fits[name].to_numpy(dtype=np.float64, na_value=np.nan)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise DataError(
+                f"`fits`: holds in {name} what is no number ({first_line(error)}); give "
+                "`Result.table`"
+            ) from None
+        whole = (values >= 0) & (values < _LARGEST_FRAME) & (values == np.floor(values))
+        if name in ("frame", "track", "event") and not (whole | np.isnan(values)).all():
+            raise DataError(
+                f"`fits`: holds {values[~whole][0]:g} in {name}, which counts from 0; give "
+                "`Result.table`"
+            )
+        if fits[name].dtype.kind not in "iuf":
+            checked[name] = values
+    return checked
+
+
+def _with_frames(rows: pd.DataFrame) -> pd.DataFrame:
+    """Refuse rows without a frame, as those of regions that are in no movie."""
+    if rows["frame"].isna().any():
+        raise DataError(
+            "`fits`: has rows without a frame, which the other program needs; number them in the "
+            "column frame"
+        )
+    return rows
 
 
 def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
     """Rows that belong to a track and have a place, by track and frame."""
-    _refuse_others(fits)
+    fits = _checked(fits)
     numbers = track_numbers(fits)
     known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
-    rows = fits[known].assign(particle=numbers[known].astype("int64"))
+    rows = _with_frames(fits[known]).assign(particle=numbers[known].astype("int64"))
     return rows.sort_values(["particle", "frame"], kind="stable")
