@@ -298,7 +298,7 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     refuse_twice(list(rows.columns), ["path", "role", "report", "movie", *sorted(used)], name)
     kept = np.ones(len(rows), bool)
     if "role" in rows:
-        role = rows["role"].fillna("sample").astype(str).str.strip()
+        role = rows["role"].astype(object).fillna("sample").astype(str).str.strip()
         kept = role.eq("sample").to_numpy()
     if not kept.any():
         raise DataError(f"{name}: has no row of a sample")
@@ -366,7 +366,7 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
     # The movies.csv of a batch says where each result is.
     column = "report" if "report" in rows else "path"
     found = []
-    for given in rows[column].fillna("").astype(str):
+    for given in rows[column].astype(object).fillna("").astype(str):
         path = Path(given.strip())
         path = path.parent if column == "report" else path
         there = path if base is None else base / path

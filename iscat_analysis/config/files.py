@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -115,6 +115,14 @@ def config_to_toml(
     """
     if not isinstance(config, Config):
         raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
+    if not isinstance(comments, bool):
+        raise ConfigError(f"`comments`: is {type(comments).__name__}; give True or False")
+    if sections is not None and not set(sections if isinstance(sections, Iterable) else [0]) <= set(
+        Config.model_fields
+    ):
+        raise ConfigError(
+            f"`sections`: names what is no section; they are {', '.join(Config.model_fields)}"
+        )
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:

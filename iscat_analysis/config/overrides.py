@@ -148,7 +148,12 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
             raise ConfigError(
                 f'`settings` = {settings!r}: give a mapping, as in {{"optics.na": 1.42}}'
             )
-        return [_parsed(text) for text in settings]
+        texts = list(settings)
+        if not all(isinstance(text, str) for text in texts):
+            raise ConfigError(
+                "`settings`: holds what is no text; give a mapping, or texts as optics.na=1.42"
+            )
+        return [_parsed(text) for text in texts]
     found = []
     for name, value in settings.items():
         section, dot, key = str(name).partition(".")

@@ -274,7 +274,9 @@ def _row(
         return None, ["path: is empty"]
     path = _address(given, root)
     if not _is_there(path):
-        what = "is a folder, and one movie is wanted" if path.is_dir() else "there is no such file"
+        what = (
+            "is a folder, and one movie is wanted" if is_folder(path) else "there is no such file"
+        )
         wrong.append(f"path: {given}: {what}; paths are relative to {root}")
     role = str(known["role"]).lower() or "sample"
     if role not in ROLES:

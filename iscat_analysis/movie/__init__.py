@@ -112,6 +112,8 @@ def open_stack(
                 "as in camera.pixel_size_nm"
             )
         return _open_file(Path(movie))
+    if name is not None and not isinstance(name, str):
+        raise ConfigError(f"name: is {type(name).__name__}; give a text")
     if not (isinstance(movie, ArrayLike) and isinstance(movie.shape, tuple)):
         raise DataError(
             f"{type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"

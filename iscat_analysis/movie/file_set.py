@@ -14,7 +14,6 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import merge
 from iscat_analysis.movie.ome import OmeSet
 from iscat_analysis.movie.stack import Frames
-from iscat_analysis.reading import is_file
 from iscat_analysis.records import StackMetadata
 
 
@@ -57,12 +56,6 @@ class FileSet:
 def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
     """Open the files of a set, which lie beside each other."""
     files = [path.with_name(name) if name else path for name in described.files]
-    missing = [file.name for file in files if not is_file(file)]
-    if missing:
-        raise DataError(
-            f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
-            "it; keep the files of a set together, under their own names"
-        )
     with ExitStack() as opened:
         members = []
         for file in files:

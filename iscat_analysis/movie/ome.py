@@ -113,10 +113,14 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
 
 def _refuse_too_many(frames: int, files: list[str], path: Path) -> None:
     """Refuse more frames than there is room for in the files, before anything is made for them."""
-    held = 0
-    for name in files:
-        file = path.with_name(name) if name else path
-        held += file.stat().st_size if is_file(file) else 0
+    paths = [path.with_name(name) if name else path for name in files]
+    missing = [file.name for file in paths if not is_file(file)]
+    if missing:
+        raise DataError(
+            f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
+            "it; keep the files of a set together, under their own names"
+        )
+    held = sum(file.stat().st_size for file in paths)
     if frames * _LEAST_IMAGE_BYTES > held:
         raise DataError(
             f"{path}: its OME-XML describes {frames} frames, but its files beside it have {held} "

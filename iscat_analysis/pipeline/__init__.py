@@ -25,7 +25,7 @@ from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, part
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, unheard
-from iscat_analysis.inference.checks import path_in
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
@@ -100,6 +100,9 @@ def fit_stack(
         was not yet begun or not done, as the interrupt says.
     """
     stack = path_in("`stack`", stack)
+    if not isinstance(config, Config):
+        raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
+    inject = int(number_in("`inject`", inject, least=0, whole=True))
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     way = background_mode(config)

@@ -309,7 +309,7 @@ def _checked(fits: pd.DataFrame) -> pd.DataFrame:
             "with all of its columns"
         )
     names = [*(name for name in EVENT_COLUMNS if name not in ("status", "flags")), "track"]
-    refuse_twice(list(fits.columns), [*names, "status"], "`fits`")
+    refuse_twice(list(fits.columns), [*names, "status", "particle"], "`fits`")
     checked = fits.copy() if fits.index.is_unique else fits.reset_index(drop=True)
     for name in set(names) & set(fits.columns):
         try:

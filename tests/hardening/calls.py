@@ -94,6 +94,8 @@ def _spoilt_array(value: np.ndarray[Any, Any], rng: Generator) -> Any:
 
 
 def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
+    if value.empty:
+        return value
     kind, column = int(rng.integers(8)), str(rng.choice(list(value.columns)))
     if kind == 0:
         return value.drop(columns=column)
@@ -109,12 +111,17 @@ def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
         column_of[row] = cell
     changed[column] = pd.Series(list(column_of), index=changed.index, dtype=object)
     if kind > 3:
-        changed[column] = pd.to_numeric(changed[column].map(_as_float), errors="coerce")
+        changed[column] = pd.to_numeric(
+            changed[column].map(_as_float).astype(float), errors="coerce"
+        )
     return changed
 
 
 def _as_float(value: Any) -> float:
-    return float(value) if isinstance(value, (int, float)) and abs(value) < 1e309 else math.nan
+    try:
+        return float(value) if isinstance(value, (int, float)) else math.nan
+    except OverflowError:
+        return math.inf
 
 
 _SECTIONS = ("optics", "camera", "particle", "fit", "simulation", "bounds", "background", "track")
