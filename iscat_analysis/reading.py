@@ -62,7 +62,7 @@ def open_regular(path: Path, most: int | None = None) -> BinaryIO:
     try:
         handle = os.open(path, _FLAGS | getattr(os, "O_CLOEXEC", 0))
     except ValueError:
-        raise OSError(errno.EINVAL, "no file can have this name", str(path)) from None
+        raise OSError(errno.EINVAL, "this is no name of a file", str(path)) from None
     state = os.fstat(handle)
     why = errno.EINVAL, "it is a pipe or a device; give a file"
     if stat.S_ISDIR(state.st_mode):

@@ -203,10 +203,10 @@ def fit_kd(
     sources: Sequence[EventTable | pd.DataFrame | Path]
     if tables is None:
         sources = _paths(rows, base, name)
-    elif len(tables) == kept.size:
+    elif isinstance(tables, (list, tuple)) and len(tables) == kept.size:
         sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
     else:
-        raise ConfigError(f"`tables`: {len(tables)} for {kept.size} rows; give one for each")
+        raise ConfigError(f"`tables`: give a list with one for each of {kept.size} rows")
     found = [
         table if isinstance(table, EventTable)
         else event_table(
@@ -284,7 +284,7 @@ def _read_samples(path: Path) -> pd.DataFrame:
         rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
         return pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else ".")
     except OSError as error:
-        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
     except ValueError as error:
         said = str(error).splitlines()[0] if str(error) else "it is empty"

@@ -117,12 +117,12 @@ def config_to_toml(
         raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
     if not isinstance(comments, bool):
         raise ConfigError(f"`comments`: is {type(comments).__name__}; give True or False")
-    if sections is not None and not set(sections if isinstance(sections, Iterable) else [0]) <= set(
-        Config.model_fields
+    known = [*Config.model_fields]
+    if sections is not None and not (
+        isinstance(sections, Iterable)
+        and all(isinstance(name, str) and name in known for name in sections)
     ):
-        raise ConfigError(
-            f"`sections`: names what is no section; they are {', '.join(Config.model_fields)}"
-        )
+        raise ConfigError(f"`sections`: names what is no section; they are {', '.join(known)}")
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:

@@ -25,7 +25,7 @@ import pandas as pd
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import first_line, open_regular
+from iscat_analysis.reading import first_line, is_folder, open_regular
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def read_events(path: Path) -> pd.DataFrame:
             signature = file.read(len(HDF5_SIGNATURE))
             size = file.seek(0, os.SEEK_END)
     except OSError as error:
-        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give the path of one event table") from None
     if signature == HDF5_SIGNATURE:
         columns, calibration = _from_hdf5(path)

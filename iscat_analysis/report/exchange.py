@@ -14,6 +14,7 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
+from iscat_analysis.inference.checks import truth_in
 from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.reading import first_line, is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
@@ -109,6 +110,7 @@ def to_photomol(fits: pd.DataFrame, *, masses: bool = True) -> pd.DataFrame:
         ``masses_kDa``, negative for a particle that leaves; and ``sigma_mass_kda`` [kDa] and
         ``snr``, which those programs do not know and ``iscat species`` reads.
     """
+    masses = truth_in("`masses`", masses)
     rows = _events(fits)
     table = pd.DataFrame(
         {
@@ -143,7 +145,7 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
         counterpart: a picture with rings has no width of a Gaussian, and its background is divided
         out.  Events are those whose status is ok.
     """
-    rows = _tracked(fits) if tracked else _events(fits)
+    rows = _tracked(fits) if truth_in("`tracked`", tracked) else _events(fits)
     rows = rows[rows[["sigma_x_nm", "sigma_y_nm"]].notna().all(axis=1)]
     pixel = _pixel_nm(rows)
     columns: dict[str, Any] = {
