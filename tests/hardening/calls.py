@@ -39,7 +39,7 @@ def call(name: str, rng: Generator) -> None:
     """Call a public function with spoilt arguments."""
     function, arguments = _seeds()[name]
     spoilt = dict(arguments)
-    for _ in range(int(rng.integers(1, 3))):
+    for _ in range(1 if rng.random() < 0.7 else 3):
         key = str(rng.choice(list(spoilt)))
         spoilt[key] = _spoilt(spoilt[key], rng)
     function(**spoilt)
@@ -53,6 +53,10 @@ def sound(name: str) -> None:
 
 def _spoilt(value: Any, rng: Generator) -> Any:
     """Give something in place of an argument, or the argument with a wound."""
+    number = isinstance(value, (int, float, np.ndarray)) and not isinstance(value, bool)
+    if number and rng.random() < 0.5:  # what somebody might mean
+        scaled = np.asarray(value) * 10.0 ** rng.uniform(-3, 3) * rng.choice([1, 1, 1, -1])
+        return scaled if isinstance(value, np.ndarray) else type(value)(scaled)
     if rng.random() < 0.4:
         return _any(rng)
     if isinstance(value, np.ndarray):
