@@ -34,6 +34,7 @@ def _start(program: str, arguments: Sequence[str] | None) -> int:
     if arguments is None:  # the process is ours
         for name in _ALGEBRA:
             os.environ.setdefault(name, "1")
+        os.environ["MPLBACKEND"] = "Agg"  # figures are files, whatever the user's windows are
     try:
         from iscat_cli import app
 

@@ -266,6 +266,8 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
         return str(error), error.exit_status
     if _interrupted(error):
         return "interrupted", INTERRUPTED
+    if isinstance(error, OSError) and error.filename and error.strerror:
+        return f"{error.filename}: cannot be read or written ({error.strerror})", UNEXPECTED
     said = f": {error}" if str(error) else ""
     hint = "" if debug else "; run again with --debug for the traceback"
     return f"unexpected {type(error).__name__}{said}{hint}", UNEXPECTED

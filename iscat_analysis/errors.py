@@ -8,6 +8,14 @@ class IscatError(Exception):
 
     exit_status = 1
 
+    def __init__(self, *said: str) -> None:
+        super().__init__(*("; ".join(_lines(text)) for text in said))
+
+
+def _lines(text: str) -> list[str]:
+    """Part a text, in which a value or another program may have put more than one line."""
+    return [line.strip() for line in text.splitlines() if line.strip()]
+
 
 class DataError(IscatError):
     """The data cannot be analysed: says which file, what is wrong and what to do (status 1)."""

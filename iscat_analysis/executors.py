@@ -7,10 +7,11 @@ memory is that of one job, whatever else waits for it; the jobs of a lost worker
 
 from __future__ import annotations
 
-import json
 import logging
 import pickle
 import platform
+import re
+import socket
 import threading
 import uuid
 import warnings
@@ -31,6 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
+from iscat_analysis.reading import read_json
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.second_process import SecondProcess
 from iscat_analysis.threads import allotted, processors
@@ -48,6 +50,7 @@ DEPENDENCIES = (
 """Packages whose versions are part of a result."""
 
 _CONNECT_S = 4.0
+_ADDRESS = re.compile(r"(?:tcp://)?(\[[^\]/]+\]|[^:/\[]+):(\d{1,5})/?", flags=re.ASCII)
 _LOOK_S = 1.0  # between two looks at how many workers there are
 _BUSY_S = 1.0  # that a job waits where its worker is busy, before it goes to another
 _MOST_AT_ONCE = 1000
@@ -409,7 +412,7 @@ def _address_in(path: Path) -> str:
     """Read the address that a scheduler left in a file."""
     advice = "give the file that `dask scheduler --scheduler-file` writes"
     try:
-        return str(json.loads(path.read_text(encoding="utf-8"))["address"])
+        return str(read_json(path)["address"])
     except OSError as error:
         raise ConfigError(
             f"`scheduler_file` = {path}: cannot be read ({error.strerror}); {advice}"
@@ -425,12 +428,35 @@ def _connected(address: str) -> Client:
         raise ConfigError(
             f'`scheduler` = {address} needs Dask; install it with: pip install "{_LIBRARIES}"'
         ) from None
+    _refuse_silence(address)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of versions, which are compared here
             return Client(address, timeout=_CONNECT_S, set_as_default=False, name="iscat")
     except (OSError, TimeoutError, ValueError):
+        raise _unanswered(address) from None
+
+
+def _refuse_silence(address: str) -> None:
+    """Refuse an address where nobody greets as a scheduler does: Dask would wait without end."""
+    match = _ADDRESS.fullmatch(address)
+    if match is None:
         raise ConfigError(
-            f"`scheduler` = {address}: no Dask scheduler answers there; start one with "
-            "`dask scheduler`, and check address and firewall"
-        ) from None
+            f"`scheduler` = {address[:80]}: give the address of the scheduler of a Dask cluster as "
+            "tcp://10.0.0.1:8786; encrypted and other connections are not supported"
+        )
+    try:
+        with socket.create_connection((match[1].strip("[]"), int(match[2])), _CONNECT_S) as line:
+            line.settimeout(_CONNECT_S)
+            greets = bool(line.recv(1))  # a scheduler speaks first
+    except (OSError, OverflowError, UnicodeError):
+        greets = False
+    if not greets:
+        raise _unanswered(address)
+
+
+def _unanswered(address: str) -> ConfigError:
+    return ConfigError(
+        f"`scheduler` = {address}: no Dask scheduler answers there; start one with "
+        "`dask scheduler`, and check address and firewall"
+    )

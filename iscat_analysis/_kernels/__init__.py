@@ -14,11 +14,18 @@ import tempfile
 from collections.abc import Callable, Set
 from typing import Any
 
-from numba import config, njit
-from numba.core import event
+from iscat_analysis.errors import ConfigError
+
+try:
+    from numba import config, njit
+    from numba.core import event
+except ValueError as error:  # of a variable of the environment, as NUMBA_NUM_THREADS=0
+    raise ConfigError(
+        f"Numba refuses a variable of the environment ({error}): correct or unset those that "
+        "begin with NUMBA_"
+    ) from None
 
 from iscat_analysis._kernels import checksums
-from iscat_analysis.errors import ConfigError
 
 
 def _probe() -> None:

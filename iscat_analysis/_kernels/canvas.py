@@ -22,6 +22,7 @@ from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.radial import AxialTable, profile_at
 from iscat_analysis._kernels.scoring import span
 from iscat_analysis._kernels.stamp import add_stamp, stamp_gradient
+from iscat_analysis._kernels.whole import whole
 
 FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
@@ -102,7 +103,7 @@ def _with_window(lens: Lens, window: FloatArray) -> Lens:
 @kernel(_nrt=False)
 def box_of(centre_nm: float, pixel_nm: float, side: int, size: int) -> tuple[int, int]:
     """Half-open range of pixels around a place, cut off at the edge of the field."""
-    first = int(np.rint(centre_nm / pixel_nm - (side - 1) / 2))
+    first = whole(np.rint(centre_nm / pixel_nm - (side - 1) / 2), -side, size)
     return max(first, 0), min(first + side, size)
 
 

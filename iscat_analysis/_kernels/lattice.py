@@ -226,10 +226,11 @@ def sum_waves(
     for j in range(dx.size):
         r = np.sqrt(dx[j] * dx[j] + dy[j] * dy[j])
         cos, sin = (dx[j] / r, dy[j] / r) if r > 0 else (1.0, 0.0)
-        i = int(r * inv_step)
+        place = r * inv_step
         out[j] = 0.0
-        if i < intervals:
-            _quintic(flat[i], r * inv_step - i, line)
+        if place < intervals:
+            i = int(place)
+            _quintic(flat[i], place - i, line)
             _sum_azimuths(value, cos, sin, sums)
             out[j] = sums[0, 0] + sums[0, 1] + sums[1, 0] + sums[1, 1]
 
@@ -247,10 +248,11 @@ def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) ->
     for far in range(half + 1):
         for near in range(far + 1):
             r = step * np.sqrt(float(far * far + near * near))
-            i = int(r * inv_step)
-            if i >= intervals:
+            place = r * inv_step
+            if not place < intervals:
                 continue
-            _quintic(flat[i], r * inv_step - i, line)
+            i = int(place)
+            _quintic(flat[i], place - i, line)
             for ix, iy in ((far, near), (near, far)):
                 cos, sin = (ix * step / r, iy * step / r) if r > 0 else (1.0, 0.0)
                 _sum_azimuths(value, cos, sin, sums)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import DEGREE, FAST, TAPS
 from iscat_analysis._kernels.mixing import mix, mix_both
+from iscat_analysis._kernels.whole import within
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Pixels
@@ -53,13 +54,21 @@ def _ends(values: FloatArray) -> tuple[float, float]:
     return low, high
 
 
+@kernel(_nrt=False)
+def _node(lens: LatticeLens, away: float) -> float:
+    """Place on the lattice at a distance from the particle, in nodes; all of its taps are there."""
+    last = 2 * lens.half + 1 - TAPS + BEFORE
+    place: float = within(away * lens.inv_step + lens.half, float(BEFORE), float(last))
+    return place
+
+
 @kernel()
 def node_rows(lens: LatticeLens, pixels: Pixels, y_p: float) -> tuple[int, int]:
     """First row of nodes that an image needs, and how many."""
     margin = abs(pixels.offsets[-1])
     low, high = _ends(pixels.y)
-    first = int((low - margin - y_p) * lens.inv_step + lens.half) - BEFORE
-    last = int((high + margin - y_p) * lens.inv_step + lens.half) - BEFORE
+    first = int(_node(lens, low - margin - y_p)) - BEFORE
+    last = int(_node(lens, high + margin - y_p)) - BEFORE
     return first, last + TAPS - first
 
 
@@ -144,7 +153,7 @@ def interpolate_columns(
     here = FIELDS
     for sample in range(pixels.offsets.size):
         for j in range(columns):
-            place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
+            place = _node(lens, pixels.x[j] + pixels.offsets[sample] - x_p)
             left[j] = int(place) - BEFORE
             taps(lens.window, place - int(place), value[j], slope[j])
         slope *= lens.inv_step
@@ -196,7 +205,7 @@ def lattice_gradient(
     q = pixels.offsets.size
     out[:] = 0.0
     for i in range(q):
-        place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+        place = _node(lens, pixels.y[row] + pixels.offsets[i] - y_p)
         top = int(place) - BEFORE - first
         taps(lens.window, place - int(place), value, slope)
         for k in range(TAPS):
@@ -242,7 +251,7 @@ def lattice_signal(
     q = pixels.offsets.size
     out[:] = 0.0
     for i in range(q):
-        place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+        place = _node(lens, pixels.y[row] + pixels.offsets[i] - y_p)
         top = int(place) - BEFORE - first
         taps(lens.window, place - int(place), value, slope)
         for sample in range(q):
@@ -292,14 +301,14 @@ def lattice_values(
     out[:] = 0.0
     for sample in range(pixels.offsets.size):
         for j in range(columns):
-            place = (pixels.x[j] + pixels.offsets[sample] - x_p) * lens.inv_step + lens.half
+            place = _node(lens, pixels.x[j] + pixels.offsets[sample] - x_p)
             left[j] = int(place) - BEFORE
             taps(lens.window, place - int(place), value[j], slope[j])
         for k in range(channels):
             _columns(stack[k], left, value, first, strip, across[k])
         for row in range(pixels.y.size):
             for i in range(pixels.offsets.size):
-                place = (pixels.y[row] + pixels.offsets[i] - y_p) * lens.inv_step + lens.half
+                place = _node(lens, pixels.y[row] + pixels.offsets[i] - y_p)
                 top = int(place) - BEFORE - first
                 taps(lens.window, place - int(place), value[0], slope[0])
                 for k in range(channels):
@@ -321,9 +330,9 @@ def lattice_span(lens: LatticeLens, x: FloatArray, margin: float, x_p: float) ->
     """Range of the flattened lattice that an image needs."""
     side = 2 * lens.half + 1
     low, high = _ends(x)
-    first = int((low - margin - x_p) * lens.inv_step + lens.half) - BEFORE
-    last = int((high + margin - x_p) * lens.inv_step + lens.half) - BEFORE + TAPS
-    return max(first, 0) * side, min(last, side) * side
+    first = int(_node(lens, low - margin - x_p)) - BEFORE
+    last = int(_node(lens, high + margin - x_p)) - BEFORE + TAPS
+    return first * side, last * side
 
 
 @kernel()
@@ -338,7 +347,7 @@ def lattice_fields(
 ) -> None:
     """Fill the fields at one point, their first derivatives and their second in (x, y, z)."""
     h = lens.inv_step
-    px, py = dx * h + lens.half, dy * h + lens.half
+    px, py = _node(lens, dx), _node(lens, dy)
     i, j = int(px), int(py)
     wx, wy = np.zeros((3, TAPS)), np.zeros((3, TAPS))
     _bent_taps(lens.window, px - i, h, wx)

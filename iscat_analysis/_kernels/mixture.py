@@ -25,6 +25,7 @@ _LN2_HIGH, _LN2_LOW = (
     1.90821492927058770002e-10,
 )  # ln 2; the first has few digits
 _HALVES = np.exp2(-np.arange(1024.0))
+_LAST_HALF = np.uint32(_HALVES.size - 1)
 
 
 @njit(inline="always")
@@ -46,7 +47,7 @@ def _exp_falling(x: float) -> float:
     value = value * r + 0.5
     value = value * r + 1.0
     value = value * r + 1.0
-    value *= _HALVES[np.uint32(halvings) & np.uint32(1023)]  # of no number it is any
+    value *= _HALVES[np.uint32(halvings) & _LAST_HALF]  # inside the table whatever x is
     return value
 
 

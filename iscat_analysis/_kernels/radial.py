@@ -30,6 +30,7 @@ from scipy.special import j0, j1
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.vectors import LANES, Code, instructions
+from iscat_analysis._kernels.whole import whole
 
 FloatArray = NDArray[np.float64]
 
@@ -250,7 +251,7 @@ def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: F
     """Fill a range of a flattened profile by interpolation along z."""
     heights, first_nm, step_nm, kappa = axial
     place = (z_nm - first_nm) / step_nm
-    i = min(max(int(place), 0), heights.shape[0] - 2)
+    i = whole(place, 0, heights.shape[0] - 2)
     t, per = place - i, 1.0 / step_nm
     t2, t3, t4, t5, per2 = t**2, t**3, t**4, t**5, per * per
     value = 10 * t3 - 15 * t4 + 6 * t5

@@ -20,6 +20,7 @@ from iscat_analysis._kernels.quintics import (
     evaluate_slopes,
     padded,
 )
+from iscat_analysis._kernels.whole import whole
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Pixels
@@ -40,7 +41,9 @@ def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, mo
     x, y, margin = pixels.x, pixels.y, abs(pixels.offsets[-1])
     dx = max(abs(x[0] - x_p), abs(x[-1] - x_p)) + margin
     dy = max(abs(y[0] - y_p), abs(y[-1] - y_p)) + margin
-    return min(int(np.sqrt(dx * dx + dy * dy) * lens.inv_step) + 2, most)
+    distance = np.sqrt(dx * dx + dy * dy) * lens.inv_step
+    needed: int = min(whole(distance, 0, most) + 2, most)
+    return needed
 
 
 @kernel(fastmath=FAST)

@@ -29,6 +29,7 @@ from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST, TAPS
 from iscat_analysis._kernels.lattice_rows import BEFORE, taps
 from iscat_analysis._kernels.mixing import mix, mix_both
+from iscat_analysis._kernels.whole import within
 
 if TYPE_CHECKING:
     from iscat_analysis._kernels.image import Pixels
@@ -52,6 +53,20 @@ def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
     return line, (STRIP + more) * line, STRIP * line + more, STRIP * line
 
 
+@kernel(_nrt=False)
+def first_nodes(
+    profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float
+) -> tuple[float, float]:
+    """Place of the first pixel among the nodes, in nodes; those of all pixels are there."""
+    room = TAPS - BEFORE
+    last_x = profile.shape[2] - room - lens.fine * (pixels.x.size - 1)
+    last_y = profile.shape[1] - room - lens.fine * (pixels.y.size - 1)
+    x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
+    y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
+    least = float(BEFORE)
+    return within(x, least, float(last_x)), within(y, least, float(last_y))
+
+
 @kernel()
 def begin_stamp(
     profile: AnyFloatArray,
@@ -64,8 +79,7 @@ def begin_stamp(
     """Work space of an image, the weights of all of its pixels at the beginning."""
     _, block, made, strip = sizes(lens, pixels.x.size)
     w = np.empty(_WEIGHTS + lens.fine * (2 * block + 3 * made) + 4 * strip, profile.dtype)
-    x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
-    y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
+    x, y = first_nodes(profile, lens, pixels, x_p, y_p)
     i, j = int(x), int(y)
     taps(lens.window, x - i, w[:TAPS], w[TAPS : 2 * TAPS])
     taps(lens.window, y - j, w[2 * TAPS : 3 * TAPS], w[3 * TAPS : 4 * TAPS])

@@ -20,6 +20,7 @@ from iscat_analysis._kernels.stamp import (
     FloatArray,
     IntArray,
     copy_nodes,
+    first_nodes,
     mix_nodes,
     mix_nodes_both,
     sizes,
@@ -59,8 +60,7 @@ def stamp_bends(
     """Fill `out` (ny, BENDS, nx) with signal, gradient and second derivatives of an image."""
     _, block, made, strip = sizes(lens, pixels.x.size)
     weights = np.empty(6 * TAPS + 1, profile.dtype)
-    x = (pixels.x[0] - x_p) * lens.inv_step + lens.half
-    y = (pixels.y[0] - y_p) * lens.inv_step + lens.half
+    x, y = first_nodes(profile, lens, pixels, x_p, y_p)
     i, j = int(x), int(y)
     _bending_taps(lens.window, x - i, lens.inv_step, weights[: 3 * TAPS])
     _bending_taps(lens.window, y - j, lens.inv_step, weights[3 * TAPS : 6 * TAPS])

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.whole import whole
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -202,8 +203,8 @@ def ring_heights(
     rows, columns = snr.shape
     distance = max(math.hypot(xc - x0, yc - y0), ring)
     near2, far = (distance - ring) ** 2, distance + ring
-    top, bottom = max(math.floor(y0 - far), 0), max(min(math.ceil(y0 + far) + 1, rows), 0)
-    left, right = max(math.floor(x0 - far), 0), max(min(math.ceil(x0 + far) + 1, columns), 0)
+    top, bottom = whole(y0 - far, 0, rows), whole(np.ceil(y0 + far) + 1, 0, rows)
+    left, right = whole(x0 - far, 0, columns), whole(np.ceil(x0 + far) + 1, 0, columns)
     sectors = highest.size
     highest[:] = -1.0
     # closer in, a patch would cover a whole lobe of a misfit
@@ -233,5 +234,5 @@ def ring_heights(
                         peak, peak_y, peak_x = value, i, j
                 elif not twice or (i - peak_y) ** 2 + (j - peak_x) ** 2 > patch**2:
                     angle = math.atan2(i - y0, j - x0) / (2 * math.pi) + 0.5
-                    sector = int(angle * sectors) % sectors
+                    sector = whole(angle * sectors, 0, sectors) % sectors
                     highest[sector] = max(highest[sector], value)

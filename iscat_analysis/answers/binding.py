@@ -13,8 +13,9 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.inference.checks import choice_in, number_in, path_in, truth_in
-from iscat_analysis.movie.text_tables import separator, without_remarks
+from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
+from iscat_analysis.movie.text_tables import refuse_twice, separator, without_remarks
+from iscat_analysis.reading import is_file, is_folder, read_text
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.binding import binding_figure
@@ -26,7 +27,7 @@ from iscat_analysis.species.choices import Ladder
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
-from iscat_analysis.species.tables import EventTable, event_table, refuse_far
+from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 
@@ -203,10 +204,10 @@ def fit_kd(
     sources: Sequence[EventTable | pd.DataFrame | Path]
     if tables is None:
         sources = _paths(rows, base, name)
-    elif len(tables) == kept.size:
+    elif isinstance(tables, (list, tuple)) and len(tables) == kept.size:
         sources = [table for table, keep in zip(tables, kept, strict=True) if keep]
     else:
-        raise ConfigError(f"`tables`: {len(tables)} for {kept.size} rows; give one for each")
+        raise ConfigError(f"`tables`: give a list with one for each of {kept.size} rows")
     found = [
         table if isinstance(table, EventTable)
         else event_table(
@@ -276,16 +277,16 @@ def check_reaction(
         )
         raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa]")
     for mass in masses_kda:
-        number_in(f"`{names[1]}`", mass, above=0.0, what="mass in kDa")
+        mass_in(f"`{names[1]}`", mass)
 
 
 def _read_samples(path: Path) -> pd.DataFrame:
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_text(path)
         rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
         return from_table(pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else "."))
     except OSError as error:
-        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
     except ValueError as error:
         said = str(error).splitlines()[0] if str(error) else "it is empty"
@@ -295,9 +296,11 @@ def _read_samples(path: Path) -> pd.DataFrame:
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
     """Keep the rows that are samples, and give which ones they were."""
     rows = rows.rename(columns=lambda column: str(column).strip())
+    used = {column for columns in CONCENTRATIONS.values() for column in columns}
+    refuse_twice(list(rows.columns), ["path", "role", "report", "movie", *sorted(used)], name)
     kept = np.ones(len(rows), bool)
     if "role" in rows:
-        role = rows["role"].fillna("sample").astype(str).str.strip()
+        role = rows["role"].astype(object).fillna("sample").astype(str).str.strip()
         kept = role.eq("sample").to_numpy()
     if not kept.any():
         raise DataError(f"{name}: has no row of a sample")
@@ -347,7 +350,8 @@ def _totals(rows: pd.DataFrame, model: Model, name: str) -> FloatArray:
         totals = rows[list(columns)].to_numpy(dtype=np.float64)
     except ValueError as error:
         raise DataError(f"{name}: a concentration is no number ({error})") from None
-    bad = ~np.isfinite(totals).all(axis=1) | (totals < 0).any(axis=1) | (totals.sum(axis=1) <= 0)
+    possible = (totals == 0) | ((totals >= 1 / LARGEST) & (totals <= LARGEST))
+    bad = ~possible.all(axis=1) | (totals.sum(axis=1) <= 0)
     if bad.any():
         raise DataError(
             f"{name}: row {int(np.argmax(bad)) + 1} has no concentration above 0 in "
@@ -364,13 +368,14 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
     # The movies.csv of a batch says where each result is.
     column = "report" if "report" in rows else "path"
     found = []
-    for given in rows[column].fillna("").astype(str):
+    for given in rows[column].astype(object).fillna("").astype(str):
         path = Path(given.strip())
         path = path.parent if column == "report" else path
-        if base is not None and not path.is_absolute() and (base / path).exists():
-            path = base / path
+        there = path if base is None else base / path
+        if is_file(there) or is_folder(there):
+            path = there
         folder = path.with_suffix(".iscat")
-        found.append(folder if path.suffix in _MOVIES and folder.is_dir() else path)
+        found.append(folder if path.suffix in _MOVIES and is_folder(folder) else path)
     return found
 
 

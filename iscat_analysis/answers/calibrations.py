@@ -22,6 +22,7 @@ from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.optics.measured import sha256_of
+from iscat_analysis.reading import first_line, is_file, open_regular
 from iscat_analysis.records import Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
@@ -206,9 +207,9 @@ def mass_calibration(
 
 def read_contrasts(path: Path) -> pd.DataFrame:
     """Read contrasts and masses from a table of this package or of Refeyn's programs."""
-    path = path / "fits.csv" if (path / "fits.csv").is_file() else path
+    path = path / "fits.csv" if is_file(path / "fits.csv") else path
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             first = file.readline(4096)
     except OSError:
         return read_events(path)  # says what is wrong with it
@@ -229,7 +230,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
         columns = good[["contrast", "mass_kda", "sigma_mass_kda"]].astype(float)
     except (ValueError, KeyError, UnicodeDecodeError) as error:
         raise DataError(
-            f"{path}: cannot be read as fits.csv ({error}); run the fit again"
+            f"{path}: cannot be read as fits.csv ({first_line(error)}); run the fit again"
         ) from None
     relative = columns["sigma_mass_kda"] / columns["mass_kda"].abs()
     columns["sigma_contrast"] = relative * columns["contrast"].abs()

@@ -173,7 +173,7 @@ def compare_tables(
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite, known=COMPARISON_FILES)
-    if len(tables) < 2:
+    if not isinstance(tables, (list, tuple)) or len(tables) < 2:
         raise DataError("a comparison needs two tables of events, or more")
     read: list[EventTable] = []
     for number, table in enumerate(tables):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
+from iscat_analysis.reading import read_text, toml_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.species.kinetics import (
     LandingRate,
@@ -153,9 +153,9 @@ def configured_frame_rate(path: Path) -> float | None:
     """Read the frame rate off the configuration that lies beside a table."""
     folder = path if path.is_dir() else path.parent
     try:
-        text = (folder / "config.toml").read_text(encoding="utf-8")
+        text = read_text(folder / "config.toml")
         (folder / "summary.json").stat()  # missing where config.toml is not that of a result
-        found = tomllib.loads(text)["camera"]["frame_rate_hz"]
+        found = toml_of(text)["camera"]["frame_rate_hz"]
         return float(found) if float(found) > 0 else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

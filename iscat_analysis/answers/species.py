@@ -29,7 +29,7 @@ from iscat_analysis.species.choices import (
     Widths,
 )
 from iscat_analysis.species.describe import Branch
-from iscat_analysis.species.tables import EventTable, event_table, refuse_far
+from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
 from iscat_analysis.units import count
 
 SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
@@ -214,7 +214,7 @@ def choice_of(
     if k is not None:
         return Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
     if masses_kda is not None:
-        masses = [number_in("`masses_kda`", m, above=0.0, what="mass in kDa") for m in masses_kda]
+        masses = [mass_in("`masses_kda`", m) for m in masses_kda]
         if not masses:
             raise ConfigError("`masses_kda`: is empty; give masses in kDa, as in 66,132")
         if len(set(masses)) < len(masses):
@@ -230,7 +230,7 @@ def choice_of(
             which = "hold" if hold else "steps"
             raise ConfigError(f"`{which}` needs a monomer whose mass is given, as in `ladder` = 66")
         return Ladder(None, (), offset, widths=widths, background=background)
-    monomer = number_in("`ladder`", ladder, above=0.0, what="mass of a monomer in kDa")
+    monomer = mass_in("`ladder`", ladder, "mass of a monomer in kDa")
     return Ladder(monomer, tuple(rungs), offset, hold, widths, background)
 
 

@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.reading import is_file
 from iscat_analysis.records import BoolArray, FloatArray
 
 CEILING_REPEATS = 4
@@ -120,7 +121,7 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
     Shapes: result (y, x).
     """
     where = f"{path}: {key}"
-    if not path.is_file():
+    if not is_file(path):
         raise DataError(f"{where} names a file that does not exist; check the path")
     try:
         with tifffile.TiffFile(path) as tiff:

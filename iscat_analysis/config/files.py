@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -15,6 +15,7 @@ from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, read_bytes, read_text, toml_of
 from iscat_analysis.text import in_toml
 
 
@@ -30,16 +31,14 @@ class OpticsFile:
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a configuration file without validating it."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        values = tomllib.loads(text)
+        text = read_text(path)
+        values = toml_of(text)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError:
         raise ConfigError(f"{path}: is not a text file in UTF-8") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: is not valid TOML: {_explain(text, str(error))}") from None
-    except ValueError:  # a NUL in the name
-        raise ConfigError(f"{str(path)!r}: is no name of a file; check the path") from None
     _anchor_paths(values, path.parent)
     return values
 
@@ -64,7 +63,7 @@ def read_optics_file(path: Path) -> OpticsFile:
 def _check_sum(path: Path, template: Path, checksum: str) -> None:
     """Refuse a template that is not the one an optics file was written with."""
     try:
-        found = sha256(template.read_bytes()).hexdigest()
+        found = sha256(read_bytes(template, LARGEST_TEMPLATE_BYTES)).hexdigest()
     except OSError as error:
         raise ConfigError(
             f"{path}: names the template {template}, which cannot be read ({error.strerror}): keep "
@@ -117,6 +116,14 @@ def config_to_toml(
     """
     if not isinstance(config, Config):
         raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
+    if not isinstance(comments, bool):
+        raise ConfigError(f"`comments`: is {type(comments).__name__}; give True or False")
+    known = [*Config.model_fields]
+    if sections is not None and not (
+        isinstance(sections, Iterable)
+        and all(isinstance(name, str) and name in known for name in sections)
+    ):
+        raise ConfigError(f"`sections`: names what is no section; they are {', '.join(known)}")
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:

@@ -21,6 +21,7 @@ from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.values import ALL
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.reading import toml_of
 
 _RIVALS = {
     ("particle", "mass_kda"): ("diameter_nm",),
@@ -114,7 +115,7 @@ def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -
     ConfigError
         As `configure` raises it.
     """
-    return configure(path, settings=list(overrides))
+    return configure(path, settings=overrides)
 
 
 def parse_config(values: Mapping[str, Any], *, where: str = "configuration") -> Config:
@@ -147,7 +148,12 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
             raise ConfigError(
                 f'`settings` = {settings!r}: give a mapping, as in {{"optics.na": 1.42}}'
             )
-        return [_parsed(text) for text in settings]
+        texts = list(settings)
+        if not all(isinstance(text, str) for text in texts):
+            raise ConfigError(
+                "`settings`: holds what is no text; give a mapping, or texts as optics.na=1.42"
+            )
+        return [_parsed(text) for text in texts]
     found = []
     for name, value in settings.items():
         section, dot, key = str(name).partition(".")
@@ -169,7 +175,7 @@ def _parsed(text: str) -> Change:
             f"`settings` = {text}: write it as section.key=value, as in optics.na=1.42"
         )
     try:
-        value = tomllib.loads(f"value = {written}")["value"]
+        value = toml_of(f"value = {written}")["value"]
     except tomllib.TOMLDecodeError:
         value = written.strip()
     return section, key, value

@@ -15,6 +15,11 @@ from iscat_analysis.config.values import (
     length,
 )
 
+MOST_FRAMES = 10_000_000
+"""No movie that is simulated is longer; particles that move have places in all of its frames."""
+
+_MOST_PLACES = 100_000_000
+
 
 class SimulatedEvent(Section):
     """One particle that appears, and may leave."""
@@ -105,7 +110,9 @@ class Simulation(Section):
     shape: tuple[Annotated[int, Field(ge=8, le=16_384)], Annotated[int, Field(ge=8, le=16_384)]] = (
         Field((128, 128), description="rows, columns")
     )
-    frames: Annotated[int, Field(ge=2)] = Field(400, description="frames in the movie")
+    frames: Annotated[int, Field(ge=2, le=MOST_FRAMES)] = Field(
+        400, description="frames in the movie"
+    )
     photons_per_pixel: Positive = Field(
         1e4,
         description="background photoelectrons per pixel and frame; dark field: scattered photons "
@@ -136,6 +143,12 @@ class Simulation(Section):
             raise ValueError("give events or count, not both")
         if self.leavings and (self.count is None or self.leavings > self.count):
             raise ValueError(f"leavings = {self.leavings} needs a count at least as large")
+        moving = sum(mover.count for mover in self.movers)
+        if moving * self.frames > _MOST_PLACES:
+            raise ValueError(
+                f"{moving} movers in frames = {self.frames} have {moving * self.frames} places, "
+                f"more than {_MOST_PLACES}: simulate fewer, or a shorter movie"
+            )
         for number, event in enumerate(self.events):
             inside = (
                 -0.5 <= event.y_px < self.shape[0] - 0.5

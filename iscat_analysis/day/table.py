@@ -22,6 +22,7 @@ from iscat_analysis.movie.addresses import MARK, beside, split_address
 from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
 from iscat_analysis.movie.text_tables import separator
+from iscat_analysis.reading import is_file, is_folder, read_text, toml_of
 from iscat_analysis.text import printable
 
 ROLES = ("sample", "calibrant", "blank", "flat")
@@ -144,13 +145,17 @@ def _checked(
 
 
 def _address(given: str, root: Path) -> Path:
-    file, part = split_address(root / Path(given).expanduser())
+    try:
+        file, part = split_address(root / Path(given).expanduser())
+        file.resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # no such user, a NUL, links in a circle
+        raise ConfigError(f"path = {given[:80]!r} is no name of a file ({error})") from None
     return Path(f"{file.resolve()}{MARK}{part}") if part else file.resolve()
 
 
 def _is_there(address: Path) -> bool:
     path, _ = split_address(address)
-    return path.is_file() or (path.is_dir() and (path.suffix.lower() == ".zarr" or is_zarr(path)))
+    return is_file(path) or (is_folder(path) and (path.suffix.lower() == ".zarr" or is_zarr(path)))
 
 
 def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:
@@ -174,7 +179,7 @@ def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ..
 
 def _text(source: Path) -> str:
     try:
-        return source.read_text(encoding="utf-8-sig")
+        return read_text(source)
     except FileNotFoundError:
         raise ConfigError(
             f"{source}: there is no such table or folder; give a CSV or TOML file with one movie "
@@ -241,7 +246,7 @@ def _check_names(source: Path, names: Sequence[str], where: str) -> None:
 
 def _from_toml(source: Path, text: str) -> Records:
     try:
-        values = tomllib.loads(text)
+        values = toml_of(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source}: is not valid TOML: {error}") from None
     other = [name for name in values if name != "movies"]
@@ -270,7 +275,9 @@ def _row(
         return None, ["path: is empty"]
     path = _address(given, root)
     if not _is_there(path):
-        what = "is a folder, and one movie is wanted" if path.is_dir() else "there is no such file"
+        what = (
+            "is a folder, and one movie is wanted" if is_folder(path) else "there is no such file"
+        )
         wrong.append(f"path: {given}: {what}; paths are relative to {root}")
     role = str(known["role"]).lower() or "sample"
     if role not in ROLES:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
@@ -19,12 +17,14 @@ import pandas as pd
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.files import whole_file
+from iscat_analysis.reading import npz_of, read_bytes, read_json, read_parquet
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 
 GOES_ON = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
 _PART = re.compile(r"[0-9a-f]{32}-\d{5}\.(parquet|npz)(\.\d+-[0-9a-f]+\.partial)?")
+_LARGEST_PART_BYTES = 2_000_000_000
 _NO_TRACE = (0.0,) * 9
 _NO_CLIP = (0,) * 4
 
@@ -60,9 +60,9 @@ class Checkpoint:
             return None
         table_path, path = self._paths(number)
         try:
-            with np.load(path, allow_pickle=False) as data:
-                found = pd.read_parquet(table_path), dict(data)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+            arrays = npz_of(read_bytes(path, _LARGEST_PART_BYTES), (), _LARGEST_PART_BYTES)
+            found = read_parquet(table_path), arrays
+        except (OSError, ValueError):
             return None
         self.kept += 1
         return found
@@ -188,7 +188,7 @@ def parts_kept(folder: Path | None) -> Iterator[None]:
 def is_resumable(folder: Path) -> bool:
     """Whether a folder holds what an interrupted run left, and its chunks, if it finished any."""
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        summary = read_json(folder / "summary.json")
         goes_on = partial_folder(folder).is_dir() or not summary["events"]
         return bool(summary["interrupted"]) and goes_on
     except (OSError, ValueError, KeyError, TypeError):

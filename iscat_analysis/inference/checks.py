@@ -21,7 +21,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 LARGEST = 1e15
-"""No mass [kDa], light [e] or number of frames is larger; the square of one is still a number."""
+"""No mass [kDa], light [e] or number of frames is larger; the square of one is still a number.
+Nor is one that must be above 0 smaller than its reciprocal."""
 
 
 def array_of(name: str, value: ArrayLike) -> NDArray[Any]:
@@ -120,11 +121,12 @@ def number_in(
     number = math.nan if array.ndim or isinstance(value, (bool, np.bool_)) else float(array)
     low = -most if least is None else least
     if above is not None:
-        low = math.nextafter(above, math.inf)
+        low = max(low, math.nextafter(above, math.inf), above + 1 / LARGEST)
     if low <= number <= most and not (whole and number != round(number)):
         return number
     limit = f" of at least {least:g}" if least is not None else ""
     limit = f" above {above:g}" if above is not None else limit
+    limit = f" of at least {low:g}" if above is not None and above < number < low else limit
     limit = f" of at most {most:g}" if number > most else limit
     what = what or ("whole number" if whole else "number")
     raise ConfigError(f"{name} = {shown(value)}: give one {what}{limit}")

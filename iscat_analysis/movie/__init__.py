@@ -22,6 +22,7 @@ from iscat_analysis.movie.mapped_frames import open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
+from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
 
 __all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
@@ -107,7 +108,9 @@ def open_stack(
                 "as in camera.pixel_size_nm"
             )
         return _open_file(Path(movie))
-    if not isinstance(movie, ArrayLike):
+    if name is not None and not isinstance(name, str):
+        raise ConfigError(f"name: is {type(name).__name__}; give a text")
+    if not (isinstance(movie, ArrayLike) and isinstance(movie.shape, tuple)):
         raise DataError(
             f"{type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"
         )
@@ -153,7 +156,7 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
             "file, and give its path"
         )
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             signature = file.read(_SIGNATURE_BYTES)
     except FileNotFoundError:
         raise DataError(f"{path}: there is no such file; check the path") from None

@@ -10,15 +10,18 @@ import re
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.reading import is_file, is_folder
 
 MARK = "::"
-_SHAPE = re.compile(r"(?:(\d+)x)?(\d+)x(\d+),\s*(\S+)", flags=re.ASCII)
+_SHAPE = re.compile(r"(?:(\d{1,12})x)?(\d{1,9})x(\d{1,9}),\s*(\S+)", flags=re.ASCII)
 
 
 def split_address(address: Path) -> tuple[Path, str]:
     """Tell the file from the part of it."""
     head, mark, part = str(address).partition(MARK)
-    return (Path(head), part) if mark and not address.exists() else (address, "")
+    if mark and not (is_file(address) or is_folder(address)):
+        return Path(head), part
+    return address, ""
 
 
 def layout(part: str) -> tuple[int | None, int, int, str] | None:
@@ -34,7 +37,10 @@ def beside(address: Path, suffix: str) -> Path:
     """Name what is written about a movie, next to it."""
     path, part = split_address(address)
     if path.name in ("", ".."):  # the folder one is in, or the one above, has its name elsewhere
-        path = path.resolve()
+        try:
+            path = path.resolve()
+        except (RuntimeError, OSError):
+            raise DataError(f"{path}: is a link that leads back to itself") from None
     if not path.name:
         raise DataError(f"{path}: is not a movie or a table; give the path of one")
     if not part or layout(part) is not None:

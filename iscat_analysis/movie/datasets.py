@@ -18,6 +18,7 @@ from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
 
 _MOST_NAMES = 1000  # that are looked at
+_MOST_GROUPS = 8  # one inside the other, in which movies are looked for; named, they may be deeper
 _SHOWN = 5  # in a message
 
 
@@ -106,6 +107,7 @@ def _movies(reader: Hdf5Reader) -> Iterator[str]:
             except DataError:  # text, links and whatever else is no movie
                 continue
             if stored is None:
-                waiting.append(whole)
+                if whole.count("/") < _MOST_GROUPS:
+                    waiting.append(whole)
             elif _is_movie(stored) and min(stored.shape[-2:]) > 1:
                 yield whole

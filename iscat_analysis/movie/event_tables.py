@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import csv
 import math
+import os
 from array import array
 from collections.abc import Mapping
 from contextlib import closing
@@ -23,7 +24,8 @@ import pandas as pd
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.text_tables import decimal_mark, separator
+from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
+from iscat_analysis.reading import first_line, is_folder, open_regular
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -95,11 +97,11 @@ def read_events(path: Path) -> pd.DataFrame:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             signature = file.read(len(HDF5_SIGNATURE))
-        size = path.stat().st_size
+            size = file.seek(0, os.SEEK_END)
     except OSError as error:
-        what = "is a folder" if path.is_dir() else f"cannot be read ({error.strerror})"
+        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give the path of one event table") from None
     if signature == HDF5_SIGNATURE:
         columns, calibration = _from_hdf5(path)
@@ -284,7 +286,9 @@ def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
     except UnicodeDecodeError:
         raise DataError(f"{path}: is neither an HDF5 file nor a text file in UTF-8") from None
     except (ValueError, MemoryError, csv.Error) as error:
-        raise DataError(f"{path}: cannot be read as a table ({error}); export it again") from None
+        raise DataError(
+            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
+        ) from None
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     return {column: np.array(values) for column, values in columns.items()}
@@ -293,6 +297,7 @@ def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
 def _places(header: list[str], path: Path) -> dict[str, int]:
     places = {}
     for column, names in _NAMES.items():
+        refuse_twice(header, names, path)
         found = next((name for name in names if name in header), None)
         if found is not None:
             places[column] = header.index(found)

@@ -56,21 +56,17 @@ class FileSet:
 def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
     """Open the files of a set, which lie beside each other."""
     files = [path.with_name(name) if name else path for name in described.files]
-    missing = [file.name for file in files if not file.is_file()]
-    if missing:
-        raise DataError(
-            f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
-            "it; keep the files of a set together, under their own names"
-        )
     with ExitStack() as opened:
         members = []
         for file in files:
             members.append(open_member(file))
             opened.callback(members[-1].close)
+        last = np.full(len(files), -1)
+        np.maximum.at(last, described.where[:, 0], described.where[:, 1])
         for number, (file, member) in enumerate(zip(files, members, strict=True)):
             if (member.shape[1:], member.dtype) != (members[0].shape[1:], members[0].dtype):
                 raise DataError(f"{file}: has other pixels than {files[0].name}; export it again")
-            needed = int(described.where[described.where[:, 0] == number, 1].max(initial=-1)) + 1
+            needed = int(last[number]) + 1
             if needed > member.shape[0]:
                 raise DataError(
                     f"{file}: holds {member.shape[0]} images, but the description of its set says "

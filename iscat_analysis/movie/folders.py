@@ -16,6 +16,7 @@ from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
 from iscat_analysis.movie.recorded import description_of, recorded_files
 from iscat_analysis.movie.stack import Frames
 from iscat_analysis.movie.tiff import first_texts, open_tiff
+from iscat_analysis.reading import is_file
 
 _TIFF = (".tif", ".tiff", ".btf", ".tf8")
 _HDF5 = (".h5", ".hdf5")
@@ -57,11 +58,11 @@ def files_of(address: Path) -> tuple[Path, ...]:
 def members_of(address: Path) -> tuple[Path, ...]:
     """Give the files of a set, or the file or folder itself, which tell one movie from another."""
     path, part = split_address(address)
-    if path.suffix.lower() in _TIFF and path.is_file():
+    if path.suffix.lower() in _TIFF and is_file(path):
         names = _described(path, *_state(path))
         if len(names) > 1:
             members = dict.fromkeys(path.with_name(name) if name else path for name in names)
-            return tuple(file for file in {**members, path: None} if file.is_file())
+            return tuple(file for file in {**members, path: None} if is_file(file))
     return (path,) if part else recorded_files(path)
 
 

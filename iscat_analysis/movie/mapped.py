@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import struct
 from contextlib import suppress
 from functools import partial
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.reading import open_regular
 from iscat_analysis.records import InPlace
 
 WHAT_LIBRARIES_RAISE = (
@@ -29,7 +31,9 @@ _MAPPED_ALONG = 2**16
 
 def map_file(path: Path) -> mmap.mmap:
     """Map a whole file for reading."""
-    with path.open("rb") as file:
+    with open_regular(path) as file:
+        if not os.fstat(file.fileno()).st_size:
+            raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 

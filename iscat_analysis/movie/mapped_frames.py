@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import tokenize
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
+from iscat_analysis.reading import first_line, open_regular
 from iscat_analysis.records import InPlace, StackMetadata
 
 NPY_SIGNATURE = b"\x93NUMPY"
@@ -43,7 +46,7 @@ class MappedFrames:
         last_first: bool = False,
         member: bool = False,
     ) -> None:
-        if len(shape) != 3 or 0 in shape or stored.kind not in "uif":
+        if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
             raise DataError(
                 f"{path}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
                 f"shape {shape}; save the camera's counts, one frame after the other"
@@ -97,13 +100,14 @@ class MappedFrames:
 def open_npy(path: Path) -> MappedFrames:
     """Open an array that NumPy saved."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
             version = npy.read_magic(file)
             shape, last_first, stored = _HEADERS[version](file)
             offset = file.tell()
-    except WHAT_LIBRARIES_RAISE as error:
+    except (SyntaxError, tokenize.TokenError, *WHAT_LIBRARIES_RAISE) as error:
         raise DataError(
-            f"{path}: begins like a NumPy array but is damaged ({error}); save it again"
+            f"{path}: begins like a NumPy array but is damaged ({first_line(error)}); save it again"
         ) from None
     return MappedFrames(path, shape, stored, offset=offset, last_first=last_first)
 
@@ -120,7 +124,7 @@ def open_raw(path: Path, part: str) -> MappedFrames:
     frames, rows, columns, name = said
     try:
         stored = np.dtype(name)
-    except TypeError:
+    except (TypeError, ValueError, SyntaxError):
         raise DataError(
             f"{path}{MARK}{part}: {name} is no type of numbers; write uint8, uint16, float32 or, "
             f"for the larger byte first, >u2, as in {example}"

@@ -25,9 +25,13 @@ from iscat_analysis.movie.descriptions import (
     positive,
     time_axis,
 )
+from iscat_analysis.reading import is_file
 
 _OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")
 _AXES = ("T", "Z", "C")
+_LEAST_IMAGE_BYTES = 50  # of the list of tags of an image: four of twelve bytes, and what ends it
+_MOST_DIGITS = 20  # a number of more is beyond every file, and stays so when cut
+_LONGEST = 64_000_000  # characters, some hundred for each frame
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,10 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
     pixels = images[0]
     sizes = _sizes(pixels, path)
     axis = time_axis(sizes, path) or "T"
+    _refuse_too_many(sizes[axis], files, path)
+    number = {name: k for k, name in enumerate(files)}
     where = np.full((sizes[axis], 2), -1, dtype=np.int64)
+    assigned = 0
     for block in _children(pixels, "TiffData"):
         frame = _integer(block, f"First{axis}", path) or 0
         image = _integer(block, "IFD", path) or 0
@@ -92,7 +99,10 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
         planes = 1 if planes is None else planes
         if frame + planes > len(where):
             raise _damaged(path, f"a TiffData block reaches frame {frame + planes} of {len(where)}")
-        where[frame : frame + planes, 0] = files.index(_file_of(block))
+        assigned += planes
+        if assigned > len(where):
+            raise _damaged(path, f"its TiffData blocks are of more than {len(where)} frames")
+        where[frame : frame + planes, 0] = number[_file_of(block)]
         where[frame : frame + planes, 1] = np.arange(image, image + planes)
     missing = int((where < 0).any(axis=1).sum())
     if missing:
@@ -101,6 +111,23 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
             "the recording or the copy was interrupted: export it again"
         )
     return OmeSet(tuple(files), where, _hints(pixels, axis))
+
+
+def _refuse_too_many(frames: int, files: list[str], path: Path) -> None:
+    """Refuse more frames than there is room for in the files, before anything is made for them."""
+    paths = [path.with_name(name) if name else path for name in files]
+    missing = [file.name for file in paths if not is_file(file)]
+    if missing:
+        raise DataError(
+            f"{path}: is one of {len(files)} files of a movie, of which {missing[0]} is not beside "
+            "it; keep the files of a set together, under their own names"
+        )
+    held = sum(file.stat().st_size for file in paths)
+    if frames * _LEAST_IMAGE_BYTES > held:
+        raise DataError(
+            f"{path}: its OME-XML describes {frames} frames, but its files beside it have {held} "
+            "bytes in all, which cannot hold them; copy all files of the set again"
+        )
 
 
 def files_of_set(text: str, path: Path) -> tuple[str, ...]:
@@ -143,6 +170,8 @@ def _parse(text: str, path: Path) -> ElementTree.Element:
             f"{path}: its OME-XML declares a document type, which could expand without limit; "
             "export it again without one"
         )
+    if len(text) > _LONGEST:
+        raise _damaged(path, f"it has {len(text)} characters")
     try:
         return ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as error:
@@ -158,7 +187,7 @@ def _integer(element: ElementTree.Element, name: str, path: Path) -> int | None:
     if text is None:
         return None
     try:
-        value = int(text)
+        value = int(text[:_MOST_DIGITS])
     except ValueError:
         raise _damaged(path, f"{name} is {text[:20]!r}") from None
     if value < 0:
@@ -188,6 +217,7 @@ def _order(pixels: ElementTree.Element, n_images: int, path: Path) -> tuple[NDAr
     if not blocks:
         return np.arange(n_frames, dtype=np.int64), axis
     order = np.full(n_frames, -1, dtype=np.int64)
+    assigned = 0
     for block in blocks:
         image = _integer(block, "IFD", path)
         planes = _integer(block, "PlaneCount", path)
@@ -197,6 +227,9 @@ def _order(pixels: ElementTree.Element, n_images: int, path: Path) -> tuple[NDAr
         image = image or 0
         if frame + planes > n_frames or image + planes > n_images:
             raise _damaged(path, f"a TiffData block reaches frame {frame + planes} of {n_frames}")
+        assigned += planes
+        if assigned > n_frames:
+            raise _damaged(path, f"its TiffData blocks are of more than {n_frames} frames")
         order[frame : frame + planes] = np.arange(image, image + planes)
     return order, axis
 

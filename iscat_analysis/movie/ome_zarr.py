@@ -5,12 +5,10 @@ Format: OME-NGFF 0.4 and 0.5 (doi:10.1038/s41592-021-01326-w); zarr reads the ar
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
@@ -24,27 +22,15 @@ from iscat_analysis.movie.descriptions import (
 )
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.stack import ArrayFrames
+from iscat_analysis.reading import first_line, is_file
 from iscat_analysis.records import StackMetadata
 
-MARKS = ("zarr.json", ".zgroup", ".zarray")
-"""Files of which a Zarr folder has one."""
+_MARKS = ("zarr.json", ".zgroup", ".zarray")
 
 
 def is_zarr(folder: Path) -> bool:
     """Tell whether a folder is one of Zarr's."""
-    return any((folder / mark).is_file() for mark in MARKS)
-
-
-class _Frames:
-    """An array whose axes between frames and rows have length 1, without these."""
-
-    def __init__(self, array: Any) -> None:
-        self._array = array
-        self.dtype = array.dtype
-        self.shape = (array.shape[0], *array.shape[-2:])
-
-    def __getitem__(self, key: Any, /) -> NDArray[Any]:
-        return np.asarray(self._array[key]).reshape(-1, *self.shape[1:])
+    return any(is_file(folder / mark) for mark in _MARKS)
 
 
 def open_zarr(folder: Path, part: str) -> ArrayFrames:
@@ -56,20 +42,26 @@ def open_zarr(folder: Path, part: str) -> ArrayFrames:
             f"{folder}: reading Zarr takes the package zarr, which is not installed; install it "
             'with: pip install "iscat-analysis[zarr]"'
         ) from None
+    from iscat_analysis.movie.zarr_folder import CheckedArray, CheckedStore
+
     name = f"{folder}{MARK}{part}" if part else str(folder)
+    store = CheckedStore(folder)
     try:
-        node = zarr.open(str(folder), mode="r", path=part.strip("/") or None)
-        if hasattr(node, "dtype"):
-            array, metadata = node, StackMetadata()
-        else:
-            array, metadata = _of_group(node, name)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of files that are none of Zarr's
+            node = zarr.open(store, mode="r", path=part.strip("/") or None)
+            if hasattr(node, "dtype"):
+                array, metadata = node, StackMetadata()
+            else:
+                array, metadata = _of_group(node, name)
+        checked = CheckedArray(array, store, name)
     except DataError:
         raise
     except WHAT_LIBRARIES_RAISE as error:
-        raise DataError(f"{name}: cannot be read as Zarr ({error}); export it again") from None
-    if len(array.shape) > 3 and set(array.shape[1:-2]) == {1}:
-        return ArrayFrames(_Frames(array), name, metadata)
-    return ArrayFrames(array, name, metadata)
+        raise DataError(
+            f"{name}: cannot be read as Zarr ({first_line(error)}); export it again"
+        ) from None
+    return ArrayFrames(checked, name, metadata)
 
 
 def _of_group(group: Any, name: str) -> tuple[Any, StackMetadata]:

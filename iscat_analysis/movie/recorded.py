@@ -21,6 +21,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.mapped_frames import MappedFrames
+from iscat_analysis.reading import is_file, read_text
 from iscat_analysis.records import StackMetadata
 
 SUFFIXES = (".bin", ".raw")
@@ -32,7 +33,6 @@ _NUMBER = re.compile(r"\d{1,12}", flags=re.ASCII)
 _NAME = re.compile(
     r"_(\d{1,9})_(\d{1,9})_(\d{1,9})_(u?int(?:8|16|32)|float(?:32|64))(?:_|$)", flags=re.ASCII
 )
-_LARGEST_SETTINGS = 10_000_000  # bytes; a text of a few kilobytes in truth
 
 
 def description_of(path: Path) -> Path | None:
@@ -41,7 +41,7 @@ def description_of(path: Path) -> Path | None:
         return None
     for stem in dict.fromkeys((path.stem, _PART.sub("", path.stem))):
         for settings in _settings(stem, path):
-            if settings.is_file():
+            if is_file(settings):
                 return settings
     return path if _named(path) is not None else None
 
@@ -142,9 +142,7 @@ def _refuse_incomplete(values: dict[str, str], counts: dict[Path, int], settings
 def _read(settings: Path) -> dict[str, str]:
     """Read a text of keys and values."""
     try:
-        if settings.stat().st_size > _LARGEST_SETTINGS:
-            raise DataError(f"{settings}: is too long for settings; put the movie's own there")
-        text = settings.read_text(encoding="utf-8", errors="replace")
+        text = read_text(settings, errors="replace")
     except OSError as error:
         raise DataError(f"{settings}: cannot be read ({error.strerror})") from None
     pairs = (line.split("\t", 1) for line in text.splitlines() if "\t" in line)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Sequence
+
+from iscat_analysis.errors import DataError
+
 _SEPARATORS = ",;\t"
 
 
@@ -20,6 +24,16 @@ def separator(text: str) -> str:
     """
     heading = next(iter(without_remarks(text)), "")
     return max(_SEPARATORS, key=heading.count)
+
+
+def refuse_twice(names: Sequence[object], used: Collection[str], table: object) -> None:
+    """Refuse two columns of one name, of which only one can be meant."""
+    for name in used:
+        if list(names).count(name) > 1:
+            raise DataError(
+                f"{table}: has two columns of the name {name}, and only one can be meant; rename "
+                "the other"
+            )
 
 
 def decimal_mark(between: str) -> str:

@@ -26,12 +26,14 @@ from iscat_analysis._kernels.lattice import FILTER, LATTICE_STEP, lattice_half, 
 from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 
 FloatArray = NDArray[np.float64]
 
 _KEPT = 4  # lattices at hand, one for each number of orders
 _SLOW = 1e-3  # a rate [rad/nm] for tables along z, where nothing changes
 _STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
+_LARGEST = 1e9  # of its numbers
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 
@@ -58,7 +60,7 @@ class Template:
     def read(cls, path: Path) -> Template:
         """Read what `to_bytes` gave."""
         try:
-            content = path.read_bytes()
+            content = read_bytes(path, LARGEST_TEMPLATE_BYTES)
         except OSError as error:
             raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
         return _parsed(str(path), content)
@@ -86,15 +88,24 @@ def sha256_of(content: bytes) -> str:
 @lru_cache(_KEPT)
 def _parsed(name: str, content: bytes) -> Template:
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
-            values: dict[str, Any] = {key: stored[key] for key in _STORED}
-    except (KeyError, ValueError, OSError):
+        values: dict[str, Any] = dict(npz_of(content, _STORED, LARGEST_TEMPLATE_BYTES))
+        for key in _STORED[2:-1]:
+            values[key] = float(values[key])
+        values["sights"] = int(values["sights"])
+        picture, error = values["contrast"], values["sigma"]
+        numbers = [picture, error, *(values[key] for key in _STORED[2:])]
+        if not (picture.ndim == 2 and picture.shape == error.shape == picture.shape[::-1]):
+            raise ValueError("no picture")
+        if not all(bool((np.abs(number) <= _LARGEST).all()) for number in numbers):
+            raise ValueError("no numbers")
+        if not min(values["step_nm"], values["pixel_nm"], values["roi_nm"]) > 1 / _LARGEST:
+            raise ValueError("no lengths")
+        values["contrast"], values["sigma"] = picture.astype(float), error.astype(float)
+    except (ValueError, TypeError, OverflowError):
         raise ConfigError(
             f"{name}: is no template of `iscat calibrate optics --measured`"
         ) from None
-    for key in _STORED[2:-1]:
-        values[key] = float(values[key])
-    return Template(**values | {"sights": int(values["sights"])})
+    return Template(**values)
 
 
 @dataclass(frozen=True, eq=False)

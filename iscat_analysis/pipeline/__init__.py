@@ -29,7 +29,7 @@ from iscat_analysis.fitting.checkpoint import (
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, unheard
-from iscat_analysis.inference.checks import path_in
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
 from iscat_analysis.movie import Stack, beside, open_stack
 from iscat_analysis.pipeline.bound import find_bound
@@ -38,7 +38,7 @@ from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, write_report
-from iscat_analysis.report.output import claim_output
+from iscat_analysis.report.output import check_output, claim_output
 from iscat_analysis.tracking.find import find_moving
 
 FIND: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
@@ -104,10 +104,14 @@ def fit_stack(
         was not yet begun or not done, as the interrupt says.
     """
     stack = path_in("`stack`", stack)
+    if not isinstance(config, Config):
+        raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
+    inject = int(number_in("`inject`", inject, least=0, whole=True))
     folder = beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     way = background_mode(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
+    check_output(folder, overwrite)
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
         with open_stack(stack) as movie:

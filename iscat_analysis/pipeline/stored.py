@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ from iscat_analysis.inference.checks import path_in
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.pipeline.redraw import Redraw, redraw
+from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import EventView
 from iscat_analysis.report.pictures import draw_view
 
@@ -88,12 +88,11 @@ class StoredResult:
         self.folder = folder
         self._movie = movie
         try:
-            self.table: pd.DataFrame = pd.read_parquet(folder / "fits.parquet")
-            text = (folder / "summary.json").read_text(encoding="utf-8")
-            self.summary: Mapping[str, Any] = json.loads(text)
+            self.table: pd.DataFrame = read_parquet(folder / "fits.parquet")
+            self.summary: Mapping[str, Any] = read_json(folder / "summary.json")
             tracked = (folder / "tracks.parquet").is_file()
             self.tracks: pd.DataFrame | None = (
-                pd.read_parquet(folder / "tracks.parquet") if tracked else None
+                read_parquet(folder / "tracks.parquet") if tracked else None
             )
         except FileNotFoundError as error:
             missing = Path(error.filename).name if error.filename else "such file"

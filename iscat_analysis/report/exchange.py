@@ -14,6 +14,9 @@ import pandas as pd
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
+from iscat_analysis.inference.checks import truth_in
+from iscat_analysis.movie.text_tables import refuse_twice
+from iscat_analysis.reading import first_line, is_file, open_regular, read_json
 from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
@@ -22,6 +25,8 @@ Layout = Literal["trackpy", "napari", "photomol", "picasso"]
 
 SUFFIXES = {"trackpy": ".csv", "napari": ".npy", "photomol": ".csv", "picasso": ".hdf5"}
 """Files that `export_result` writes; Picasso's has a second one, ``.yaml``, beside it."""
+
+_LARGEST_FRAME = 2**32
 
 
 @dataclass(frozen=True)
@@ -105,6 +110,7 @@ def to_photomol(fits: pd.DataFrame, *, masses: bool = True) -> pd.DataFrame:
         ``masses_kDa``, negative for a particle that leaves; and ``sigma_mass_kda`` [kDa] and
         ``snr``, which those programs do not know and ``iscat species`` reads.
     """
+    masses = truth_in("`masses`", masses)
     rows = _events(fits)
     table = pd.DataFrame(
         {
@@ -139,7 +145,7 @@ def to_picasso(fits: pd.DataFrame, *, tracked: bool = False) -> pd.DataFrame:
         counterpart: a picture with rings has no width of a Gaussian, and its background is divided
         out.  Events are those whose status is ok.
     """
-    rows = _tracked(fits) if tracked else _events(fits)
+    rows = _tracked(fits) if truth_in("`tracked`", tracked) else _events(fits)
     rows = rows[rows[["sigma_x_nm", "sigma_y_nm"]].notna().all(axis=1)]
     pixel = _pixel_nm(rows)
     columns: dict[str, Any] = {
@@ -166,7 +172,7 @@ def export_result(
     if layout not in get_args(Layout):
         raise ConfigError(f"layout = {layout!r}: choose one of {', '.join(get_args(Layout))}")
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out
-    if not (folder / "fits.csv").exists():
+    if not is_file(folder / "fits.csv"):
         raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
     beside = path.with_suffix(".yaml")
     for taken in [path, *([beside] if layout == "picasso" else [])]:
@@ -174,14 +180,15 @@ def export_result(
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
     if layout == "picasso" and path == beside:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
-    tracked = (folder / "tracks.csv").exists()
+    tracked = is_file(folder / "tracks.csv")
     if tracked and layout == "photomol":
         raise DataError(
             f"{folder}: holds tracks, and PhotoMol reads landings and leavings; tracks.csv has the "
             "mass of every track"
         )
     try:
-        fits = pd.read_csv(folder / "fits.csv", keep_default_na=False, na_values=[""])
+        with open_regular(folder / "fits.csv") as table:
+            fits = pd.read_csv(table, keep_default_na=False, na_values=[""])
         path.parent.mkdir(parents=True, exist_ok=True)
         if layout == "picasso":
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
@@ -253,7 +260,7 @@ def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
 def _summary(folder: Path) -> dict[str, Any]:
     """Read ``summary.json``; empty where it cannot be read."""
     try:
-        found = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        found = read_json(folder / "summary.json")
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}
@@ -288,13 +295,13 @@ def _pixel_nm(rows: pd.DataFrame) -> float:
 
 def _events(fits: pd.DataFrame) -> pd.DataFrame:
     """Give the events that are fit to be used, by frame."""
-    _refuse_others(fits)
+    fits = _checked(fits)
     good = (fits["status"] == Status.OK) & fits["x_px"].notna() & fits["contrast"].notna()
-    return fits[good].sort_values("frame", kind="stable")
+    return _with_frames(fits[good]).sort_values("frame", kind="stable")
 
 
-def _refuse_others(fits: pd.DataFrame) -> None:
-    """Refuse what is no table of fits."""
+def _checked(fits: pd.DataFrame) -> pd.DataFrame:
+    """Refuse what is no table of fits, and give its columns of numbers as such."""
     if not isinstance(fits, pd.DataFrame):
         raise DataError(f"`fits`: is {type(fits).__name__}; give `Result.table`")
     missing = [name for name in EVENT_COLUMNS if name not in fits]
@@ -303,12 +310,42 @@ def _refuse_others(fits: pd.DataFrame) -> None:
             f"`fits`: has no column {', '.join(missing[:3])}; give `Result.table`, or fits.csv "
             "with all of its columns"
         )
+    names = [*(name for name in EVENT_COLUMNS if name not in ("status", "flags")), "track"]
+    refuse_twice(list(fits.columns), [*names, "status", "particle"], "`fits`")
+    checked = fits.copy() if fits.index.is_unique else fits.reset_index(drop=True)
+    for name in set(names) & set(fits.columns):
+        try:
+            values = fits[name].to_numpy(dtype=np.float64, na_value=np.nan)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise DataError(
+                f"`fits`: holds in {name} what is no number ({first_line(error)}); give "
+                "`Result.table`"
+            ) from None
+        whole = (values >= 0) & (values < _LARGEST_FRAME) & (values == np.floor(values))
+        if name in ("frame", "track", "event") and not (whole | np.isnan(values)).all():
+            raise DataError(
+                f"`fits`: holds {values[~whole][0]:g} in {name}, which counts from 0; give "
+                "`Result.table`"
+            )
+        if fits[name].dtype.kind not in "iuf":
+            checked[name] = values
+    return checked
+
+
+def _with_frames(rows: pd.DataFrame) -> pd.DataFrame:
+    """Refuse rows without a frame, as those of regions that are in no movie."""
+    if rows["frame"].isna().any():
+        raise DataError(
+            "`fits`: has rows without a frame, which the other program needs; number them in the "
+            "column frame"
+        )
+    return rows
 
 
 def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
     """Rows that belong to a track and have a place, by track and frame."""
-    _refuse_others(fits)
+    fits = _checked(fits)
     numbers = track_numbers(fits)
     known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
-    rows = fits[known].assign(particle=numbers[known].astype("int64"))
+    rows = _with_frames(fits[known]).assign(particle=numbers[known].astype("int64"))
     return rows.sort_values(["particle", "frame"], kind="stable")

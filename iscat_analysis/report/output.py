@@ -123,9 +123,12 @@ def atomic_folder(
 def _resolved(folder: Path) -> Path:
     """Resolve links and ``..``; the folders on the way need not exist."""
     try:
-        return folder.resolve()
-    except (OSError, RuntimeError) as error:  # RuntimeError: links in a circle, before 3.13
+        target = folder.resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # RuntimeError: links in a circle
         raise DataError(f"{folder}: cannot be found ({error}); choose another `out`") from None
+    if not target.name:
+        raise DataError(f"{folder}: is the root of all folders; choose another `out`")
+    return target
 
 
 def _short(target: Path) -> str:

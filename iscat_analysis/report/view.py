@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.reading import is_file, is_folder
 
 PAGES = (
     "report.html", "batch.html", "camera.html", "calibration.html", "optics.html", "template.html",
@@ -15,18 +16,18 @@ PAGES = (
 
 def page_of(result: Path) -> Path:
     """Find the page of a result."""
-    if result.suffix.lower() in (".html", ".htm") and result.is_file():
+    if result.suffix.lower() in (".html", ".htm") and is_file(result):
         return result
-    folder = result.with_suffix(".iscat") if result.is_file() else result
-    found = [folder / name for name in PAGES if (folder / name).is_file()]
+    folder = result.with_suffix(".iscat") if is_file(result) else result
+    found = [folder / name for name in PAGES if is_file(folder / name)]
     if found:
         return found[0]
-    if folder.is_dir():
+    if is_folder(folder):
         raise DataError(
             f"{folder}: holds no page ({', '.join(PAGES)}); give the output folder of iscat fit, "
             "batch, calibrate or benchmark"
         )
-    if result.is_file():
+    if is_file(result):
         raise DataError(
             f"{result}: has no result beside it ({folder.name}); analyse it with iscat fit, or "
             "give the folder of its result"

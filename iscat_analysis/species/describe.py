@@ -21,7 +21,7 @@ from iscat_analysis.species.curves import (
     curves_of,
     histogram_of,
 )
-from iscat_analysis.species.events import Efficiency, Events
+from iscat_analysis.species.events import Efficiency, Events, possible
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.units import count
 
@@ -159,7 +159,7 @@ def describe(
             f"max_species = {max_species} and draws = {draws} must be positive, and branch = "
             f"{branch!r} one of magnitude, landing, leaving"
         )
-    usable = np.isfinite(mass) & np.isfinite(sigma) & (sigma > 0)
+    usable = possible(mass, sigma)
     if branch != "magnitude":
         usable &= (mass > 0) == (branch == "landing")
     notes = []

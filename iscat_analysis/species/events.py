@@ -10,7 +10,21 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
+
+POSSIBLE_KDA = (1e-6, 1e9)
+"""Masses of particles, and errors of them, that a light microscope can tell of: a proton has 1e-3,
+a protein as large as the wavelength 1e8.  Their squares, and ratios of these, are numbers."""
+
+
+def possible(mass_kda: FloatArray, sigma_kda: FloatArray) -> BoolArray:
+    """Tell which events have a mass, of either sign, and an error that can be true.
+
+    Shapes: `mass_kda, sigma_kda` (n,), result (n,).
+    """
+    least, most = POSSIBLE_KDA
+    size = np.abs(mass_kda)
+    return np.asarray((size >= least) & (size <= most) & (sigma_kda >= least) & (sigma_kda <= most))
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ instrument's; the width of a species then holds its error.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -30,9 +29,17 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.text_tables import decimal_mark, separator
+from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
+from iscat_analysis.reading import (
+    first_line,
+    is_file,
+    is_folder,
+    open_regular,
+    read_json,
+    read_parquet,
+)
 from iscat_analysis.records import FloatArray, Status
-from iscat_analysis.species.events import Efficiency, Events
+from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count
 
 UNKNOWN_SIGMA_KDA = 1.0
@@ -46,6 +53,16 @@ _SHARP = 1e-6  # of a cut: its width
 _OURS = ("fits.parquet", "fits.csv")
 _NEAREST = 0.5  # of the lightest mass, and the heaviest over it, between which an event must lie
 _LARGEST = 2_000_000_000  # bytes
+_FRAMES, _PIXELS, _RATIOS = (0.0, 2.0**40), (0.0, 1e6), (0.0, 1e9)
+_RANGES = {
+    "mass_kda": POSSIBLE_KDA, "sigma_mass_kda": POSSIBLE_KDA,
+    "systematic_mass_kda": (0.0, POSSIBLE_KDA[1]), "contrast": _RATIOS,
+    "systematic_contrast": _RATIOS, "snr": (1e-3, _RATIOS[1]), "frame": _FRAMES, "n_after": _FRAMES,
+    "x_px": _PIXELS, "y_px": _PIXELS,
+}  # fmt: skip
+"""The columns of numbers that are used, and how large their magnitudes can be."""
+
+_USED = (*_RANGES, "status")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +84,12 @@ class EventTable:
     def events(self) -> Events:
         """Magnitudes of the masses, as fits take them."""
         return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
+
+
+def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
+    """Check the mass of a particle, or an error of one."""
+    least, most = POSSIBLE_KDA
+    return number_in(name, value, least=least, above=0.0, most=most, what=what)
 
 
 def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
@@ -100,7 +123,7 @@ def event_table(
         ("above_kda", above_kda),
     ):
         if value is not None:
-            number_in(f"`{option}`", value, above=0.0, what="mass in kDa")
+            mass_in(f"`{option}`", value)
     if limit_kda is not None and above_kda is not None:
         raise ConfigError(
             "`limit_kda` and `above_kda` are two ways to say what is missed; give one of them"
@@ -116,6 +139,7 @@ def event_table(
     else:
         table, path = _read(Path(events))
         called = name or str(events)
+    table = _checked(table, called)
     found = _usable(table, called, sigma_kda)
     efficiency, said = found.efficiency, list(found.notes)
     if above_kda is not None:
@@ -196,8 +220,8 @@ def shared_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | Non
 
 def _read(path: Path) -> tuple[pd.DataFrame, Path]:
     """Read a table of whichever program; the path of the file that was read."""
-    if path.is_dir():
-        inside = next((path / name for name in _OURS if (path / name).exists()), None)
+    if is_folder(path):
+        inside = next((path / name for name in _OURS if is_file(path / name)), None)
         if inside is None:
             raise DataError(
                 f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or a "
@@ -205,27 +229,27 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
             )
         path = inside
     try:
-        with path.open("rb") as file:
+        with open_regular(path, _LARGEST) as file:
             head = file.read(65536)
-        if path.stat().st_size > _LARGEST:
-            raise DataError(f"{path}: is too large for a table of events; check the path")
     except OSError:
         return read_events(path), path  # says what is wrong with it
     try:
         if head.startswith(b"PAR1"):
-            return pd.read_parquet(path), path
+            return read_parquet(path), path
         first = head.splitlines()[0].decode("utf-8", errors="replace") if head else ""
         between = separator(first)
         names = [name.strip() for name in first.lstrip("\ufeff").split(between)]
         if "mass_kda" in names:
+            refuse_twice(names, _USED, path)  # which pandas would rename
             table = pd.read_csv(
                 path, sep=between, decimal=decimal_mark(between),
                 keep_default_na=False, na_values=["", "nan", "NaN"],
             )  # fmt: skip
             return table, path
     except (ValueError, OSError, MemoryError) as error:
-        said = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"{path}: cannot be read as a table ({said}); export it again") from None
+        raise DataError(
+            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
+        ) from None
     try:
         return read_events(path), path
     except DataError:
@@ -242,6 +266,24 @@ def _read(path: Path) -> tuple[pd.DataFrame, Path]:
         ) from None
 
 
+def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
+    """Take the columns that are used; whatever is no possible number becomes NaN.
+
+    All that is computed later, and every kernel, gets numbers of these ranges.
+    """
+    refuse_twice(list(table.columns), _USED, name)
+    columns = {}
+    for column, (least, most) in _RANGES.items():
+        if column in table:
+            values = _numbers(table, column, name)
+            size = np.abs(values)
+            columns[column] = np.where((size >= least) & (size <= most), values, math.nan)
+    checked = pd.DataFrame(columns, index=range(len(table)))
+    if "status" in table:
+        checked["status"] = table["status"].to_numpy()
+    return checked
+
+
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
     """Take the rows that have a mass and are fit to be used."""
     if "mass_kda" not in table:
@@ -255,29 +297,31 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         if good.empty:
             raise DataError(f"{name}: holds no event with status ok")
     mass, sigma, frame, x, y = (
-        _numbers(good, column, name)
+        good[column].to_numpy() if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
     )
     if "tick" in good:  # the camera dropped frames, and time went on
         frame = _numbers(good, "tick", name)
-    known = np.isfinite(mass) & (mass != 0)
     notes = []
     if sigma_kda is not None:
         sigma = np.full(mass.shape, sigma_kda)
-    elif not np.isfinite(sigma[known]).any():
+    elif not np.isfinite(sigma[np.isfinite(mass)]).any():
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
         notes.append(
             f"{name}: its events have no errors of their own, so that the width of a species holds "
             "them; `sigma_kda` gives them one"
         )
-    known &= np.isfinite(sigma) & (sigma > 0)
+    known = possible(mass, sigma)
+    between = "between {:g} and {:g} kDa".format(*POSSIBLE_KDA)
     if not known.any():
         raise DataError(
-            f"{name}: holds no event with a mass and an error; fit the masses (mode mass or joint) "
-            "or export the table with masses"
+            f"{name}: holds no event with a mass and an error {between}; fit the masses (mode mass "
+            "or joint) or export the table with masses"
         )
     if missing := int(np.count_nonzero(~known)):
-        notes.append(f"{name}: {count(missing, 'event')} without a mass and an error left out")
+        notes.append(
+            f"{name}: {count(missing, 'event')} without a mass and an error {between} left out"
+        )
     rows = good[known]
     window = (
         int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0
@@ -296,14 +340,12 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
 
 
 def _numbers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
-    """Give a column as numbers; NaN where there is none."""
-    if column not in table:
-        return np.full(len(table), math.nan)
+    """Give a column as numbers."""
     try:
         return np.asarray(table[column].to_numpy(dtype=np.float64))
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise DataError(
-            f"{name}: holds in {column} what is no number ({error}); correct the table"
+            f"{name}: holds in {column} what is no number ({first_line(error)}); correct the table"
         ) from None
 
 
@@ -343,9 +385,9 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     threshold = _edge(snr)
     if path is not None:
         try:
-            text = (path.parent / "summary.json").read_text(encoding="utf-8")
-            stored = json.loads(text)["detection_threshold_snr"]
-            threshold = float(stored) if stored else threshold
+            summary = read_json(path.parent / "summary.json")
+            stored = float(summary["detection_threshold_snr"] or threshold)
+            threshold = stored if 0 < stored < _RATIOS[1] else threshold
         except (OSError, ValueError, KeyError, TypeError):
             pass  # no summary, or not ours: the table alone must do
     return filter_efficiency(good, threshold)

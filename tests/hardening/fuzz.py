@@ -1,12 +1,14 @@
-"""Feed the readers files that were damaged at random, and say what broke.
+"""Feed readers with files damaged at random, and public functions with bad arguments.
 
     python tests/hardening/fuzz.py --inputs 25000 --seed 1
 
-Each input is a small whole file (`samples`) after one to six mutations, made from the seed and its
-number alone, so ``--only N`` repeats input N.  A reader may return or raise `DataError`, with one
-line of text.  Anything else is a failure: another exception, a warning, the death of the process,
-more than `MEMORY_MB` of address space beyond what Python and its libraries take, or more than
-`SECONDS` for one input.  The inputs are tried in a process of their own, which is watched.
+An input is a small valid seed (`seeds`), one of whose files is missing or has one to six mutations,
+or a call of a public function with spoilt arguments (`calls`).  It is made from the seed and its
+number alone, so ``--only N`` repeats input N.  A reader or a function may return, or raise an
+`IscatError` with one line of text.  Anything else is a failure: another exception, a warning of a
+reader, the death of the process, more than `MEMORY_MB` of address space beyond what Python and its
+libraries take, or more than `SECONDS` for one input.  The inputs are tried in a process of their
+own, which is watched.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import argparse
 import logging
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -25,22 +28,22 @@ import warnings
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from hardening.samples import samples
+from hardening import calls
+from hardening.seeds import READERS, REFUSED_WHOLE, Seed, seeds
 
-from iscat_analysis.camera.counts import read_map
-from iscat_analysis.errors import DataError
-from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.errors import IscatError
 
-MEMORY_MB = 512
+MEMORY_MB = 800
 SECONDS = 60.0  # a guard against hanging; an input takes milliseconds
-KINDS = ("tiff", "map", "mp", "h5", "csv")
+KINDS = (*READERS, "call", "call", "call")
+_MISSING = 0.05  # of the seeds of several files, those that lack one
 _INTERESTING = (
     0, 1, 2, 7, 8, 127, 128, 255, 256, 32767, 32768, 65535, 65536, 2**24, 2**31 - 1, 2**31,
     2**32 - 1, 2**32, 2**40, 2**62, 2**63 - 1, 2**63, 2**64 - 1,
@@ -148,62 +151,91 @@ _MUTATIONS: tuple[Callable[[bytearray, bytes, Generator], None], ...] = (
 )  # fmt: skip
 
 
-def build(number: int, seed: int, originals: dict[str, list[bytes]]) -> tuple[str, bytes]:
+def build(number: int, seed: int, originals: dict[str, list[Seed]]) -> tuple[str, Seed]:
     """Make one input; the same numbers make the same bytes."""
     rng = np.random.default_rng([seed, number])
     kind = KINDS[number % len(KINDS)]
-    files = originals[kind]
-    return kind, mutated(
-        files[int(rng.integers(len(files)))], files[int(rng.integers(len(files)))], rng
-    )
-
-
-def consume(kind: str, path: Path) -> None:
-    """Read all that a file of this kind offers, a little at a time."""
-    if kind in ("tiff", "mp"):
-        with open_stack(path) as stack:
-            repr(stack)
-            for _ in stack.chunks(memory_mb=16):
-                pass
-    elif kind == "map":
-        read_map(path, "camera.gain_e_per_adu", (12, 14))
+    if kind == "call":
+        names = calls.names()
+        return names[int(rng.integers(len(names)))], {}
+    kept = originals[kind]
+    files = dict(kept[int(rng.integers(len(kept)))])
+    name = list(files)[int(rng.integers(len(files)))]
+    if len(files) > 1 and rng.random() < _MISSING:
+        del files[name]
     else:
-        read_events(path)
+        other = list(kept[int(rng.integers(len(kept)))].values())
+        files[name] = mutated(files[name], other[int(rng.integers(len(other)))], rng)
+    return kind, files
 
 
-def verdict(kind: str, path: Path) -> str:
+def _put(files: Seed, folder: Path) -> None:
+    """Write an input into an empty folder."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def attempt(kind: str, first: str, folder: Path, rng: Generator) -> str:
     """Try one input: ``"read"``, ``"refused"``, or the traceback of what must not happen."""
+
+    def work() -> None:
+        if kind in READERS:
+            READERS[kind](folder / first)
+        else:
+            calls.call(kind, rng)
+
     with warnings.catch_warnings(), ThreadPoolExecutor(1) as pool:
-        warnings.simplefilter("error")
-        error = pool.submit(consume, kind, path).exception()
+        warnings.simplefilter("error" if kind in READERS else "ignore")
+        error = pool.submit(work).exception()
     if error is None:
         return "read"
-    if not isinstance(error, DataError):
+    if not isinstance(error, IscatError):
         return "".join(traceback.format_exception(error))
-    return "refused" if "\n" not in str(error).strip() else f"more than one line: {error}"
+    return "refused" if len(str(error).strip().splitlines()) == 1 else f"not one line: {error}"
+
+
+def _try_undamaged(originals: dict[str, list[Seed]], folder: Path) -> None:
+    """Import, compile and try everything before memory is limited."""
+    for kind, kept in originals.items():
+        for number, files in enumerate(kept):
+            here = folder / f"{kind}{number}"
+            _put(files, here)
+            outcome = attempt(kind, next(iter(files)), here, np.random.default_rng(0))
+            if outcome != ("refused" if kind in REFUSED_WHOLE else "read"):
+                raise SystemExit(f"the undamaged {kind} seed {number} is not read: {outcome}")
+    for name in calls.names():
+        with suppress(IscatError):  # of what is not there
+            calls.sound(name)
 
 
 def _work(first: int, stop: int, seed: int, folder: Path) -> None:
     """Try inputs and report on stdout; runs in a process of its own."""
     logging.disable()
-    originals = samples(folder)
-    path = folder / "input"
-    for kind, files in originals.items():  # everything is imported and tried before the limit
-        for data in files:
-            path.write_bytes(data)
-            outcome = verdict(kind, path)
-            if outcome != "read":
-                raise SystemExit(f"the undamaged {kind} sample is not read: {outcome}")
+    report = os.fdopen(os.dup(1), "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # of what is called
+    originals = seeds(folder)
+    os.chdir(folder)
+    _try_undamaged(originals, folder)
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
     limit = taken + MEMORY_MB * 1_000_000
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     for number in range(first, stop):
-        kind, data = build(number, seed, originals)
-        path.write_bytes(data)
+        kind, files = build(number, seed, originals)
+        here = folder / "here"
+        here.mkdir()
+        _put(files, here)
+        main = next(iter(originals[kind][0])) if len(originals.get(kind, ())) == 1 else ""
+        os.chdir(here)
         signal.alarm(int(SECONDS))  # kills: a loop inside a C library sees no exception
-        outcome = verdict(kind, path)
+        outcome = attempt(
+            kind, main or next(iter(files), ""), here, np.random.default_rng([seed, number, 1])
+        )
         signal.alarm(0)
-        print(number, kind, repr(outcome), flush=True)
+        os.chdir(folder)
+        shutil.rmtree(here)
+        print(number, kind, repr(outcome), file=report, flush=True)
 
 
 def run(inputs: int, seed: int, first: int = 0) -> tuple[Counter[tuple[str, str]], list[str]]:
@@ -228,11 +260,14 @@ def run(inputs: int, seed: int, first: int = 0) -> tuple[Counter[tuple[str, str]
     counts: Counter[tuple[str, str]] = Counter()
     failures: list[str] = []
     number, stop = first, first + inputs
+    environment = os.environ | {"MALLOC_ARENA_MAX": "2", "OPENBLAS_NUM_THREADS": "1"}
     while number < stop:
         with tempfile.TemporaryDirectory() as folder:
             command = [sys.executable, __file__, "--work", folder, "--first", str(number)]
             command += ["--inputs", str(stop - number), "--seed", str(seed)]
-            with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as worker:
+            with subprocess.Popen(
+                command, stdout=subprocess.PIPE, text=True, env=environment
+            ) as worker:
                 for line in worker.stdout or ():
                     text, kind, outcome = line.rstrip("\n").split(" ", 2)
                     number = int(text) + 1
@@ -274,15 +309,19 @@ def main() -> int:
         return 0
     if options.only is not None:
         with tempfile.TemporaryDirectory() as folder:
-            kind, data = build(options.only, options.seed, samples(Path(folder)))
-            path = Path(folder) / "input"
-            path.write_bytes(data)
-            print(kind, verdict(kind, path))
+            kind, files = build(options.only, options.seed, seeds(Path(folder)))
+            here = Path(folder) / "here"
+            here.mkdir()
+            _put(files, here)
+            os.chdir(here)
+            rng = np.random.default_rng([options.seed, options.only, 1])
+            print(kind, attempt(kind, next(iter(files), ""), here, rng))
+            os.chdir("/")
         return 0
     begin = time.perf_counter()
     counts, failures = run(options.inputs, options.seed, options.first)
     for (kind, word), count in sorted(counts.items()):
-        print(f"{kind:6} {word:8} {count}")
+        print(f"{kind:21} {word:8} {count}")
     for text in failures[: options.show]:
         print(text)
     print(

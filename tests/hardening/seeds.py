@@ -1,0 +1,251 @@
+"""What the fuzzer damages, and what reads it: small valid files of every kind that is read.
+
+A seed is a dictionary of files by their paths; the first one is what a reader is given, or the
+folder that holds it where the seed is a folder.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pandas as pd
+import tifffile
+import zarr
+from hardening.samples import samples
+from tiff_files import movie
+
+from iscat_analysis.answers.binding import fit_kd
+from iscat_analysis.answers.calibrations import read_contrasts
+from iscat_analysis.answers.species import find_species
+from iscat_analysis.camera.counts import read_map
+from iscat_analysis.config import Config, config_to_toml, load_config
+from iscat_analysis.day.table import read_table
+from iscat_analysis.executors import open_place
+from iscat_analysis.movie import open_stack
+from iscat_analysis.movie.event_tables import read_events
+from iscat_analysis.optics.measured import Template
+from iscat_analysis.pipeline.stored import open_result
+from iscat_analysis.reading import read_json, read_parquet
+
+Seed = dict[str, bytes]
+Reader = Callable[[Path], Any]
+
+_FRAMES = movie(6, 12, 14)
+
+
+def seeds(folder: Path) -> dict[str, list[Seed]]:
+    """Make valid files of every kind."""
+    found = {kind: [{"input": data} for data in files] for kind, files in samples(folder).items()}
+    found["npy"] = [{"input": _npy(a)} for a in (_FRAMES, _FRAMES.astype(">u2"), _FRAMES.T.T)]
+    found["npy"].append({"input": _npy(np.asfortranarray(_FRAMES.astype("f4")))})
+    found["zarr"] = [_zarr(folder / f"{k}.zarr", **options) for k, options in enumerate(_LAYOUTS)]
+    found["dataset"] = [_dataset(folder / "sample", **options) for options in _DATASETS]
+    found["set"] = [_ome_set()]
+    settings = "save/frame/shape\t(12, 14)\nsave/frame/dtype\t<u2\nsave/saved\t6\n"
+    raw = _FRAMES.astype("<u2").tobytes()
+    found["raw"] = [{"movie.bin": raw, "movie_settings.dat": settings.encode()}]
+    found["toml"] = [{"input": text.encode()} for text in _configurations()]
+    found["table"] = [*_tables()]
+    found["samples"] = [{"input": text.encode()} for text in _SAMPLES]
+    found["movies"] = [{name: text.encode(), "a.tif": b"II*\0"} for name, text in _MOVIES.items()]
+    found["contrasts"] = [{"input": _fits().to_csv(index=False).encode()}]
+    found["result"] = [_result()]
+    found["cache"] = [_cache()]
+    template = Template(np.eye(9), np.eye(9), 40.0, 84.4, 160.0, 0.1, 5)
+    found["template"] = [{"input": template.to_bytes()}]
+    found["address"] = [{"input": b'{"type": "Scheduler", "address": "nowhere", "workers": {}}'}]
+    return found
+
+
+def _npy(array: np.ndarray[Any, Any]) -> bytes:
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
+_LAYOUTS: tuple[dict[str, Any], ...] = (
+    {"zarr_format": 2, "chunks": (3, 12, 14)},
+    {"zarr_format": 3, "chunks": (2, 6, 14)},
+    {"zarr_format": 3, "chunks": (1, 6, 7), "shards": (3, 12, 14)},
+    {"zarr_format": 3, "chunks": (6, 12, 14), "compressors": None},
+)
+
+
+def _zarr(folder: Path, **options: Any) -> Seed:
+    stored = zarr.create_array(folder, shape=_FRAMES.shape, dtype="u2", **options)
+    stored[:] = _FRAMES
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {f"m.zarr/{path.relative_to(folder)}": path.read_bytes() for path in files}
+
+
+_DATASETS: tuple[dict[str, Any], ...] = (
+    {}, {"chunks": (2, 5, 14), "compression": "gzip"}, {"chunks": (1, 12, 14), "shuffle": True},
+)  # fmt: skip
+
+
+def _dataset(path: Path, **options: Any) -> Seed:
+    with h5py.File(path, "w") as file:
+        file.create_dataset("run 3/movie", data=_FRAMES, **options)
+        file["run 3/note"] = "of Monday"
+    content = path.read_bytes()
+    path.unlink()
+    return {"input": content}
+
+
+def _ome_set() -> Seed:
+    block = '<TiffData FirstT="{}" IFD="{}"><UUID FileName="{}">urn:uuid:{}</UUID></TiffData>'
+    names = ("a.ome.tif", "b.ome.tif")
+    blocks = "".join(block.format(t, t % 3, names[t // 3], t // 3) for t in range(6))
+    text = (
+        '<?xml version="1.0"?><OME><Image ID="Image:0"><Pixels DimensionOrder="XYZCT" SizeT="6" '
+        f'SizeC="1" SizeZ="1" SizeX="14" SizeY="12" Type="uint16">{blocks}</Pixels></Image></OME>'
+    )
+    files = {}
+    for number, name in enumerate(names):
+        out = io.BytesIO()
+        part = _FRAMES[3 * number : 3 * number + 3]
+        tifffile.imwrite(out, part, description=text, metadata=None, photometric="minisblack")
+        files[name] = out.getvalue()
+    return files
+
+
+def _configurations() -> list[str]:
+    simulation = {"pixel_size_nm": 84.4, "gain_e_per_adu": 2.0}
+    return [
+        config_to_toml(Config(camera=simulation)),
+        config_to_toml(Config(), comments=False),
+        "[simulation]\nframes = 20\n[[simulation.events]]\nframe = 3\nx_px = 5.0\ny_px = 6.0\n"
+        "[[simulation.movers]]\nd_um2_s = 1.5\n[particle]\nkind = 'gold'\ndiameter_nm = 20\n",
+    ]
+
+
+def _events() -> pd.DataFrame:
+    rng = np.random.default_rng(3)
+    mass = rng.normal(np.repeat([66.0, 132.0], 15), 8.0)
+    place = rng.uniform(0, 99, (2, mass.size)).round(3)
+    return pd.DataFrame(
+        {"event": range(mass.size), "frame": np.arange(mass.size) * 7, "x_px": place[0],
+         "y_px": place[1], "mass_kda": mass.round(3), "sigma_mass_kda": 8.0,
+         "snr": (mass / 8).round(3), "contrast": (-mass * 5e-5).round(7), "status": "ok"}
+    )  # fmt: skip
+
+
+def _fits() -> pd.DataFrame:
+    return _events().assign(n_after=50, systematic_mass_kda=1.0, systematic_contrast=1e-5)
+
+
+def _parquet(table: pd.DataFrame) -> bytes:
+    out = io.BytesIO()
+    table.to_parquet(out, index=False)
+    return out.getvalue()
+
+
+def _tables() -> list[Seed]:
+    events = _events()
+    simple = events[["mass_kda"]]
+    return [
+        {"input": events.to_csv(index=False).encode()},
+        {"input": simple.to_csv(index=False, sep=";", decimal=",").encode()},
+        {"input": _parquet(_fits())},
+        {"o.iscat/fits.csv": _fits().to_csv(index=False).encode(),
+         "o.iscat/summary.json": b'{"detection_threshold_snr": 5.2}'},
+    ]  # fmt: skip
+
+
+_SAMPLES = (
+    "path,concentration_nm,role\na.csv,3,sample\nb.csv,30.5,sample\nc.csv,,blank\n",
+    "# of Monday\npath;a_nm;b_nm\na.csv;3,5;10\nb.csv;7;20\n",
+)
+_MOVIES = {
+    "movies.csv": "path,sample,role,concentration_nm,standards\na.tif,PBS,sample,3,\n",
+    "movies.toml": "[[movies]]\npath = 'a.tif'\nrole = 'calibrant'\nstandards = [66, 146.5]\n",
+}
+
+
+def _result() -> Seed:
+    return {
+        "o.iscat/summary.json": b'{"mode": "mass", "events": 30, "movie": "m.tif", "frames": 400}',
+        "o.iscat/fits.parquet": _parquet(_fits()),
+        "o.iscat/config.toml": config_to_toml(Config()).encode(),
+    }
+
+
+def _cache() -> Seed:
+    out = io.BytesIO()
+    np.savez(out, traces=np.arange(9.0), clip_frames=np.arange(3))
+    return {"part.npz": out.getvalue(), "part.parquet": _parquet(_events())}
+
+
+# ---- readers -------------------------------------------------------------------------------------
+
+
+def _frames(path: Path) -> None:
+    with open_stack(path) as stack:
+        repr(stack)
+        for _ in stack.chunks(memory_mb=16):
+            pass
+
+
+def _zarr_folder(path: Path) -> None:
+    while path.suffix != ".zarr":
+        path = path.parent
+    _frames(path)
+
+
+def _kept_part(path: Path) -> None:
+    from iscat_analysis.fitting.checkpoint import Checkpoint
+
+    part = object.__new__(Checkpoint)  # of any key
+    part._folder, part.kept = path.parent, 0
+    part._paths = lambda _: (path.with_suffix(".parquet"), path.with_suffix(".npz"))
+    part.read(0)
+
+
+def _outside(path: Path) -> None:
+    with open_place(scheduler_file=path):
+        pass
+
+
+def _parts(path: Path) -> None:
+    """Read what a result is made of, each by itself."""
+    for name, read in (("summary.json", read_json), ("fits.parquet", read_parquet)):
+        try:
+            read(path.with_name(name))
+        except (OSError, ValueError) as error:
+            if not str(error):
+                raise AssertionError("it says nothing") from error
+    open_result(path.parent)
+
+
+READERS: dict[str, Reader] = {
+    "tiff": _frames,
+    "map": lambda path: read_map(path, "camera.gain_e_per_adu", (12, 14)),
+    "mp": _frames,
+    "h5": read_events,
+    "csv": read_events,
+    "npy": _frames,
+    "zarr": _zarr_folder,
+    "dataset": _frames,
+    "set": _frames,
+    "raw": _frames,
+    "toml": load_config,
+    "table": lambda path: find_species(
+        path.parent if path.parent.suffix == ".iscat" else path, k=1, draws=0
+    ),
+    "samples": lambda path: fit_kd(path, model="ab", masses_kda=(40, 80)),
+    "movies": read_table,
+    "contrasts": read_contrasts,
+    "result": _parts,
+    "cache": _kept_part,
+    "template": Template.read,
+    "address": _outside,
+}
+"""What reads each kind of seed."""
+
+REFUSED_WHOLE = ("samples", "address")
+"""Kinds whose seeds lead to a refusal, as the files that they name are not there."""
