@@ -187,9 +187,13 @@ _ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)
 
 def _second_for(movie: Path | None, workers: int) -> SecondProcess | None:
     """Start a second process where a movie is large enough to be worth it."""
-    if movie is None or min(workers, processors()) < 2 or not movie.is_file():
+    if movie is None or min(workers, processors()) < 2:
         return None
-    return SecondProcess(_IMPORTED) if movie.stat().st_size > _LARGE_BYTES else None
+    try:
+        large = movie.is_file() and movie.stat().st_size > _LARGE_BYTES
+    except OSError:  # said in words by what opens the movie
+        return None
+    return SecondProcess(_IMPORTED) if large else None
 
 
 class DaskExecutor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from iscat_analysis.records import silent
 from iscat_analysis.threads import allotted, processors
 
 R = TypeVar("R")
+_Warned = tuple[Warning | str, type[Warning], str, int]
 
 
 class SecondProcess:
@@ -37,7 +39,10 @@ class SecondProcess:
 
     def call(self, job: Callable[..., R], /, *arguments: Any) -> R:
         """Do a job there and wait for it."""
-        return self._pool.submit(_with_half, job, *arguments).result()
+        result, warned = self._pool.submit(_with_half, job, *arguments).result()
+        for one in warned:
+            warnings.warn_explicit(*one)
+        return result
 
     def end(self) -> None:
         """End it now, whatever it does."""
@@ -79,7 +84,11 @@ def _import_all(modules: Sequence[str]) -> None:
         import_module(module)
 
 
-def _with_half(job: Callable[..., R], *arguments: Any) -> R:
-    """Do a job with half of the processors."""
-    with allotted(max(1, processors() // 2), lambda: None):
-        return job(*arguments, progress=silent)
+def _with_half(job: Callable[..., R], *arguments: Any) -> tuple[R, list[_Warned]]:
+    """Do a job with half of the processors; give what it warned of, for the first to say."""
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        allotted(max(1, processors() // 2), lambda: None),
+    ):
+        result = job(*arguments, progress=silent)
+    return result, [(one.message, one.category, one.filename, one.lineno) for one in caught]

@@ -86,13 +86,13 @@ def record(folder: str, compiled: tuple[str, ...]) -> None:
 def _replace(folder: str, digests: dict[str, str]) -> None:
     """Write the list whole, or leave it as it is."""
     with suppress(OSError):
-        file = tempfile.NamedTemporaryFile("w", dir=folder, delete=False)  # noqa: SIM115
+        handle, made = tempfile.mkstemp(dir=folder)
         try:
-            with file:
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
                 json.dump(digests, file)
-            os.replace(file.name, f"{folder}/{_LIST}")  # noqa: PTH105
+            os.replace(made, f"{folder}/{_LIST}")  # noqa: PTH105
         except OSError:
-            os.unlink(file.name)  # noqa: PTH108
+            os.unlink(made)  # noqa: PTH108
 
 
 def _listed(folder: str) -> dict[str, str]:

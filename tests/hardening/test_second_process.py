@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from jobs import warn
 
 from iscat_analysis.config import load_config
+from iscat_analysis.second_process import SecondProcess
 from iscat_analysis.study.simulate import write_stack
 
 SETUP = """
@@ -120,6 +122,15 @@ def test_two_processes_find_what_one_finds_to_the_byte(place: Path) -> None:
     assert found.keys() == expected.keys()
     assert [name for name in expected if found[name] != expected[name]] == []
     assert len(expected) > 10
+
+
+def test_warnings_of_the_second_process_are_said_by_the_first() -> None:
+    second = SecondProcess([])
+    try:
+        with pytest.warns(UserWarning, match="of the other"):
+            second.call(warn, "of the other")
+    finally:
+        second.close()
 
 
 def test_the_work_of_a_lost_process_is_done_again(place: Path) -> None:
