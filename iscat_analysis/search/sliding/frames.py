@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis._kernels.region import copy_region
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.camera.counts import Camera
@@ -294,18 +293,7 @@ def _region(
     ends = zip((rows, columns), counts.shape[1:], strict=True)
     if not all(0 <= low <= high <= size for (low, high), size in ends):
         raise IndexError(f"rows {rows} and columns {columns} of frames of shape {counts.shape[1:]}")
-    counts = np.ascontiguousarray(counts)
-    by_frame, by_row, by_pixel = counts.strides
-    shape = max(frames.stop - frames.start, 0), rows[1] - rows[0], columns[1] - columns[0]
-    region = np.empty(shape, dtype=counts.dtype)
-    copy_region(
-        counts.reshape(-1).view(np.uint8),
-        frames.start * by_frame + rows[0] * by_row + columns[0] * by_pixel,
-        (by_frame, by_row),
-        (shape[0], shape[1], shape[2] * by_pixel),
-        region.reshape(-1).view(np.uint8),
-    )
-    return region
+    return counts[frames, slice(*rows), slice(*columns)].copy()
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:
