@@ -53,13 +53,14 @@ def sound(name: str) -> None:
 
 def _spoilt(value: Any, rng: Generator) -> Any:
     """Give something in place of an argument, or the argument with a wound."""
-    number = isinstance(value, (int, float, np.ndarray)) and not isinstance(value, bool)
+    number = type(value) in (int, float) and abs(value) < 1e9
+    number = number or (isinstance(value, np.ndarray) and value.dtype.kind in "iuf")
     if number and rng.random() < 0.5:  # what somebody might mean
         scaled = np.asarray(value) * 10.0 ** rng.uniform(-3, 3) * rng.choice([1, 1, 1, -1])
         return scaled if isinstance(value, np.ndarray) else type(value)(scaled)
     if rng.random() < 0.4:
         return _any(rng)
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
         return _spoilt_array(value, rng)
     if isinstance(value, pd.DataFrame):
         return _spoilt_table(value, rng)
