@@ -223,6 +223,10 @@ def _made() -> dict[str, Call]:
         "schema": (ia.schema, {"name": "fit"}),
         "compute_bounds": (ia.compute_bounds, {"config": None, "settings": dict(small),
                                                "mode": "mass"}),
+        "forecast_optics": (
+            ia.forecast_optics,
+            {"config": folder, "settings": dict(small), "events": 60, "free": None},
+        ),
         "simulate_movie": (ia.simulate_movie, {
             "config": {}, "path": "movie.tif", "seed": 1, "settings": dict(tiny),
             "overwrite": True}),
