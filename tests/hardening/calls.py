@@ -99,7 +99,7 @@ def _spoilt_array(value: np.ndarray[Any, Any], rng: Generator) -> Any:
 
 
 def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
-    if value.empty:
+    if value.empty or not value.columns.is_unique:
         return value
     kind, column = int(rng.integers(8)), str(rng.choice(list(value.columns)))
     if kind == 0:
@@ -116,9 +116,7 @@ def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
         column_of[row] = cell
     changed[column] = pd.Series(list(column_of), index=changed.index, dtype=object)
     if kind > 3:
-        changed[column] = pd.to_numeric(
-            changed[column].map(_as_float).astype(float), errors="coerce"
-        )
+        changed[column] = changed[column].map(_as_float).astype(float)
     return changed
 
 
