@@ -11,7 +11,7 @@ import pandas as pd
 
 from iscat_analysis.answers.species import choice_of
 from iscat_analysis.errors import DataError
-from iscat_analysis.inference.checks import path_in
+from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.comparison import comparison_figure
@@ -32,6 +32,7 @@ COMPARISON_FILES = frozenset({"comparison.csv", "comparison.json", "figures"})
 Table: TypeAlias = str | Path | pd.DataFrame | EventTable
 """What may be compared."""
 
+_MOST_WORKERS = 1024
 _MOST_POOLED = 20_000  # events that choose the species
 _DRAWN = 8  # samples in the figure's left panel
 _BINS = 120
@@ -173,6 +174,8 @@ def compare_tables(
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite, known=COMPARISON_FILES)
+    if workers is not None:
+        workers = int(number_in("`workers`", workers, least=1, most=_MOST_WORKERS, whole=True))
     if not isinstance(tables, (list, tuple)) or len(tables) < 2:
         raise DataError("a comparison needs two tables of events, or more")
     read: list[EventTable] = []

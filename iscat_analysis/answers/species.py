@@ -129,8 +129,10 @@ def find_species(
         k, masses_kda, ladder, steps=steps, offset=offset, hold=hold, widths=widths,
         background=background,
     )  # fmt: skip
-    number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True)
-    number_in("`seed`", seed, least=0, whole=True)
+    draws = int(number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True))
+    seed = int(number_in("`seed`", seed, least=0, whole=True))
+    if kinetics is not None and not isinstance(kinetics, Kinetics):
+        raise ConfigError(f"`kinetics` = {shown(kinetics)}: give what `fit_kinetics` returns")
     choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:

@@ -148,7 +148,11 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
             raise ConfigError(
                 f'`settings` = {settings!r}: give a mapping, as in {{"optics.na": 1.42}}'
             )
-        texts = list(settings)
+        texts: list[Any]
+        try:
+            texts = list(settings)
+        except TypeError:  # of an array without an axis
+            texts = [settings]
         if not all(isinstance(text, str) for text in texts):
             raise ConfigError(
                 "`settings`: holds what is no text; give a mapping, or texts as optics.na=1.42"

@@ -77,7 +77,7 @@ class Table:
 
 def read_table(source: Path) -> Table:
     """Read the table of a day."""
-    if source.is_dir():
+    if is_folder(source):
         found = find_movies(source)
         if not found:
             raise ConfigError(

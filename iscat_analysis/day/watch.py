@@ -26,6 +26,7 @@ from iscat_analysis.executors import THREADS
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.folders import files_of, find_movies
+from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 
@@ -101,7 +102,7 @@ def watch(
         The folder of the batch holds something else.
     """
     place = path_in("`folder`", folder)
-    if not place.is_dir():
+    if not is_folder(place):
         raise ConfigError(f"{place}: there is no such folder; give the one movies are saved in")
     number_in("`interval_s`", interval_s, above=0.0)
     results = place / FOLDER if out is None else path_in("`out`", out)

@@ -53,13 +53,14 @@ def sound(name: str) -> None:
 
 def _spoilt(value: Any, rng: Generator) -> Any:
     """Give something in place of an argument, or the argument with a wound."""
-    number = isinstance(value, (int, float, np.ndarray)) and not isinstance(value, bool)
+    number = type(value) in (int, float) and abs(value) < 1e9
+    number = number or (isinstance(value, np.ndarray) and value.dtype.kind in "iuf")
     if number and rng.random() < 0.5:  # what somebody might mean
         scaled = np.asarray(value) * 10.0 ** rng.uniform(-3, 3) * rng.choice([1, 1, 1, -1])
         return scaled if isinstance(value, np.ndarray) else type(value)(scaled)
     if rng.random() < 0.4:
         return _any(rng)
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
         return _spoilt_array(value, rng)
     if isinstance(value, pd.DataFrame):
         return _spoilt_table(value, rng)
@@ -98,7 +99,7 @@ def _spoilt_array(value: np.ndarray[Any, Any], rng: Generator) -> Any:
 
 
 def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
-    if value.empty:
+    if value.empty or not value.columns.is_unique:
         return value
     kind, column = int(rng.integers(8)), str(rng.choice(list(value.columns)))
     if kind == 0:
@@ -115,9 +116,7 @@ def _spoilt_table(value: pd.DataFrame, rng: Generator) -> pd.DataFrame:
         column_of[row] = cell
     changed[column] = pd.Series(list(column_of), index=changed.index, dtype=object)
     if kind > 3:
-        changed[column] = pd.to_numeric(
-            changed[column].map(_as_float).astype(float), errors="coerce"
-        )
+        changed[column] = changed[column].map(_as_float).astype(float)
     return changed
 
 
@@ -222,6 +221,10 @@ def _made() -> dict[str, Call]:
         "schema": (ia.schema, {"name": "fit"}),
         "compute_bounds": (ia.compute_bounds, {"config": None, "settings": dict(small),
                                                "mode": "mass"}),
+        "forecast_optics": (
+            ia.forecast_optics,
+            {"config": folder, "settings": dict(small), "events": 60, "free": None},
+        ),
         "simulate_movie": (ia.simulate_movie, {
             "config": {}, "path": "movie.tif", "seed": 1, "settings": dict(tiny),
             "overwrite": True}),

@@ -223,6 +223,7 @@ def _block(name: str, frame: int, image: int = 0, planes: int = 1) -> str:
 def test_a_set_of_more_frames_than_its_files_can_hold(tmp_path: Path) -> None:
     blocks = _block("a.tif", 0, planes=10**8) + _block("b.tif", 10**8, planes=10**8)
     path = _ome(tmp_path / "a.tif", OME.format(2 * 10**8, blocks))
+    (tmp_path / "b.tif").write_bytes(bytes(1000))
     refuse(path, "describes 200000000 frames, but its files beside it have")
 
 
