@@ -23,9 +23,9 @@ from iscat_analysis.executors import versions
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.movie.stack import printable
-from iscat_analysis.pipeline.rows import reported_rows
+from iscat_analysis.pipeline.rows import flagged_all, reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.records import Analysis, Film, Provenance, silent
+from iscat_analysis.records import Analysis, Film, Provenance, Status, silent
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
@@ -56,6 +56,8 @@ def gather(
         further["optics"] = found.optics
     further |= extra
     table, achieved = reported_rows(found)
+    if ready.distorted:
+        table = flagged_all(table, Status.NONLINEAR)
     for doubt in (
         line_warning(config, table),
         bend_warning(scene.model.scale, table),
@@ -132,6 +134,7 @@ def gather(
         warnings=tuple(run.warnings),
         tracks=tracks,
         films=films,
+        response=ready.response.table if ready.response is not None else None,
     )
     return replace(analysis, summary=summary | species_of(scene, table))
 

@@ -30,6 +30,7 @@ OUTPUT_NAMES = frozenset(
         "summary.json",
         "config.toml",
         "posterior.nc",
+        "response.csv",
         "report.html",
         "figures",
     }
