@@ -1,9 +1,9 @@
 """The numbers of the camera, as far as the movie tells them: learned once, before anything else.
 
-What the configuration leaves at "auto" is measured from the first frames: offset and read noise from
-frames in the dark where there are some, the offset otherwise from where the light of the pixels
-ends, the gain from the noise.  What cannot be told keeps its stated assumption.  From here on the
-configuration has numbers, whatever they come from.
+What the configuration leaves at "auto" is measured from the first frames: offset and read noise
+from frames in the dark where there are some, the offset otherwise from where the light of the
+pixels ends, the gain from the noise.  What cannot be told keeps its stated assumption.  From here
+on the configuration has numbers, whatever they come from.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ _LOOKS = 24  # frames all over a movie, that tell how much light there is
 _FIRST = 64  # frames among which some may be dark
 _DARK = 0.5  # of the usual counts, below which a frame may be without light
 _LEAK = 0.01  # of the light that a dark frame may show
+_QUIET = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
@@ -153,23 +155,28 @@ def _sample(
     opening = movie.read(0, min(_FIRST, total))
     means = opening.mean(axis=(1, 2))
     dim = (means < _DARK * usual) & (means > 0)
+    dim &= means - means.min() < _LEAK * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
     counts = movie.read(span[0], min(span[1], span[0] + most))
     lit = counts.mean(axis=(1, 2)) > _DARK * usual
-    repeats = np.array([False, *(np.array_equal(a, b) for a, b in zip(counts, counts[1:]))])
+    repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
     counts = counts[lit & ~repeats]
     if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
         return counts, None
     dark = opening[dim]
-    return counts, dark if _is_dark(dark.mean(axis=0), counts.mean(axis=0)) else None
+    return counts, dark if _is_dark(dark, counts) else None
 
 
-def _is_dark(dark: FloatArray, lit: FloatArray) -> bool:
-    """Tell whether frames show nothing of the pattern of those with light.
+def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
+    """Tell whether frames have neither the noise nor the pattern of light.
 
-    Shapes: `dark` (y, x), `lit` (y, x).
+    Shapes: `dark` (k, y, x), `lit` (t, y, x).
     """
-    apart, pattern = dark - dark.mean(), lit - lit.mean()
+    as_light = _noise_adu2(lit) * float(dark.mean()) / float(lit.mean())
+    seen = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
+    if seen > _QUIET * as_light:
+        return False
+    apart, pattern = (part.mean(axis=0) - part.mean() for part in (dark, lit))
     power = float(np.sum(pattern**2))
     if power <= 0:
         return False
@@ -247,7 +254,9 @@ class _Learning:
 
     def _learn_gain(self) -> bool:
         """Measure the gain; False where it cannot be."""
-        turns = 1 if self._dark_variance is None and not np.any(self.camera.read_noise_e) else _TURNS
+        turns = (
+            1 if self._dark_variance is None and not np.any(self.camera.read_noise_e) else _TURNS
+        )
         for _ in range(turns):
             if self._dark_variance is not None:
                 gain = float(np.mean(self.camera.gain_e_per_adu))
@@ -323,7 +332,9 @@ class _Learning:
         if law.kind == "read noise" and "read_noise_e" in self.free and not dark:
             share, level = law.value, found.level
             if "gain_e_per_adu" in self.free:
-                self._set("gain_e_per_adu", gain * (1 + share), self._se["gain_e_per_adu"], MEASURED)
+                self._set(
+                    "gain_e_per_adu", gain * (1 + share), self._se["gain_e_per_adu"], MEASURED
+                )
                 level *= 1 + share
             read = math.sqrt(share * level)
             self._set("read_noise_e", read, read * law.se / (2 * share), MEASURED)

@@ -49,7 +49,8 @@ class Response:
         slope = (self.photoelectrons[1] - self.photoelectrons[0]) / (
             self.counts[1] - self.counts[0]
         )
-        return out + below * slope
+        out += below * slope
+        return out
 
     @property
     def full(self) -> float:
@@ -124,7 +125,9 @@ def read_response(path: Path) -> Response:
         raise DataError(f"{where} cannot be read as CSV ({error})") from None
     missing = [name for name in COLUMNS if name not in table]
     if missing:
-        raise DataError(f"{where} needs the columns {' and '.join(COLUMNS)}, but has no {missing[0]}")
+        raise DataError(
+            f"{where} needs the columns {' and '.join(COLUMNS)}, but has no {missing[0]}"
+        )
     try:
         counts, electrons = (table[name].to_numpy(float) for name in COLUMNS)
     except ValueError:

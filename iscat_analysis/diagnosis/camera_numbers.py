@@ -35,9 +35,11 @@ def zero_by_law(law: Law, level_e: float) -> LightZero | None:
 def law_said(known: LearnedCamera) -> tuple[str, ...]:
     """Say that counts are not in proportion to light, by which law, and what to do."""
     law = known.camera.law
-    if law is None or not (law.bent or law.kind == "other light" and law.dilutes):
+    if law is None or not (law.bent or (law.kind == "other light" and law.dilutes)):
         return ()
-    seen = "the noise and the answer to the laser's power grow" if law.flickers else "the noise grows"
+    seen = (
+        "the noise and the answer to the laser's power grow" if law.flickers else "the noise grows"
+    )
     effect = f"{_effect(1 - law.contrast)} (± {100 * law.contrast_se:.2g} %)"
     flagged = "all rows are flagged nonlinear"
     if law.kind == "other light":

@@ -14,6 +14,7 @@ from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.learner import LEAST_SIGHTS, Judgement, ParticleImage, judge
 from iscat_analysis.instrument.learner.measured_picture import (
     PictureFit,

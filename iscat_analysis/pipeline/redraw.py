@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.camera.counts import Camera, camera_from_config
-from iscat_analysis.camera.response import linear
 from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
+from iscat_analysis.camera.response import linear
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import DataError

@@ -36,7 +36,9 @@ def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, Empir
 
 def flagged_all(table: pd.DataFrame, flag: Status) -> pd.DataFrame:
     """Flag all rows of a movie with what is wrong with the movie itself."""
-    flags = [verdict([*map(Status, filter(None, text.split(";"))), flag]) for text in table["flags"]]
+    flags = [
+        verdict([*map(Status, filter(None, text.split(";"))), flag]) for text in table["flags"]
+    ]
     return table.assign(
         status=[str(worst) for worst, _ in flags], flags=[";".join(all_) for _, all_ in flags]
     )

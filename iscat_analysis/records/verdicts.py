@@ -40,8 +40,8 @@ _ADVICE = {
     Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
     "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
-    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that all "
-    "masses are wrong by the same factor: a line says by how much and why.",
+    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
+    "all masses are wrong by the same factor: a line says by how much and why.",
 }
 
 

@@ -42,7 +42,9 @@ from scipy.optimize import least_squares
 from iscat_analysis.camera.calibration.transfer import Transfer
 from iscat_analysis.records import FloatArray
 
-Kind = Literal["linear", "offset", "other light", "read noise", "noisy light", "gamma", "saturation"]
+Kind = Literal[
+    "linear", "offset", "other light", "read noise", "noisy light", "gamma", "saturation"
+]
 Curves = tuple[FloatArray, FloatArray]
 """Variance and slope, each up to a factor."""
 

@@ -115,4 +115,7 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
             found.slope[used][part].mean(),
             wider[1] * math.sqrt(found.slope_variance[used][part].mean()) / root,
         ])  # fmt: skip
-    return Transfer(*np.array(rows).T, level=level, noise=noise, flicker=flicker)
+    light, noises, noises_se, slopes, slopes_se = np.array(rows).T
+    return Transfer(
+        light, noises, noises_se, slopes, slopes_se, level=level, noise=noise, flicker=flicker
+    )
