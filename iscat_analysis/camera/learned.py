@@ -28,7 +28,7 @@ from iscat_analysis.camera.successive import averaged_noise
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import CountSource, FloatArray
+from iscat_analysis.records import CountSource
 
 MEASURED, DARK, CONFIGURED = "measured", "dark frames", "configured"
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
@@ -40,10 +40,13 @@ _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
 _LOOKS = 24  # frames all over a movie, that tell how much light there is
 _FIRST = 64  # frames among which some may be dark
 _DARK = 0.5  # of the usual counts, below which a frame may be without light
-_LEAK = 0.01  # of the light that a dark frame may show
+_LEAST = 0.01  # of the usual counts, by which dark frames may differ
+_TOLD, _LEAK = 0.1, 0.1  # of what the counts of dark frames would show, if they were light
+_BLINKS = 4.0  # times the median, of the noise of a pixel in the dark that is left out
 _QUIET = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
+_FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
 _SHAKEN = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
@@ -155,7 +158,7 @@ def _sample(
     opening = movie.read(0, min(_FIRST, total))
     means = opening.mean(axis=(1, 2))
     dim = (means < _DARK * usual) & (means > 0)
-    dim &= means - means.min() < _LEAK * usual  # and no shutter that is opening
+    dim &= means - means.min() < _LEAST * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
     counts = movie.read(span[0], min(span[1], span[0] + most))
     lit = counts.mean(axis=(1, 2)) > _DARK * usual
@@ -168,21 +171,20 @@ def _sample(
 
 
 def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
-    """Tell whether frames have neither the noise nor the pattern of light.
+    """Tell whether frames have not the pattern of light, nor its noise where that is even.
 
     Shapes: `dark` (k, y, x), `lit` (t, y, x).
     """
-    as_light = _noise_adu2(lit) * float(dark.mean()) / float(lit.mean())
-    seen = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
-    if seen > _QUIET * as_light:
-        return False
+    as_light = float(dark.mean()) / float(lit.mean())  # if all of it were light
     apart, pattern = (part.mean(axis=0) - part.mean() for part in (dark, lit))
     power = float(np.sum(pattern**2))
-    if power <= 0:
-        return False
-    share = float(np.sum(apart * pattern)) / power
-    error = math.sqrt(float(np.mean((apart - share * pattern) ** 2)) / power)
-    return abs(share) < _LEAK + 3 * error
+    share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
+    rest = float(np.mean((apart - share * pattern) ** 2))
+    error = math.sqrt(rest / power) if power > 0 else math.inf
+    if error < _TOLD * as_light:
+        return abs(share) < _LEAK * as_light + 3 * error
+    noise = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
+    return noise < _QUIET * as_light * _noise_adu2(lit)
 
 
 class _Learning:
@@ -223,8 +225,9 @@ class _Learning:
             error = float(np.std(pixels)) / math.sqrt(pixels.size)
             self._set("offset_adu", float(np.mean(pixels)), error, DARK)
         if "read_noise_e" in self.free and len(dark) > 1:
-            steps = np.diff(dark.astype(np.float64), axis=0)
-            self._dark_variance = float(np.median(np.mean(steps**2, axis=0))) / 2
+            variance = np.mean(np.diff(dark.astype(np.float64), axis=0) ** 2, axis=0) / 2
+            usual = variance < _BLINKS * np.median(variance)
+            self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
     def learn(self) -> None:
         """Learn what is free from the frames with light."""
@@ -254,10 +257,9 @@ class _Learning:
 
     def _learn_gain(self) -> bool:
         """Measure the gain; False where it cannot be."""
-        turns = (
-            1 if self._dark_variance is None and not np.any(self.camera.read_noise_e) else _TURNS
-        )
-        for _ in range(turns):
+        quiet = self._dark_variance is None and not np.any(self.camera.read_noise_e)
+        fine = _noise_adu2(self.counts) > _FINE * rounding_variance_adu2(self.counts)
+        for _ in range(1 if quiet and fine else _TURNS):  # what is no light depends on the gain
             if self._dark_variance is not None:
                 gain = float(np.mean(self.camera.gain_e_per_adu))
                 read = gain * math.sqrt(self._dark_variance)
@@ -277,8 +279,8 @@ class _Learning:
         camera, counts = self.camera, self.counts[:_GAIN_FRAMES]
         step2 = 12 * rounding_variance_adu2(counts)
         if step2 and 0 < _noise_adu2(counts) < _COARSE * step2:
-            rough = _as_stored(counts)
-            found = diagnose_gain(rough, replace(camera, read_noise_e=0.0))
+            as_stored = counts.astype(np.float64)  # of which nothing is taken off for rounding
+            found = diagnose_gain(as_stored, replace(camera, read_noise_e=0.0))
             return found.gain_e_per_adu, found.gain_se, EFFECTIVE
         found = diagnose_gain(counts, camera)
         seen = replace(camera, gain_e_per_adu=found.gain_e_per_adu)
@@ -286,9 +288,9 @@ class _Learning:
         if longer is not None:
             return found.gain_e_per_adu / longer, found.gain_se / longer, EFFECTIVE
         still = without_shaking(counts[:_FIRST], seen)
-        calm, rough_ = (_short(part, seen) for part in (still, counts[:_FIRST]))
-        if calm is not None and rough_ is not None:
-            ratio = calm.noise_ratio / rough_.noise_ratio
+        calm, rough = (_short(part, seen) for part in (still, counts[:_FIRST].astype(np.float64)))
+        if calm is not None and rough is not None:
+            ratio = calm.noise_ratio / rough.noise_ratio
             if ratio < 1 - _SHAKEN - 3 * calm.noise_ratio_se:
                 return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
@@ -369,11 +371,6 @@ def _noise_adu2(counts: NDArray[Any]) -> float:
     steps = np.diff(counts[:_FIRST].astype(np.float64), axis=0)
     steps -= steps.mean(axis=(1, 2), keepdims=True)
     return float(np.mean(steps**2)) / 2
-
-
-def _as_stored(counts: NDArray[Any]) -> NDArray[Any]:
-    """Give counts as real numbers, of whose noise nothing is taken off for rounding."""
-    return counts.astype(np.float64)
 
 
 def _short(counts: NDArray[Any], camera: Camera) -> GainDiagnosis | None:

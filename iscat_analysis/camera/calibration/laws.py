@@ -100,7 +100,8 @@ class Law:
 
     @property
     def _matters(self) -> bool:
-        return abs(1 - self.contrast) > TOLERANCE + SIGMAS * self.contrast_se
+        # that it is none of chance is known: another law describes the pixels worse
+        return abs(1 - self.contrast) > TOLERANCE + 2 * self.contrast_se
 
 
 @dataclass(frozen=True)
