@@ -15,18 +15,18 @@ Electrons = NDArray[np.float64]
 
 
 def gamma(exponent: float) -> Callable[[Electrons], Electrons]:
-    """Counts as light to a power, as where gamma is switched on."""
+    """Give counts as light to a power, as where gamma is switched on."""
     return lambda e: np.asarray(60000 * (e / (2 * LEVEL_E)) ** exponent)
 
 
 def saturation(full: float) -> Callable[[Electrons], Electrons]:
-    """Counts that approach a full scale, of so many times the mean light."""
+    """Give counts that approach a full scale, of so many times the mean light."""
     most = full * LEVEL_E
     return lambda e: np.asarray(most / 4 * -np.expm1(-e / most))
 
 
 def linear(gain: float, offset: float = 0.0) -> Callable[[Electrons], Electrons]:
-    """Counts of a camera as it should be."""
+    """Give counts of a camera as it should be."""
     return lambda e: e / gain + offset
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from iscat_analysis.camera.calibration import LightZero
-from iscat_analysis.camera.calibration.laws import Law
+from iscat_analysis.camera.calibration.laws import TOLERANCE, Law
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.learned import LearnedCamera
 from iscat_analysis.camera.metadata import GainDiagnosis
@@ -16,6 +16,9 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum
 
 _SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
+SAID = ("other light", "read noise")
+"""Laws by which noise is not what the camera's numbers predict, as `law_said` has it."""
+
 _OTHERS = {
     "offset": "an offset that is too high",
     "read noise": "read noise that is missing",
@@ -35,7 +38,15 @@ def zero_by_law(law: Law, level_e: float) -> LightZero | None:
 def law_said(known: LearnedCamera) -> tuple[str, ...]:
     """Say that counts are not in proportion to light, by which law, and what to do."""
     law = known.camera.law
-    if law is None or not (law.bent or (law.kind == "other light" and law.dilutes)):
+    if law is None:
+        return ()
+    if law.kind == "read noise" and law.value > TOLERANCE:
+        return (
+            f"in the dark the noise has {100 * law.value:.2g} ± {100 * law.se:.1g} % of the light's "
+            "variance beyond what camera.read_noise_e says: it lacks "
+            f"{math.sqrt(law.value * known.level_e):.3g} e, in squares; record a dark",
+        )
+    if not (law.bent or (law.kind == "other light" and law.dilutes)):
         return ()
     seen = (
         "the noise and the answer to the laser's power grow" if law.flickers else "the noise grows"

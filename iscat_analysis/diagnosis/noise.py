@@ -19,6 +19,7 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.camera.successive import shared_light
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import (
+    SAID,
     allow_for_correlation,
     either_said,
     offset_is_wrong,
@@ -117,7 +118,7 @@ def judge_counts(
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
     law = camera.law
-    if law is not None and (law.bent or law.kind == "other light"):  # which is said already
+    if law is not None and (law.bent or law.kind in SAID):  # already
         excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
         return Noise((), gain.off, excess, spectrum)
     if law is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recorded_light import LEVEL_E, gamma, linear, record, saturation
 
 import iscat_analysis as ia
 from iscat_analysis.camera.calibration.laws import Law, find_law
@@ -20,7 +21,6 @@ from iscat_analysis.camera.response import read_response
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.diagnosis.camera_numbers import law_said
 from iscat_analysis.movie import open_stack
-from recorded_light import LEVEL_E, gamma, linear, record, saturation
 
 SEEDS = 3
 CLEAN = 20
@@ -76,7 +76,8 @@ def test_control_rounding_that_is_not_taken_off_is_no_line() -> None:
     """As real numbers, the counts of eight bits have noise where there is no light."""
     counts = record(1, linear(700.0), flicker=0.001)
     found = measure_transfer(counts.astype(float), Camera(gain_e_per_adu=700.0))
-    assert found is not None and found.noise is not None
+    assert found is not None
+    assert found.noise is not None
     assert found.noise.value / found.level < -0.3  # 700 · 700 / 12 / 1e5 = 0.41 of the light
     assert _law(counts, 700.0).kind == "linear"
 
@@ -85,10 +86,12 @@ def test_eight_bits_have_no_offset_under_a_steady_laser() -> None:
     for seed in range(SEEDS):
         known = _learned(record(seed, linear(700.0), flicker=0.001))
         offset, gain = known.numbers["offset_adu"], known.numbers["gain_e_per_adu"]
-        assert offset.value == 0.0 and offset.source == "assumed"
+        assert offset.value == 0.0
+        assert offset.source == "assumed"
         assert abs(gain.value - 700) < 5 * gain.se
         read = known.numbers["read_noise_e"]
-        assert read.source == "rounding" and read.value == pytest.approx(700 / 12**0.5, rel=0.02)
+        assert read.source == "rounding"
+        assert read.value == pytest.approx(700 / 12**0.5, rel=0.02)
         assert not law_said(known)
 
 
@@ -98,7 +101,8 @@ def test_gain_and_offset_are_learned_with_their_errors() -> None:
         known = _learned(record(seed, linear(4.0, 2000)))
         gain, offset = known.numbers["gain_e_per_adu"], known.numbers["offset_adu"]
         assert gain.source == offset.source == "measured"
-        assert abs(gain.value / 4 - 1) < 0.02 and abs(offset.value - 2000) < 400
+        assert abs(gain.value / 4 - 1) < 0.02
+        assert abs(offset.value - 2000) < 400
         pulls.append([(gain.value - 4.0) / gain.se, (offset.value - 2000) / offset.se])
     assert np.all(np.abs(np.mean(pulls, axis=0)) < 4 / math.sqrt(8))
     assert np.all(np.std(pulls, axis=0) < 2.0)
@@ -115,7 +119,8 @@ def test_dark_frames_tell_offset_and_read_noise() -> None:
 
 def test_a_number_that_was_given_is_used() -> None:
     known = _learned(record(1, linear(4.0)), gain_e_per_adu=1.5, read_noise_e=3.0)
-    assert known.config.gain_e_per_adu == 1.5 and known.config.read_noise_e == 3.0
+    assert known.config.gain_e_per_adu == 1.5
+    assert known.config.read_noise_e == 3.0
     assert known.numbers["gain_e_per_adu"].source == "configured"
 
 
@@ -137,7 +142,8 @@ def test_a_steady_laser_does_not_tell_gamma_from_saturation() -> None:
     known = _learned(record(1, gamma(0.8), flicker=0.0))
     assert known.response is None
     (said,) = law_said(known)
-    assert "does not tell" in said and "camera.response" not in said
+    assert "does not tell" in said
+    assert "camera.response" not in said
 
 
 def test_the_curve_of_a_law_gives_back_the_light(tmp_path: Path) -> None:

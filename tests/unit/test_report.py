@@ -93,7 +93,7 @@ def test_names_of_axes_are_where_they_would_be_without_an_image_drawn_before(
 class TestFolder:
     def test_holds_exactly_what_is_promised(self, folder: Path) -> None:
         assert {path.name for path in folder.iterdir()} == OUTPUT_NAMES - {
-            "tracks.csv", "tracks.parquet"
+            "tracks.csv", "tracks.parquet", "response.csv"
         }  # fmt: skip
 
     def test_leaves_no_temporary_sibling(self, folder: Path) -> None:

@@ -37,7 +37,6 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from iscat_analysis.camera.calibration.transfer import Transfer
 from iscat_analysis.records import FloatArray
@@ -61,6 +60,7 @@ _BETTER = 16.0  # of χ², by which a law with one number more must describe the
 _BOTH = 20.0  # the same, where an offset is wrong besides
 _ALIKE = 6.0  # of χ², within which another law is as good
 _RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
+_STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
 _MOST_FILLED = 0.98  # of full scale, up to which the light follows from the counts
 
 
@@ -86,22 +86,19 @@ class Law:
     @property
     def bent(self) -> bool:
         """Whether counts are no line in light, so that no offset makes masses right."""
-        return self.kind in BENT and self._matters
+        # that it is no chance is known already: a line describes the pixels clearly worse
+        return self.kind in BENT and abs(1 - self.contrast) > TOLERANCE
 
     @property
     def dilutes(self) -> bool:
         """Whether masses are wrong by an offset, or by light that no particle changes."""
-        return self.kind in ("offset", "other light") and self._matters
+        wrong = abs(1 - self.contrast) > TOLERANCE + SIGMAS * self.contrast_se
+        return self.kind in ("offset", "other light") and wrong
 
     @property
     def certain(self) -> bool:
         """Whether it is known by how much masses are wrong: no other kind of law is as good."""
         return self.flickers or not self.alike
-
-    @property
-    def _matters(self) -> bool:
-        # that it is none of chance is known: another law describes the pixels worse
-        return abs(1 - self.contrast) > TOLERANCE + 2 * self.contrast_se
 
 
 @dataclass(frozen=True)
@@ -205,13 +202,10 @@ def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray)
         return _residuals(found, family.curves(above, float(theta[0])))
 
     low, high = family.ends
-    start = np.array([family.start, *offset])
-    bounds = ([low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)])
-    fit = least_squares(residuals, np.clip(start, low + 1e-9, None), bounds=bounds, x_scale=0.1)
-    information = fit.jac.T @ fit.jac
-    covariance = np.linalg.pinv(information)
-    value, se = float(fit.x[0]), math.sqrt(max(float(covariance[0, 0]), 0.0))
-    shift = float(fit.x[1]) if offset.size else 0.0
+    ends = np.array([[low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)]])
+    theta, chi2, covariance = _least_squares(residuals, np.array([family.start, *offset]), ends)
+    value, se = float(theta[0]), math.sqrt(float(covariance[0, 0]))
+    shift = float(theta[1]) if offset.size else 0.0
     step = 1e-4
     slope = (family.contrast(value + step) - family.contrast(value)) / step
     gradient = np.array([slope * (1 - shift), *(-family.contrast(value) + 0 * offset)])
@@ -222,6 +216,36 @@ def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray)
         contrast=family.contrast(value) * (1 - shift),
         contrast_se=math.sqrt(max(float(gradient @ covariance @ gradient), 0.0)),
         offset=shift,
-        chi2=2 * float(fit.cost),
+        chi2=chi2,
         flickers=found.flicker is not None,
     )
+
+
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], start: FloatArray, ends: FloatArray
+) -> tuple[FloatArray, float, FloatArray]:
+    """Minimise a sum of squares inside bounds: Levenberg and Marquardt, with differences.
+
+    Shapes: `start` (k,), `ends` (2, k), `theta` (k,), `covariance` (k, k).
+    """
+    low, high = ends
+    theta = np.clip(start, low, high)
+    rest, damping = residuals(theta), 1e-3
+    while True:
+        step = np.where(theta + _STEP < high, _STEP, -_STEP)
+        slopes = np.stack([(residuals(theta + d) - rest) / d.sum() for d in np.diag(step)], axis=1)
+        information = slopes.T @ slopes
+        while damping < _STUCK:
+            damped = information + damping * np.diag(np.diag(information) + 1e-300)
+            new = np.clip(theta - np.linalg.solve(damped, slopes.T @ rest), low, high)
+            tried = residuals(new)
+            if tried @ tried < rest @ rest:
+                break
+            damping *= 4
+        else:
+            break
+        gained = float(rest @ rest - tried @ tried)
+        theta, rest, damping = new, tried, damping / 8
+        if gained < _SETTLED:
+            break
+    return theta, float(rest @ rest), np.linalg.pinv(information)
