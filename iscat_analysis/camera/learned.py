@@ -50,6 +50,8 @@ _FINE = 1e4  # times the variance of rounding, from where that has no part in th
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
 _SHAKEN = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
+_RESOLVED = 0.4  # of λ/NA, below which pixels are finer than any detail of light
+_FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
 
 @dataclass(frozen=True)
@@ -114,22 +116,35 @@ def with_camera(
 ) -> tuple[Stack, Config, LearnedCamera]:
     """Give a movie through its response curve, and a configuration with numbers of the camera."""
     movie = linear(movie, config.camera)
-    additive = config.optics.scheme == "darkfield"
-    learned = learn_camera(movie, config.camera, span, additive=additive)
+    optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
+    resolved = pixel_nm < _RESOLVED * optics.wavelength_nm / optics.na
+    learned = learn_camera(
+        movie, config.camera, span,
+        additive=optics.scheme == "darkfield",
+        moving=config.fit.mode == "track" and resolved,
+    )  # fmt: skip
     return movie, config.model_copy(update={"camera": learned.config}), learned
 
 
 def learn_camera(
-    movie: CountSource, config: CameraConfig, span: tuple[int, int], *, additive: bool = False
+    movie: CountSource,
+    config: CameraConfig,
+    span: tuple[int, int],
+    *,
+    additive: bool = False,
+    moving: bool = False,
 ) -> LearnedCamera:
-    """Learn the numbers of the camera from a movie; `additive` where light is no reference."""
+    """Learn the numbers of the camera from a movie.
+
+    `additive` where there is no reference; `moving` where particles move in all frames.
+    """
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config, shape, movie.dtype)
     if config.response is not None:
         camera = replace(camera, full_scale_adu=full_scale(config, movie.dtype))
     free = {key for key in ASSUMED if getattr(config, key) == AUTO}
     counts, dark = _sample(movie, span, math.prod(shape))
-    found = _Learning(camera, free, counts, additive)
+    found = _Learning(camera, free, counts, additive, moving)
     if dark is not None:
         found.take_dark(dark)
     found.learn()
@@ -191,9 +206,15 @@ class _Learning:
     """What is known of a camera while it is being learned."""
 
     def __init__(
-        self, camera: Camera, free: set[str], counts: NDArray[Any], additive: bool
+        self,
+        camera: Camera,
+        free: set[str],
+        counts: NDArray[Any],
+        additive: bool,
+        moving: bool,
     ) -> None:
-        self.camera, self.free, self.counts, self.additive = camera, free, counts, additive
+        self.camera, self.free, self.counts = camera, free, counts
+        self.additive, self.moving = additive, moving
         self.changed: set[str] = set()
         self.law: Law | None = None
         self.transfer: Transfer | None = None
@@ -282,6 +303,8 @@ class _Learning:
             as_stored = counts.astype(np.float64)  # of which nothing is taken off for rounding
             found = diagnose_gain(as_stored, replace(camera, read_noise_e=0.0))
             return found.gain_e_per_adu, found.gain_se, EFFECTIVE
+        if self.moving:
+            return *_gain_of_detail(counts, camera), MEASURED
         found = diagnose_gain(counts, camera)
         seen = replace(camera, gain_e_per_adu=found.gain_e_per_adu)
         longer = averaged_noise(counts, seen)
@@ -371,6 +394,35 @@ def _noise_adu2(counts: NDArray[Any]) -> float:
     steps = np.diff(counts[:_FIRST].astype(np.float64), axis=0)
     steps -= steps.mean(axis=(1, 2), keepdims=True)
     return float(np.mean(steps**2)) / 2
+
+
+def _gain_of_detail(counts: NDArray[Any], camera: Camera) -> tuple[float, float]:
+    """Give the gain by the noise of the finest detail, and its standard error.
+
+    Light that interferes has no detail finer than λ/NA: where pixels are smaller than half of that,
+    differences of neighbouring frames hold particles that moved, but not in the finest detail,
+    which is taken by fourth differences along both axes.
+
+    Shapes: `counts` (t, y, x).
+    """
+    light = camera.to_electrons(counts)
+    power = light.mean(axis=(1, 2), keepdims=True)
+    if power.min() <= 0:
+        raise DataError("a frame is dark")
+    light *= power.mean() / power
+    mean, dark = light.mean(axis=0), camera.dark_variance_e2(counts)
+    scale = _FOURTH * np.sqrt(2 * np.maximum(mean + dark, 1.0))
+    squares = [
+        np.mean(np.diff(np.diff((after - before) / scale, 4, axis=0), 4, axis=1) ** 2)
+        for before, after in pairwise(light)
+    ]
+    level, other = float(mean.mean()), float(dark.mean())
+    ratio = (float(np.mean(squares)) * (level + other) - other) / level
+    error = float(np.std(squares)) * (level + other) / level / math.sqrt(len(squares))
+    gain = float(np.mean(camera.gain_e_per_adu))
+    if ratio <= 0:
+        raise DataError("the frames are no noisier than camera.read_noise_e alone")
+    return gain / ratio, gain * error / ratio**2
 
 
 def _short(counts: NDArray[Any], camera: Camera) -> GainDiagnosis | None:

@@ -42,8 +42,8 @@ def law_said(known: LearnedCamera) -> tuple[str, ...]:
         return ()
     if law.kind == "read noise" and law.value > TOLERANCE:
         return (
-            f"in the dark the noise has {100 * law.value:.2g} ± {100 * law.se:.1g} % of the light's "
-            "variance beyond what camera.read_noise_e says: it lacks "
+            f"without light the noise is {100 * law.value:.2g} ± {100 * law.se:.1g} % of the "
+            "light's variance beyond what camera.read_noise_e says: it lacks "
             f"{math.sqrt(law.value * known.level_e):.3g} e, in squares; record a dark",
         )
     if not (law.bent or (law.kind == "other light" and law.dilutes)):
