@@ -28,9 +28,9 @@ from iscat_analysis.camera.successive import averaged_noise
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import CountSource
+from iscat_analysis.records import CountSource, StackMetadata
 
-MEASURED, DARK, CONFIGURED = "measured", "dark frames", "configured"
+MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", "metadata"
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 """Where a number comes from."""
 
@@ -122,6 +122,7 @@ def with_camera(
         movie, config.camera, span,
         additive=optics.scheme == "darkfield",
         moving=config.fit.mode == "track" and resolved,
+        metadata=movie.metadata,
     )  # fmt: skip
     return movie, config.model_copy(update={"camera": learned.config}), learned
 
@@ -133,10 +134,12 @@ def learn_camera(
     *,
     additive: bool = False,
     moving: bool = False,
+    metadata: StackMetadata | None = None,
 ) -> LearnedCamera:
     """Learn the numbers of the camera from a movie.
 
-    `additive` where there is no reference; `moving` where particles move in all frames.
+    `additive` where there is no reference; `moving` where particles move in all frames.  Gain and
+    offset of the file's metadata stand where they cannot be measured.
     """
     shape = (movie.shape[1], movie.shape[2])
     camera = camera_from_config(config, shape, movie.dtype)
@@ -145,6 +148,8 @@ def learn_camera(
     free = {key for key in ASSUMED if getattr(config, key) == AUTO}
     counts, dark = _sample(movie, span, math.prod(shape))
     found = _Learning(camera, free, counts, additive, moving)
+    if metadata is not None and config.response is None:
+        found.take_metadata(metadata)
     if dark is not None:
         found.take_dark(dark)
     found.learn()
@@ -236,6 +241,13 @@ class _Learning:
         top = self.camera.full_scale_adu or float(self.counts.max())
         return response_of(law, found, self.camera, max(top, float(self.counts.max())))
 
+    def take_metadata(self, metadata: StackMetadata) -> None:
+        """Begin with what the camera's driver wrote into the file."""
+        for key in ("gain_e_per_adu", "offset_adu"):
+            value = getattr(metadata, key)
+            if value is not None and key in self.free:
+                self._set(key, value, 0.0, METADATA)
+
     def take_dark(self, dark: NDArray[Any]) -> None:
         """Take offset and read noise from frames without light.
 
@@ -270,7 +282,7 @@ class _Learning:
 
     def _cannot(self, why: str) -> None:
         """Say once that the gain keeps its assumption."""
-        if "gain_e_per_adu" in self.free:
+        if self._source["gain_e_per_adu"] == ASSUMPTION:
             self.messages.append(
                 f"the camera's gain cannot be learned from this movie, because {why}: "
                 f"camera.gain_e_per_adu = {ASSUMED['gain_e_per_adu']:g} is assumed; set it"
@@ -345,7 +357,7 @@ class _Learning:
         gain = float(np.mean(self.camera.gain_e_per_adu))
         steps = math.sqrt(12 * rounding_variance_adu2(self.counts))
         plausible = max(_READ_E, _READ_STEPS * steps * gain) ** 2 / found.level
-        dark = self._source["offset_adu"] == DARK
+        dark = self._source["offset_adu"] in (DARK, METADATA)
         lowest = -float(np.mean(self.camera.offset_adu)) * gain / found.level
         self.law = law = find_law(found, most_read=plausible, least_offset=lowest)
         error = law.se * found.level / gain

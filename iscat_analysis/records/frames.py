@@ -24,6 +24,10 @@ class StackMetadata:
         Exposure of one frame [ms].
     frame_rate_hz : float or None
         Frames per second [Hz].
+    gain_e_per_adu : float or None
+        Photoelectrons per count, as the camera's driver has it.
+    offset_adu : float or None
+        Counts in the dark, as the driver has it.
     source : str
         Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
     """
@@ -31,6 +35,8 @@ class StackMetadata:
     pixel_size_nm: float | None = None
     exposure_ms: float | None = None
     frame_rate_hz: float | None = None
+    gain_e_per_adu: float | None = None
+    offset_adu: float | None = None
     source: str = "none"
 
 

@@ -265,7 +265,7 @@ class CameraNumber(Closed):
     from_: str = Field(
         alias="from",
         description="measured from the movie's light, dark frames, rounding, effective (of frames "
-        "that are not raw), configured or assumed",
+        "that are not raw), metadata, configured or assumed",
     )
 
 

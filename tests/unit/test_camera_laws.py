@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded_light import LEVEL_E, gamma, linear, record, saturation
+from recorded_light import LEVEL_E, SHAPE, gamma, linear, record, saturation
 
 import iscat_analysis as ia
 from iscat_analysis.camera.calibration.laws import Law, find_law
@@ -21,13 +21,14 @@ from iscat_analysis.camera.response import read_response
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.diagnosis.camera_numbers import law_said
 from iscat_analysis.movie import open_stack
+from iscat_analysis.records import StackMetadata
 
 SEEDS = 3
 CLEAN = 20
 
 
-def _learned(counts: np.ndarray, **settings: object) -> LearnedCamera:
-    config = CameraConfig(**settings)  # type: ignore[arg-type]
+def _learned(counts: np.ndarray, **settings: float) -> LearnedCamera:
+    config = CameraConfig(**settings)
     return learn_camera(open_stack(counts), config, (0, len(counts)))
 
 
@@ -122,6 +123,38 @@ def test_a_number_that_was_given_is_used() -> None:
     assert known.config.gain_e_per_adu == 1.5
     assert known.config.read_noise_e == 3.0
     assert known.numbers["gain_e_per_adu"].source == "configured"
+
+
+def test_what_the_driver_wrote_stands_where_it_is_not_measured() -> None:
+    wrote = StackMetadata(gain_e_per_adu=0.46, offset_adu=2000.0, source="micromanager")
+    counts = record(1, linear(4.0, 2000.0))
+    known = learn_camera(open_stack(counts), CameraConfig(), (0, len(counts)), metadata=wrote)
+    gain, offset = known.numbers["gain_e_per_adu"], known.numbers["offset_adu"]
+    assert (gain.source, offset.source, offset.value) == ("measured", "metadata", 2000.0)
+    assert gain.value == pytest.approx(4.0, rel=0.01)
+    same = open_stack(np.repeat(counts[:1], 3, axis=0))
+    one = learn_camera(same, CameraConfig(), (0, 3), metadata=wrote)
+    assert one.numbers["gain_e_per_adu"].value == 0.46
+    assert not one.messages
+
+
+def test_particles_that_move_do_not_change_the_gain() -> None:
+    """Their light has no detail as fine as a pixel; without looking there, the gain is far off."""
+    rng = np.random.default_rng(4)
+    y, x = np.indices(SHAPE)
+    places, counts = rng.uniform(0, 64, (15, 2)), record(4, linear(4.0), frames=128)
+    moved = counts.astype(float)
+    for frame in moved:
+        places = (places + rng.normal(0, 1.5, places.shape)) % 64
+        for row, column in places:
+            square = (y - row) ** 2 + (x - column) ** 2
+            frame *= 1 - 0.02 * np.exp(-square / 9.7) * np.cos(0.9 * np.sqrt(square))
+    movie = open_stack(np.rint(moved).astype(np.uint16))
+    kept, lost = (
+        learn_camera(movie, CameraConfig(), (0, 128), moving=way) for way in (True, False)
+    )
+    assert kept.numbers["gain_e_per_adu"].value == pytest.approx(4.0, rel=0.02)
+    assert lost.numbers["gain_e_per_adu"].value < 3.5  # a control
 
 
 def test_twelve_bits_stored_as_sixteen_are_rounded_to_sixteens() -> None:
