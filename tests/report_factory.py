@@ -108,8 +108,8 @@ def make_analysis(
     status = np.array([Status.OK.value] * n, dtype=object)
     flags = np.array([""] * n, dtype=object)
     for k, verdict in enumerate([s for s in Status if s is not Status.OK]):
-        status[5 + 2 * k :: 41] = verdict.value
-        flags[5 + 2 * k :: 41] = f"{verdict.value};masked_pixels"
+        status[5 + 6 * k :: 41] = verdict.value
+        flags[5 + 6 * k :: 41] = f"{verdict.value};masked_pixels"
     frame = pd.DataFrame({**table, "status": status, "flags": flags}, columns=list(EVENT_COLUMNS))
     if n > 6:
         frame.loc[frame.index[5], [c for c in frame if c.startswith("sigma_")]] = np.nan
