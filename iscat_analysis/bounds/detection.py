@@ -67,7 +67,7 @@ def detection_limit(experiment: Experiment) -> DetectionLimit | None:
         return None
     theta = experiment.theta.copy()
     theta[3] *= _FAINT
-    read = experiment.config.camera.read_noise_e
+    read = experiment.config.camera.assumed.read_noise_e
     empty = expected_likelihood(
         model, experiment.grid, theta, at.photons_per_pixel, at.photons_per_pixel,
         n_before=at.n_before, n_after=at.n_after,

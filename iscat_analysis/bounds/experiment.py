@@ -68,7 +68,7 @@ def plan(
     like: ForwardModel | None = None,
 ) -> Experiment:
     """Set up the experiment of ``[bounds]``."""
-    at, camera = config.bounds, config.camera
+    at, camera = config.bounds, config.camera.assumed
     pixel_nm = camera.pixel_size_nm
     if pixel_nm is None:
         raise ConfigError(

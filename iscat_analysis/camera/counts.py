@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tifffile
@@ -21,6 +21,9 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.reading import is_file
 from iscat_analysis.records import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from iscat_analysis.camera.calibration.laws import Law
 
 CEILING_REPEATS = 4
 """Counts that must share the largest one before it is taken for a converter's full scale."""
@@ -43,6 +46,7 @@ class Camera:
     read_noise_e: float | FloatArray = 0.0
     well_depth_e: float | None = None
     full_scale_adu: float | None = None
+    law: Law | None = None  # that the movie's counts follow, where it was looked for
 
     def to_electrons(self, counts: NDArray[Any]) -> FloatArray:
         """Convert counts to photoelectrons.
@@ -89,10 +93,31 @@ class Camera:
         """
         return np.broadcast_to(np.square(self.read_noise_e, dtype=np.float64), shape).copy()
 
+    def dark_variance_e2(self, counts: NDArray[Any]) -> FloatArray:
+        """Variance of what is no light in one frame: read noise, and at least that of rounding.
+
+        Shapes: `counts` (t, y, x), result (y, x).
+        """
+        rounding = rounding_variance_adu2(counts) * np.square(self.gain_e_per_adu)
+        # whole photoelectrons that are counted one by one are not rounded
+        rounding = np.maximum(rounding - 1 / 12, 0.0)
+        read = self.read_variance_e2((counts.shape[1], counts.shape[2]))
+        return np.maximum(read, rounding)
+
+
+def rounding_variance_adu2(counts: NDArray[Any]) -> float:
+    """Variance that rounding adds to counts: d²/12, d the largest step that all are multiples of.
+
+    Twelve bits that are stored as sixteen have steps of 16 counts.
+    """
+    if not np.issubdtype(counts.dtype, np.integer) or not counts.size:
+        return 0.0
+    return float(np.gcd.reduce(counts[0], axis=None)) ** 2 / 12
+
 
 def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
     """Build the camera that a configuration describes, reading its maps."""
-    stored = np.dtype(dtype)
+    config, stored = config.assumed, np.dtype(dtype)
     full_scale = float(np.iinfo(stored).max) if np.issubdtype(stored, np.integer) else None
     return Camera(
         gain_e_per_adu=_number_or_map(config.gain_e_per_adu, "gain_e_per_adu", shape_yx),

@@ -209,7 +209,7 @@ def diagnose_gain(
         before = after
     shot = float(np.sum(1 / power[:-1] + 1 / power[1:]))
     read = float(np.sum(1 / power[:-1] ** 2 + 1 / power[1:] ** 2))
-    excess = squares - read * camera.read_variance_e2(counts.shape[1:])[used]
+    excess = squares - read * camera.dark_variance_e2(counts)[used]
     expected = shot * (1 - float(np.sum(share**2))) * mean
 
     kept = _without_outliers(excess / expected, n_frames)

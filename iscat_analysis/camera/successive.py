@@ -57,3 +57,21 @@ def shared_light(
         return None
     short = 1 - near / apart
     return near / apart if short > _LEAST and abs(far / apart - 1) < _GROWS * short else None
+
+
+def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
+    """Give the variance of long averages over that of frames next to each other, where they share.
+
+    Frames that were averaged or filtered in time have noise in common: with the correlation ρ_k of
+    frames k apart, an average of n has 1 + 2 Σ ρ_k times the variance over n of one.
+
+    Shapes: `counts` (t, y, x).
+    """
+    if shared_light(counts, camera) is None:
+        return None
+    pixels = camera.to_electrons(counts[:_FRAMES])
+    power = pixels.mean(axis=(1, 2), keepdims=True)
+    pixels *= power.mean() / power
+    squares = [float(np.mean((pixels[k:] - pixels[:-k]) ** 2)) for k in (*range(1, _APART), _FAR)]
+    common = sum(1 - one / squares[-1] for one in squares[:-1])
+    return squares[-1] / squares[0] * (1 + 2 * common)

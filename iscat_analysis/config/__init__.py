@@ -25,6 +25,8 @@ from iscat_analysis.config.files import (
 )
 from iscat_analysis.config.instrument import (
     ABERRATIONS,
+    ASSUMED,
+    AUTO,
     MEASURABLE,
     Calibration,
     CameraConfig,
@@ -54,6 +56,8 @@ from iscat_analysis.config.values import (
 __all__ = [
     "ABERRATIONS",
     "ALL",
+    "ASSUMED",
+    "AUTO",
     "MEASURABLE",
     "PIXEL_NM",
     "SIMULATED",

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from iscat_analysis.config.complaints import model_of
+from iscat_analysis.config.instrument import AUTO
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
@@ -171,11 +172,11 @@ def _toml_value(value: Any) -> str:
 
 _PATH_KEYS = {
     "optics": ("file", "template"),
-    "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e"),
+    "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e", "response"),
     "simulation": ("background",),
 }
 
-_NOT_PATHS = ("flat", "speckle")
+_NOT_PATHS = ("flat", "speckle", AUTO)
 
 
 def _anchor_paths(values: dict[str, Any], folder: Path) -> None:

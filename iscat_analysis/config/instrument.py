@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -207,6 +208,13 @@ class Optics(Section):
         return self
 
 
+AUTO = "auto"
+"""In place of a number of the camera: it is learned from the movie."""
+
+ASSUMED: Mapping[str, float] = {"gain_e_per_adu": 1.0, "offset_adu": 0.0, "read_noise_e": 0.0}
+"""What is taken where nothing tells: counts are photoelectrons, and there are none in the dark."""
+
+
 class CameraConfig(Section):
     """The detector, in the sample plane."""
 
@@ -214,11 +222,22 @@ class CameraConfig(Section):
         None, description="in the sample plane; taken from the TIFF metadata where absent"
     )
     gain_e_per_adu: Positive | str = Field(
-        1.0, description="photoelectrons per count: a number or the path of a TIFF map"
+        AUTO,
+        description='photoelectrons per count: a number, the path of a TIFF map, or "auto": '
+        "measured from the movie's noise",
     )
-    offset_adu: Finite | str = Field(0.0, description="counts in the dark: a number or a map")
+    offset_adu: Finite | str = Field(
+        AUTO,
+        description='counts in the dark: a number, a map, or "auto": of dark frames, or where the '
+        "light of the pixels ends",
+    )
     read_noise_e: NonNegative | str = Field(
-        0.0, description="read noise, standard deviation per frame: a number or a map"
+        AUTO,
+        description='read noise, standard deviation per frame: a number, a map, or "auto"',
+    )
+    response: str | None = Field(
+        None,
+        description="CSV file of counts and photoelectrons, of a camera that is not linear",
     )
     well_depth_e: Positive | None = Field(
         None, description="full well: counts at or above it are flagged as saturated"
@@ -228,6 +247,12 @@ class CameraConfig(Section):
     samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(
         1, description="per axis, to integrate over pixels; 1 = point sampling at pixel centres"
     )
+
+    @property
+    def assumed(self) -> CameraConfig:
+        """The camera where there is no movie to learn from: what is "auto" has a stated number."""
+        numbers = {key: value for key, value in ASSUMED.items() if getattr(self, key) == AUTO}
+        return self.model_copy(update=numbers) if numbers else self
 
 
 class Particle(Section):

@@ -33,7 +33,7 @@ STATE = ".batch"
 _POLL_S = 0.2  # between two looks at a lock that another run holds
 _PATIENCE_S = 2.0  # after which the waiting is told
 _REMEMBERED = 2**14  # tables that were read
-_MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e")
+_MAPS = ("gain_e_per_adu", "offset_adu", "read_noise_e", "response")
 
 
 class Records:
@@ -120,7 +120,8 @@ def key_of(config: Config, *further: Any) -> str:
     """Hash what an analysis is asked for."""
     compute = type(config.compute)(seed=config.compute.seed)
     settings = config.model_copy(update={"compute": compute})
-    maps = [sha256_of(Path(v)) for n in _MAPS if isinstance(v := getattr(config.camera, n), str)]
+    numbers = config.camera.assumed
+    maps = [sha256_of(Path(v)) for n in _MAPS if isinstance(v := getattr(numbers, n), str)]
     return hash_of(config_to_toml(settings, comments=False), maps, *further)
 
 

@@ -8,13 +8,86 @@ from dataclasses import replace
 import numpy as np
 
 from iscat_analysis.camera.calibration import LightZero
+from iscat_analysis.camera.calibration.laws import TOLERANCE, Law
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.learned import LearnedCamera
 from iscat_analysis.camera.metadata import GainDiagnosis
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 
 _SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
+SAID = ("other light", "read noise")
+"""Laws by which noise is not what the camera's numbers predict, as `law_said` has it."""
+
+_OTHERS = {
+    "offset": "an offset that is too high",
+    "read noise": "read noise that is missing",
+    "noisy light": "light that is noisy by itself",
+    "other light": "light that does not follow the laser",
+}
 _SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
+
+
+def zero_by_law(law: Law, level_e: float) -> LightZero | None:
+    """Give where the light ends by the law that the movie's counts follow."""
+    if law.kind == "offset":
+        return LightZero(law.value, law.se, law.value * level_e, law.flickers)
+    return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
+
+
+def law_said(known: LearnedCamera) -> tuple[str, ...]:
+    """Say that counts are not in proportion to light, by which law, and what to do."""
+    law = known.camera.law
+    if law is None:
+        return ()
+    if law.kind == "read noise" and law.value > TOLERANCE:
+        return (
+            f"without light the noise is {100 * law.value:.2g} ± {100 * law.se:.1g} % of the "
+            "light's variance beyond what camera.read_noise_e says: it lacks "
+            f"{math.sqrt(law.value * known.level_e):.3g} e, in squares; record a dark",
+        )
+    if not (law.bent or (law.kind == "other light" and law.dilutes)):
+        return ()
+    seen = (
+        "the noise and the answer to the laser's power grow" if law.flickers else "the noise grows"
+    )
+    effect = f"{_effect(1 - law.contrast)} (± {100 * law.contrast_se:.2g} %)"
+    flagged = "all rows are flagged nonlinear"
+    if law.kind == "other light":
+        camera, share = known.config, law.value
+        counts = share * known.level_e / float(np.mean(known.camera.gain_e_per_adu))
+        advice = ""
+        if not isinstance(camera.offset_adu, str) and not isinstance(camera.read_noise_e, str):
+            read = math.hypot(camera.read_noise_e, math.sqrt(share * known.level_e))
+            advice = (
+                f", or set camera.offset_adu = {camera.offset_adu + counts:.5g} and "
+                f"camera.read_noise_e = {read:.4g}, which is its shot noise"
+            )
+        return (
+            f"{100 * share:.2g} ± {100 * law.se:.1g} % of the light does not follow the laser's "
+            "power but has its shot noise, as light of the room, which interferes with nothing; it "
+            f"makes {effect}; {flagged}: put it out{advice}",
+        )
+    named = {
+        "gamma": f"gamma {law.value:.3g} ± {law.se:.1g} (counts as light to this power)",
+        "saturation": "soft saturation (the pixels are filled to "
+        f"{law.value:.3g} ± {law.se:.1g} of the light at which they saturate)",
+    }
+    if law.certain:
+        more = f" besides an offset of {100 * law.offset:.2g} % of the light" if law.offset else ""
+        return (
+            f"the counts are not in proportion to the light: {seen} with it as by "
+            f"{named[law.kind]}{more}, which makes {effect}; {flagged}: switch it off or lower the "
+            "exposure, or correct this movie with camera.response = response.csv, which is written "
+            "with the result",
+        )
+    others = " or ".join(_OTHERS.get(kind, kind) for kind in law.alike)
+    return (
+        f"the counts are not in proportion to the light: {seen} with it as by {named[law.kind]}, "
+        f"and the movie does not tell this from {others}; "
+        f"the first makes {effect}; {flagged}: switch gamma off and lower the exposure; "
+        "`iscat calibrate camera` with a dark tells them apart",
+    )
 
 
 def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:

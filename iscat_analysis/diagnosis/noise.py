@@ -19,10 +19,12 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.camera.successive import shared_light
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import (
+    SAID,
     allow_for_correlation,
     either_said,
     offset_is_wrong,
     offset_said,
+    zero_by_law,
 )
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.scene import Scene
@@ -115,7 +117,14 @@ def judge_counts(
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
-    zero = None if additive else find_zero(counts, camera, masked=masked)
+    law = camera.law
+    if law is not None and (law.bent or law.kind in SAID):  # already
+        excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
+        return Noise((), gain.off, excess, spectrum)
+    if law is not None:
+        zero = zero_by_law(law, float(camera.to_electrons(counts[:1]).mean()))
+    else:
+        zero = None if additive else find_zero(counts, camera, masked=masked)
     leaks = spectrum is not None and spectrum.correlated
     if zero is not None and leaks and not zero.flickers:
         zero = None  # the variance of a pixel is then of its neighbours' light as well
@@ -130,7 +139,9 @@ def judge_counts(
     if wrong is None:
         return Noise((said,) if said else (), gain.off, excess, spectrum, gain.shakes)
     messages = [said]
-    moved = replace(camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu)
+    moved = replace(
+        camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu, law=None
+    )
     with contextlib.suppress(DataError):  # too dark to tell
         rest = diagnose_gain(counts[:_GAIN_FRAMES], moved, masked=masked)
         rest = allow_for_correlation(rest, measure_spectrum(counts, moved, masked=masked))

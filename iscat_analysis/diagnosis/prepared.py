@@ -9,6 +9,7 @@ from typing import Any
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera.response import Response
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.fitting.background_mode import BackgroundMode
@@ -29,6 +30,15 @@ class Prepared:
     other_kind: str
     digest: Future[str]
     summary: Mapping[str, Any]
+    response: Response | None = None
+
+    @property
+    def distorted(self) -> bool:
+        """Whether all masses are wrong, because counts are not in proportion to the light."""
+        law = self.camera.law
+        if law is None:
+            return False
+        return law.bent or (law.dilutes and law.flickers)
 
     @property
     def shape(self) -> tuple[int, int]:

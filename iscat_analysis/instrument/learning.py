@@ -11,7 +11,8 @@ from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from typing import Any
 
-from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
@@ -222,7 +223,9 @@ def calibrate_movie(
         if notify is not None:
             notify(note)
     refuse_uncalibratable(config)
-    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    span = config.background.recorded or fitted_frames(movie, config)
+    movie, config, known = with_camera(movie, config, span)
+    camera = known.camera
     with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:

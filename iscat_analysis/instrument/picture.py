@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.learner import LEAST_SIGHTS, Judgement, ParticleImage, judge
 from iscat_analysis.instrument.learner.measured_picture import (
     PictureFit,
@@ -135,7 +136,9 @@ def measure_template(
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
-    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    span = config.background.recorded or fitted_frames(movie, config)
+    movie, config, known = with_camera(movie, config, span)
+    camera = known.camera
     with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):
             progress("particles", number, len(MARGINS_PX))

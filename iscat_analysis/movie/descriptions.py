@@ -43,6 +43,7 @@ _AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "positi
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
+_DCAM_CONVERSION = ("CONVERSION FACTOR COEFF", "CONVERSION FACTOR OFFSET")  # Hamamatsu's driver
 _MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
 _RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
 _PLAUSIBLE_PIXEL_NM = (5.0, 5000.0)  # outside: a printer's 72 or 300 dpi, not a microscope
@@ -54,7 +55,7 @@ Resolution = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Hints:
-    """Pixel size along x and y [nm], exposure [ms] and frame rate [Hz] from one kind of metadata.
+    """Pixel size along x and y [nm], exposure [ms], frame rate [Hz] and camera, of one kind.
 
     None where it is silent; `ticks` and `source` are as in `StackMetadata`.
     """
@@ -65,6 +66,8 @@ class Hints:
     exposure_ms: float | None = None
     frame_rate_hz: float | None = None
     ticks: tuple[int, ...] | None = None
+    gain_e_per_adu: float | None = None
+    offset_adu: float | None = None
 
 
 @dataclass(frozen=True)
@@ -179,9 +182,11 @@ def micro_manager_hints(
     interval = find("Interval_ms")
     if interval is not None and (exposure is None or interval >= exposure) and ticks is None:
         rate = positive(1e3 / interval)
+    gain, offset = (_driver_number(begin, name) for name in _DCAM_CONVERSION)
     return Hints(
-        "micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate, ticks=ticks
-    )
+        "micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate, ticks=ticks,
+        gain_e_per_adu=gain, offset_adu=offset if gain is not None else None,
+    )  # fmt: skip
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
@@ -219,6 +224,8 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
             "pixel_size_nm": x,
             "exposure_ms": hint.exposure_ms,
             "frame_rate_hz": hint.frame_rate_hz,
+            "gain_e_per_adu": hint.gain_e_per_adu,
+            "offset_adu": hint.offset_adu,
         }
         fresh = {key: n for key, n in given.items() if n is not None and key not in found}
         if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
@@ -257,6 +264,12 @@ def _json_object(text: str) -> dict[str, Any]:
 def _mm_value(value: object) -> object:
     """Unwrap a value that Micro-Manager 2 wraps as a property of a device."""
     return value.get("PropVal") if isinstance(value, dict) else value
+
+
+def _driver_number(properties: Mapping[str, Any], name: str) -> float | None:
+    """Read a property of the one camera that has it, as ``Camera-CONVERSION FACTOR COEFF``."""
+    found = [value for key, value in properties.items() if str(key).upper().endswith(name)]
+    return _mm_number(found[0]) if len(found) == 1 else None
 
 
 def _mm_number(value: object) -> float | None:

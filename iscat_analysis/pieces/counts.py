@@ -43,7 +43,7 @@ class Counts:
 
     def likelihood(self, index: int) -> Likelihood:
         """Likelihood of one region."""
-        read = float(self.config.camera.read_noise_e) ** 2
+        read = float(self.config.camera.assumed.read_noise_e) ** 2
         ratio = float(self.ratio[index])
         return counts_likelihood(
             self.model, self.grid, self.before[index], self.after[index], ratio,

@@ -113,7 +113,7 @@ def crb(
     joint, level = truth_in("joint", joint), truth_in("level", level)
     free = FREE_PARAMETERS[mode]
     index = [PARAMETERS.index(name) for name in free]
-    read_noise_e = float(config.camera.read_noise_e)
+    read_noise_e = float(config.camera.assumed.read_noise_e)
     out = np.full((len(free), *setups.shape), np.nan)
     for place in np.ndindex(setups.shape):
         at = setups.at(place)

@@ -45,7 +45,7 @@ def config_of(
         )
     if camera.pixel_size_nm is None:
         raise ConfigError("camera.pixel_size_nm is needed: Camera(pixel_size_nm=84.4)")
-    if isinstance(camera.read_noise_e, str):
+    if isinstance(camera.assumed.read_noise_e, str):
         raise ConfigError(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: give one number [e]"
         )

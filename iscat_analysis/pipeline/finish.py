@@ -22,9 +22,9 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import versions
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.pipeline.rows import reported_rows
+from iscat_analysis.pipeline.rows import flagged_all, reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.records import Analysis, Film, Provenance, make_rows, silent
+from iscat_analysis.records import Analysis, Film, Provenance, Status, make_rows, silent
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
 from iscat_analysis.tracking.common_motion import warnings_of
@@ -60,6 +60,8 @@ def gather(
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
         table = make_rows(table, tick=ticks[table["frame"].to_numpy(int)])
+    if ready.distorted:
+        table = flagged_all(table, Status.NONLINEAR)
     for doubt in (
         line_warning(config, table),
         bend_warning(scene.model.scale, table),
@@ -136,6 +138,7 @@ def gather(
         warnings=tuple(run.warnings),
         tracks=tracks,
         films=films,
+        response=ready.response.table if ready.response is not None else None,
     )
     return replace(analysis, summary=summary | species_of(scene, table))
 

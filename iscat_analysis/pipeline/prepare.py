@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
+from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.camera_numbers import law_said
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
@@ -57,18 +59,25 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             'optics.psf = "measured": bounds are those of the template, and there is no quantum '
             "bound, because a picture does not say what light made it"
         )
-    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
     start, stop = config.background.recorded or span
+    stored, auto = movie, config.camera.assumed is not config.camera
+    stated = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
+    movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
+    camera = known.camera
+    for text in (*known.messages, *law_said(known)):
+        run.tell(f"{movie.name}: {text}")
+    if auto:
+        run.notify(f"{movie.name}: {known.said}")
     stop = min(stop, start + _OPENING, movie.shape[0])
     seen = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
-    refuse_overflow(seen, movie.name)
+    refuse_overflow(stored.read(start, max(start, stop)), movie.name)
     swapped = axes_warning(movie.name, seen)
     if swapped:
         run.tell(swapped)
-    summary: dict[str, Any] = {}
+    summary: dict[str, Any] = {"camera": known.summary}
     looking: Future[Changes] | None = None
     opened: NoiseSurvey | None = None
 
@@ -118,7 +127,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(
-        movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
+        movie, steady, config, camera, way, lines, opened, other_kind, digest, summary,
+        known.response,
     )  # fmt: skip
 
 

@@ -10,12 +10,14 @@ import threading
 from collections.abc import Callable, Mapping
 
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_ratio
+from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
+from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline.looks import (
@@ -77,11 +79,14 @@ class Preview:
                 "what open_stack and configure return"
             )
         config, notes = resolve_metadata(config, movie.metadata)
-        self.config = config
-        self.notes = (*movie.notes, *notes)
         shape = (movie.shape[1], movie.shape[2])
-        camera = camera_from_config(config.camera, shape, movie.dtype)
-        refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", camera)
+        stated = camera_from_config(config.camera, shape, movie.dtype)
+        refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
+        span = config.background.recorded or fitted_frames(movie, config)
+        movie, config, known = with_camera(movie, config, span)
+        camera = known.camera
+        self.config = config
+        self.notes = (*movie.notes, *notes, *known.messages)
         judged = judge_light(movie, config, camera)
         self._search = _SEARCHES[background_mode(config)](
             judged.movie, config, camera, judged.lines

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.camera.counts import Camera, camera_from_config
 from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
+from iscat_analysis.camera.response import linear
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import DataError
@@ -64,6 +65,7 @@ def redraw(
     summary: Mapping[str, Any],
 ) -> Redraw:
     """Prepare to draw the rows of a result."""
+    movie = linear(movie, config.camera)
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     judged = judge_light(movie, config, camera)
     movie, lines = judged.movie, judged.lines

@@ -12,7 +12,7 @@ import pandas as pd
 
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FloatArray, make_rows
+from iscat_analysis.records import FloatArray, Status, make_rows, verdict
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.systematic import systematic
@@ -31,3 +31,13 @@ def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, Empir
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     return make_rows(fits, **columns), achieved
+
+
+def flagged_all(table: pd.DataFrame, flag: Status) -> pd.DataFrame:
+    """Flag all rows of a movie with what is wrong with the movie itself."""
+    flags = [
+        verdict([*map(Status, filter(None, text.split(";"))), flag]) for text in table["flags"]
+    ]
+    return table.assign(
+        status=[str(worst) for worst, _ in flags], flags=[";".join(all_) for _, all_ in flags]
+    )

@@ -190,6 +190,8 @@ class Analysis:
         Mode ``track``: one row per track, columns `TRACK_COLUMNS`.
     films : tuple of Film
         Tracks that are shown frame by frame.
+    response : pandas.DataFrame or None
+        Counts and photoelectrons of a camera that was found not to be linear.
     """
 
     config_toml: str
@@ -206,3 +208,4 @@ class Analysis:
     warnings: tuple[str, ...] = field(default=())
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
+    response: pd.DataFrame | None = None

@@ -27,6 +27,10 @@ class StackMetadata:
     ticks : tuple of int or None
         Intervals of the camera from the first frame to each, shape (t,), where frames are missing;
         None where each frame is one interval after the other, or nothing says so.
+    gain_e_per_adu : float or None
+        Photoelectrons per count, as the camera's driver has it.
+    offset_adu : float or None
+        Counts in the dark, as the driver has it.
     source : str
         Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
     """
@@ -35,6 +39,8 @@ class StackMetadata:
     exposure_ms: float | None = None
     frame_rate_hz: float | None = None
     ticks: tuple[int, ...] | None = None
+    gain_e_per_adu: float | None = None
+    offset_adu: float | None = None
     source: str = "none"
 
 

@@ -17,6 +17,7 @@ class Status(StrEnum):
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
     SIDELOBE = "sidelobe"
+    NONLINEAR = "nonlinear"
 
     @property
     def advice(self) -> str:
@@ -39,6 +40,8 @@ _ADVICE = {
     Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
     "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+    Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
+    "all masses are wrong by the same factor: a line says by how much and why.",
 }
 
 
@@ -50,10 +53,11 @@ SEVERITY = (
     Status.AMBIGUOUS_Z,
     Status.TOO_CLOSE,
     Status.SATURATED,
+    Status.NONLINEAR,
 )
 """What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
 a model that does not describe the data; one of several heights; a mass shared with a neighbour;
-pixels left out."""
+pixels left out; counts that are not in proportion to the light."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:

@@ -57,8 +57,8 @@ def write_report(
 
     ``fits.csv``, ``fits.parquet``, in mode ``track`` ``tracks.csv`` and ``tracks.parquet``,
     ``summary.json``, ``config.toml``, ``posterior.nc`` (where a posterior converged),
-    ``report.html`` and ``figures/``.  The folder appears complete or not at
-    all; an earlier result is replaced only once the new one is complete.
+    ``response.csv`` (where the camera is not linear), ``report.html`` and ``figures/``.  The folder
+    appears complete or not at all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
         fill_report(analysis, building, event_figures=event_figures, place=place)

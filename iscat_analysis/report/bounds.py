@@ -61,7 +61,7 @@ def design_toml(design: PupilOptimum) -> str:
     camera = {
         key: str(Path(value).resolve())
         for key in maps
-        if isinstance(value := getattr(config.camera, key), str)
+        if isinstance(value := getattr(config.camera.assumed, key), str)
     }
     config = config.model_copy(update={"camera": config.camera.model_copy(update=camera)})
     sections = ("optics", "camera", "particle", "background", "fit", "bounds")

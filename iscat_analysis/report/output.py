@@ -33,6 +33,7 @@ OUTPUT_NAMES = frozenset(
         "summary.json",
         "config.toml",
         "posterior.nc",
+        "response.csv",
         "report.html",
         "figures",
         FILE_LIST,

@@ -41,7 +41,7 @@ def _text(value: Any) -> str:
 def write_tables(analysis: Analysis, folder: Path) -> None:
     """Write ``fits.csv``, ``tracks.csv`` where there are tracks, both as Parquet, and the rest.
 
-    The rest is ``summary.json`` and ``config.toml``.
+    The rest is ``summary.json``, ``config.toml``, and the response of a camera that is not linear.
     """
     tables = {"fits": event_table(analysis)}
     if analysis.tracks is not None:
@@ -53,6 +53,11 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
         )  # fmt: skip
         with (folder / f"{name}.parquet").open("wb") as file:  # pyarrow wants paths as text
             table.to_parquet(file, index=False)
+    if analysis.response is not None:
+        analysis.response.to_csv(
+            folder / "response.csv", index=False, float_format=f"%.{CSV_DIGITS}g",
+            lineterminator="\n",
+        )  # fmt: skip
     summary = to_json("summary", analysis.summary)
     (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")

@@ -201,6 +201,44 @@ class Repeats(Closed):
     cause: str = key("What kind of noise it looks like")
 
 
+class CameraNumber(Closed):
+    """A number of the camera."""
+
+    value: Number = key("The number that was used; of a map the mean")
+    se: NotNegative = key("Its standard error; 0 where it is not known")
+    from_: str = Field(
+        alias="from",
+        description="measured from the movie's light, dark frames, rounding, effective (of frames "
+        "that are not raw), metadata, configured or assumed",
+    )
+
+
+class CameraLaw(Closed):
+    """How the counts of the camera grow with the light."""
+
+    kind: str = key(
+        "linear, offset, read noise, noisy light, gamma, saturation, or other light, which does "
+        "not follow the laser"
+    )
+    value: Number = key(
+        "Its number: the exponent of gamma, how far pixels are filled, or a share of the light"
+    )
+    se: NotNegative = key("Its standard error")
+    contrast: Number = key("Contrast that is measured, over the true one")
+    contrast_se: NotNegative = key("Its standard error")
+    alike: list[str] = key("Other laws that describe the pixels as well")
+    flickers: bool = key("Whether the laser's power changes enough to tell")
+
+
+class CameraNumbers(Closed):
+    """The camera: numbers, their errors, and where they come from."""
+
+    gain_e_per_adu: CameraNumber = key("Photoelectrons per count [e]")
+    offset_adu: CameraNumber = key("Counts in the dark [counts]")
+    read_noise_e: CameraNumber = key("Read noise, standard deviation per frame [e]")
+    law: CameraLaw = maybe("Where the pixels differ in brightness: how counts grow with the light")
+
+
 class Changes(Closed):
     """What becomes of clear changes between averages of 20 frames, in the first 2000 at most."""
 
@@ -298,6 +336,7 @@ class Summary(Document):
     versions: Versions = key("Of this program, Python and the numerical libraries")
     warnings: list[str] = key("What the user should know, one line each")
     interrupted: bool = maybe("Whether an interrupt ended the run early")
+    camera: CameraNumbers = maybe("The camera's numbers, and where they come from")
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")

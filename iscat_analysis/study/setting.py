@@ -208,7 +208,7 @@ def make_setting(
     )
     centre = (side - 1) / 2 * scene.pixel_nm
     at = config.bounds
-    read = config.camera.read_noise_e
+    read = config.camera.assumed.read_noise_e
     return Setting(
         config=config,
         scene=replace(scene, config=config),

@@ -236,6 +236,18 @@ def test_micro_manager(path: Path) -> None:
     assert found.source == "micromanager"
 
 
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_micro_manager_has_the_conversion_of_hamamatsu(path: Path, cameras: int) -> None:
+    """Of one camera; of two it is not known which one recorded."""
+    fields = {}
+    for k in range(cameras):
+        fields[f"Cam{k}-CONVERSION FACTOR COEFF"] = "0.46"
+        fields[f"Cam{k}-CONVERSION FACTOR OFFSET"] = {"PropVal": "100"}
+    found = metadata(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields)))
+    given = (0.46, 100.0) if cameras == 1 else (None, None)
+    assert (found.gain_e_per_adu, found.offset_adu) == given
+
+
 @pytest.mark.parametrize("interval", [0, 5])
 def test_micro_manager_falls_back_on_time_stamps(path: Path, interval: float) -> None:
     fields = {"PixelSizeUm": 0, "Exposure-ms": {"PropVal": "10"}, "Interval_ms": interval}

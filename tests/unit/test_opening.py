@@ -78,6 +78,9 @@ def test_counts_that_are_too_coarse_are_no_wrong_gain(gain: float) -> None:
     """Of 8 bits: noise of 0.3 counts, which rounding hides, whatever gain was configured."""
     counts = (_movie(0.0) // 1024).astype(np.uint8)
     message = diagnose_gain(counts, Camera(gain_e_per_adu=gain, well_depth_e=1e9)).message
+    if gain == 1024.0:  # which predicts the noise, with what rounding adds
+        assert message is None
+        return
     assert message is not None
     assert "record or export the movie with more bits" in message
     assert "set camera.gain" not in message

@@ -258,7 +258,7 @@ def test_dark_field(level_e: float | None, camera: dict, tmp_path: Path) -> None
     """
     config = _small(
         **DARK_FIELD,
-        camera=camera,
+        camera={"gain_e_per_adu": 1.0, **camera},  # which little light does not tell
         background={"level_e": level_e},
         simulation={
             "events": [GOLD_EVENTS[0]], "photons_per_pixel": 800.0, "background": "flat", "seed": 7,
@@ -327,7 +327,7 @@ def test_gain_offset_and_read_noise(told: bool, tmp_path: Path) -> None:
         _assert_true(analysis.table, truth, "mass")
         assert not analysis.warnings
     else:
-        analysis = fit_stack(movie, _small(camera={"offset_adu": 120.0}))
+        analysis = fit_stack(movie, _small(camera={"gain_e_per_adu": 1.0, "offset_adu": 120.0}))
         assert any("gain_e_per_adu" in text for text in analysis.warnings)
 
 

@@ -203,7 +203,7 @@ def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
-    pixel, camera = config.camera.pixel_size_nm, config.camera
+    pixel, camera = config.camera.pixel_size_nm, config.camera.assumed
     if pixel is None:
         raise ConfigError(
             "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
@@ -249,7 +249,7 @@ class _Picture:
             expected_likelihood(
                 model, grid, theta, at.photons_per_pixel, at.photons_per_pixel,
                 n_before=at.n_before, n_after=at.n_after,
-                read_noise_e=float(config.camera.read_noise_e),
+                read_noise_e=float(config.camera.assumed.read_noise_e),
             )
             for theta in thetas
         )  # fmt: skip

@@ -1,0 +1,251 @@
+r"""Which law the counts of a movie follow: a line, a wrong offset, gamma, saturation, other light.
+
+Let c = f(N) be the counts above the offset that N photoelectrons make, with light N that is Poisson
+and follows the laser's power ρ.  Pixels then have the variance and the slope
+
+    v = f′(N)²·N,        dm/d ln ρ = f′(N)·N ,
+
+so that against m = f(N) both are straight lines through zero for f linear, and for nothing else:
+
+===================  =======================  =================  ==========================
+law                  v                        dm/d ln ρ          contrast, measured over true
+===================  =======================  =================  ==========================
+linear               m/g                      m                  1
+offset wrong by s    (m − s)/g                m − s              (m − s)/m
+other light s        m/g                      m − s              (m − s)/m
+read noise           m/g + σ²                 m                  1
+noisy light          m/g + κm²                m                  1
+gamma, c ∝ N^γ       ∝ m^(2 − 1/γ)            γm                 γ
+saturation           N·e^(−2N/F)              N·e^(−N/F)         x/(eˣ − 1),  x = N/F
+===================  =======================  =================  ==========================
+
+with m = F(1 − e^(−N/F)) in the last row.  "Other light" is light that does not follow the laser, as
+a room's: it has shot noise, and no particle changes it.  The two lines end, as shares of the mean
+light, at (0, −(1 − γ)/(2γ − 1)) for gamma, at (−x/2, −3x/2) for weak saturation, at (s, s) for an
+offset and at (s, 0) for other light: with a laser that flickers by 1 % these are told apart.
+
+Without flicker there is the noise alone.  A noise that rises faster than the light above the offset
+says that the offset is too low: nothing that compresses does so.  One that rises more slowly is
+read noise, as far as cameras have it, or a law that bends: gamma and saturation are then alike.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from iscat_analysis.camera.calibration.transfer import Transfer
+from iscat_analysis.records import FloatArray
+
+Kind = Literal[
+    "linear", "offset", "other light", "read noise", "noisy light", "gamma", "saturation"
+]
+Curves = tuple[FloatArray, FloatArray]
+"""Variance and slope, each up to a factor."""
+
+BENT: tuple[Kind, ...] = ("gamma", "saturation")
+"""Laws by which counts are no line in light, so that masses are wrong whatever the numbers."""
+
+TOLERANCE = 0.01
+"""Share of the light, and of masses, that may be wrong before it is said."""
+
+SIGMAS = 4.0
+"""And the excess over the tolerance that chance must not explain."""
+
+_BETTER = 16.0  # of χ², by which a law with one number more must describe the pixels better
+_BOTH = 20.0  # the same, where an offset is wrong besides
+_ALIKE = 6.0  # of χ², within which another law is as good
+_RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
+_STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
+_MOST_FILLED = 0.98  # of full scale, up to which the light follows from the counts
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law and its number.
+
+    `value` is γ, N/F at the mean light, or the share s of the mean light; `offset` is the share
+    that an offset is wrong by besides; `contrast` is that measured over the true one, of a faint
+    particle in the mean light.
+    """
+
+    kind: Kind
+    value: float
+    se: float
+    contrast: float
+    contrast_se: float
+    offset: float = 0.0
+    chi2: float = 0.0
+    alike: tuple[Kind, ...] = ()
+    flickers: bool = False
+
+    @property
+    def bent(self) -> bool:
+        """Whether counts are no line in light, so that no offset makes masses right."""
+        # that it is no chance is known already: a line describes the pixels clearly worse
+        return self.kind in BENT and abs(1 - self.contrast) > TOLERANCE
+
+    @property
+    def dilutes(self) -> bool:
+        """Whether masses are wrong by an offset, or by light that no particle changes."""
+        wrong = abs(1 - self.contrast) > TOLERANCE + SIGMAS * self.contrast_se
+        return self.kind in ("offset", "other light") and wrong
+
+    @property
+    def certain(self) -> bool:
+        """Whether it is known by how much masses are wrong: no other kind of law is as good."""
+        return self.flickers or not self.alike
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Laws of one kind: curves of light over its mean for a number, where it starts and ends."""
+
+    kind: Kind
+    curves: Callable[[FloatArray, float], Curves]
+    contrast: Callable[[float], float]
+    start: float
+    ends: tuple[float, float]
+
+
+def _filled(u: FloatArray, x: float) -> FloatArray:
+    """Photoelectrons over those at full scale, of counts u over the mean; x at the mean."""
+    return -np.log1p(-np.minimum(-math.expm1(-x) * u, _MOST_FILLED))
+
+
+def _saturation(u: FloatArray, x: float) -> Curves:
+    n = _filled(u, x)
+    return n * np.exp(-2 * n), n * np.exp(-n)
+
+
+_FAMILIES = (
+    _Family("offset", lambda u, s: (u - s, u - s), lambda s: 1 - s, 0.0, (-3.0, 0.95)),
+    _Family("read noise", lambda u, r: (u + r, u), lambda _: 1.0, 0.01, (0.0, 3.0)),
+    _Family("gamma", lambda u, g: (np.power(u, 2 - 1 / g), u), lambda g: g, 0.9, (0.3, 1.0)),
+    _Family("saturation", _saturation, lambda x: x / math.expm1(x), 0.1, (1e-4, 4.0)),
+    _Family("other light", lambda u, s: (u, u - s), lambda s: 1 - s, 0.01, (0.0, 0.95)),
+    _Family("noisy light", lambda u, k: (u + k * u * u, u), lambda _: 1.0, 0.01, (0.0, 10.0)),
+)
+
+
+def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -3.0) -> Law:
+    """Find the law that describes the pixels best; a line unless another is clearly better.
+
+    `most_read` is the variance of the read noise, over that of the mean light, that a camera may
+    have without anybody saying so.  `least_offset` is how much too high the offset may be, as a
+    share of the light below zero: no camera has an offset below no counts.
+    """
+    u = found.light / found.level
+    flat = np.zeros(0)
+    linear = float(np.sum(_residuals(found, (u, u)) ** 2))
+    laws = []
+    for family in _FAMILIES:
+        if family.kind == "other light" and found.flicker is None:
+            continue
+        if family.kind == "offset":
+            family = replace(family, ends=(min(least_offset, -1e-6), family.ends[1]))
+        law = _fitted(found, u, family, flat)
+        if family.kind == "read noise" and law.value - 2 * law.se > most_read:
+            continue
+        laws.append(law)
+    best = min(laws, key=lambda law: law.chi2 + _RARE.get(law.kind, 0.0))
+    pairs = [
+        _fitted(found, u, family, np.zeros(1))
+        for family in _FAMILIES
+        if found.flicker is not None and family.kind in BENT
+    ]
+    both = min(pairs, key=lambda law: law.chi2, default=best)
+    if best.chi2 - both.chi2 > _BOTH:
+        return both
+    if linear - best.chi2 < _BETTER:
+        zero = next(law for law in laws if law.kind == "offset")
+        se = math.hypot(zero.value, zero.se)  # of zero, which is kept
+        flickers = found.flicker is not None
+        return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
+    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _ALIKE])
+
+
+def _among(best: Law, alike: list[Law]) -> Law:
+    """Widen the error of a law by what others that are as good say of the contrast."""
+    kinds = tuple(law.kind for law in alike if law.kind != best.kind)
+    if best.kind in BENT:
+        alike = [law for law in alike if law.kind in BENT]
+        weight = np.exp([(best.chi2 - law.chi2) / 2 for law in alike])
+        apart = [law.contrast_se**2 + (law.contrast - best.contrast) ** 2 for law in alike]
+        spread = math.sqrt(float(np.average(apart, weights=weight)))
+        return replace(best, alike=kinds, contrast_se=max(best.contrast_se, spread))
+    return replace(best, alike=kinds)
+
+
+def _residuals(found: Transfer, curves: Curves) -> FloatArray:
+    """Give what the best multiples of two curves leave over, in standard errors."""
+    rest = []
+    for seen, se, curve in (
+        (found.variance, found.variance_se, curves[0]),
+        (found.slope, found.slope_se, curves[1]),
+    )[: 1 if found.flicker is None else 2]:
+        model = curve / se
+        rest.append(seen / se - model * float(model @ (seen / se)) / float(model @ model))
+    return np.concatenate(rest)
+
+
+def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray) -> Law:
+    """Fit a law's number, and with an `offset` of one entry the share that is no light besides."""
+
+    def residuals(theta: FloatArray) -> FloatArray:
+        shift = float(theta[1]) if offset.size else 0.0
+        above = np.maximum(u - shift, 1e-3) / (1 - shift)
+        return _residuals(found, family.curves(above, float(theta[0])))
+
+    low, high = family.ends
+    ends = np.array([[low, *(-3.0 + 0 * offset)], [high, *(0.9 + 0 * offset)]])
+    theta, chi2, covariance = _least_squares(residuals, np.array([family.start, *offset]), ends)
+    value, se = float(theta[0]), math.sqrt(float(covariance[0, 0]))
+    shift = float(theta[1]) if offset.size else 0.0
+    step = 1e-4
+    slope = (family.contrast(value + step) - family.contrast(value)) / step
+    gradient = np.array([slope * (1 - shift), *(-family.contrast(value) + 0 * offset)])
+    return Law(
+        kind=family.kind,
+        value=value,
+        se=se,
+        contrast=family.contrast(value) * (1 - shift),
+        contrast_se=math.sqrt(max(float(gradient @ covariance @ gradient), 0.0)),
+        offset=shift,
+        chi2=chi2,
+        flickers=found.flicker is not None,
+    )
+
+
+def _least_squares(
+    residuals: Callable[[FloatArray], FloatArray], start: FloatArray, ends: FloatArray
+) -> tuple[FloatArray, float, FloatArray]:
+    """Minimise a sum of squares inside bounds: Levenberg and Marquardt, with differences.
+
+    Shapes: `start` (k,), `ends` (2, k), `theta` (k,), `covariance` (k, k).
+    """
+    low, high = ends
+    theta = np.clip(start, low, high)
+    rest, damping = residuals(theta), 1e-3
+    while True:
+        step = np.where(theta + _STEP < high, _STEP, -_STEP)
+        slopes = np.stack([(residuals(theta + d) - rest) / d.sum() for d in np.diag(step)], axis=1)
+        information = slopes.T @ slopes
+        while damping < _STUCK:
+            damped = information + damping * np.diag(np.diag(information) + 1e-300)
+            new = np.clip(theta - np.linalg.solve(damped, slopes.T @ rest), low, high)
+            tried = residuals(new)
+            if tried @ tried < rest @ rest:
+                break
+            damping *= 4
+        else:
+            break
+        gained = float(rest @ rest - tried @ tried)
+        theta, rest, damping = new, tried, damping / 8
+        if gained < _SETTLED:
+            break
+    return theta, float(rest @ rest), np.linalg.pinv(information)
