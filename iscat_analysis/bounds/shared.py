@@ -96,10 +96,12 @@ def displacement(
 def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> FloatArray:
     """Change of the mass that a calibration gives an amplitude, with the microscope.
 
+    A line that keeps the optics of its standards gives an amplitude one mass in any microscope.
+
     Shapes: result (len(names).
     """
     line = model.scale.calibration
-    if line is None or not names:
+    if line is None or line.optics is not None or not names:
         return np.zeros(len(names))
     *_, slopes = peak_gradient(model, model.height_nm, amplitude, names)
     return np.asarray(slopes / line.gradient_per_kda)

@@ -21,6 +21,7 @@ from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
     read_optics_file,
+    toml_value,
     with_absolute_paths,
 )
 from iscat_analysis.config.instrument import (
@@ -31,6 +32,7 @@ from iscat_analysis.config.instrument import (
     Optics,
     OpticsCovariance,
     Particle,
+    StandardsCamera,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import Config
@@ -77,6 +79,7 @@ __all__ = [
     "SimulatedEvent",
     "SimulatedMover",
     "Simulation",
+    "StandardsCamera",
     "TrackConfig",
     "config_to_toml",
     "configure",
@@ -84,5 +87,6 @@ __all__ = [
     "parse_config",
     "plausible_pixel",
     "read_optics_file",
+    "toml_value",
     "with_absolute_paths",
 ]

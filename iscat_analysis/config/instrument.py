@@ -270,10 +270,24 @@ class Particle(Section):
         return self
 
 
+class StandardsCamera(Section):
+    """The detector with which the standards of a calibration were recorded."""
+
+    pixel_size_nm: Positive | None = Field(None, description="in the sample plane")
+    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(1, description="per axis")
+    gain_e_per_adu: Positive | None = Field(
+        None, description="photoelectrons per count, where it is one number"
+    )
+    offset_adu: Finite | None = Field(
+        None, description="counts in the dark, where they are one number"
+    )
+
+
 class Calibration(Section):
     """Contrast against mass; present, it replaces the model's absolute scale.
 
-    Signed peak contrast = gradient·mass + sign(mass)·offset.
+    Signed peak contrast = gradient·mass + sign(mass)·offset, at the optics of the standards; at
+    other optics the model carries it over.
     """
 
     gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
@@ -284,6 +298,19 @@ class Calibration(Section):
     offset_se: NonNegative = Field(0.0, description="standard error of offset")
     correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
         0.0, description="of the errors of gradient_per_kda and offset"
+    )
+    optics: Optics | None = Field(
+        None, description="keys of [optics] with which the standards were analysed"
+    )
+    covariance: OpticsCovariance | None = Field(
+        None, description="of these where they were learned, { names, matrix }"
+    )
+    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
+        None, description="particle.height_nm with which the standards were analysed"
+    )
+    camera: StandardsCamera | None = Field(None, description="with which they were recorded")
+    optics_assumed: bool = Field(
+        False, description="true: nobody recorded the optics; those configured are taken"
     )
 
     @model_validator(mode="after")

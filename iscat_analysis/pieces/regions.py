@@ -28,6 +28,7 @@ from iscat_analysis.records import (
     Candidate,
     FitResult,
     Status,
+    flagged,
     verdict,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
@@ -153,7 +154,9 @@ def fit_rois(
     compile_kernels(counts.model, parts_of(FREE_PARAMETERS[mode], posteriors=False))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    return numbered(lines_from(rows), range(count))
+    table = numbered(lines_from(rows), range(count))
+    refused = bool(counts.model.scale.refusal)
+    return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 
 
 def lines_from(lines: Sequence[Mapping[str, Any]], *further: str) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from iscat_analysis.diagnosis.causes import (
     course_warning,
     line_warning,
     plane_warning,
+    scale_warning,
     sign_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
@@ -25,7 +26,15 @@ from iscat_analysis.fitting.run import Run
 from iscat_analysis.movie.stack import printable
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.records import Analysis, Film, Provenance, silent
+from iscat_analysis.records import (
+    Analysis,
+    Film,
+    Provenance,
+    Status,
+    TrackStatus,
+    flagged,
+    silent,
+)
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
@@ -56,9 +65,11 @@ def gather(
         further["optics"] = found.optics
     further |= extra
     table, achieved = reported_rows(found)
+    scale = scene.model.scale
     for doubt in (
+        scale_warning(scale),
         line_warning(config, table),
-        bend_warning(scene.model.scale, table),
+        bend_warning(scale, table),
         sign_warning(config, table),
         course_warning(table) if ready.way == "sliding" else "",
     ):
@@ -95,6 +106,9 @@ def gather(
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(scene, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")
+    if scale.refusal:
+        table = flagged(table, Status.UNCALIBRATED_OPTICS)
+        tracks = None if tracks is None else flagged(tracks, TrackStatus.UNCALIBRATED_OPTICS)
     summary = summary_of(scene, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",

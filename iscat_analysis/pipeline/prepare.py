@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
@@ -99,10 +100,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         config, learned = learn_sign(
             steady, wrong, camera, tell=run.tell, notify=run.notify, opening=opened
         )
+        config = _with_standards(config, run)
     else:
         config, learned = learn_optics(
-            steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
-        )
+            steady, _with_standards(config, run), camera,
+            tell=run.tell, notify=run.notify, opening=opened,
+        )  # fmt: skip
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
@@ -120,6 +123,20 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary
     )  # fmt: skip
+
+
+def _with_standards(config: Config, run: Run) -> Config:
+    """Say once that a gradient came without the optics of its standards, and where it is taken."""
+    found = with_standards(config)
+    if found is not config:
+        optics = found.optics
+        run.notify(
+            "[calibration] does not say with what optics its standards were measured: the gradient "
+            f"is taken at those of the configuration (focus {optics.focus_nm:g} nm, NA "
+            f"{optics.na:g}, height {found.particle.height_nm:g} nm); `iscat calibrate mass` "
+            "writes a line with its optics"
+        )
+    return found
 
 
 def _landing_light(

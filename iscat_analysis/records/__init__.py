@@ -24,6 +24,7 @@ from iscat_analysis.records.columns import (
     PARAMETERS,
     REPEAT_COLUMNS,
     TRACK_COLUMNS,
+    flagged,
     free_parameters,
     track_numbers,
 )
@@ -75,6 +76,7 @@ __all__ = [
     "Trace",
     "TrackStatus",
     "Windows",
+    "flagged",
     "free_parameters",
     "silent",
     "track_numbers",

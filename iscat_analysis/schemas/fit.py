@@ -330,6 +330,16 @@ class Distribution(Document):
     notes: list[str] = key("What the user should know")
 
 
+class Scale(Closed):
+    """How far the scale of masses was carried from the optics of its standards."""
+
+    carried: Number = key("Contrast per kDa with these optics over that with the standards'")
+    optics: Literal["recorded", "configured"] = key(
+        "Where the standards' are from: their record, or the configuration for want of one"
+    )
+    refusal: str | None = key("Why the model does not carry the scale so far; rows are flagged")
+
+
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
@@ -339,6 +349,7 @@ class Summary(Document):
     emission: Emission = key("Emission model")
     convention: Convention = key("Formulas")
     mass_scale: str = key("Where the mass scale comes from: a calibration, or the model")
+    scale: Scale = maybe("With a calibration: how far it was carried")
     status: dict[str, Count] = key("Events by status")
     frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")
     frames_after: tuple[Count, Count] | None = key("Fitted frames [start, stop)")

@@ -8,7 +8,8 @@ shrink when events are averaged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,11 +18,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds import imitation, joint_information, mass_drift, peak_gradient
+from iscat_analysis.bounds import imitation, joint_information, peak_gradient
 from iscat_analysis.calibration.mass import line_sigma_kda
-from iscat_analysis.config import Config
+from iscat_analysis.config import ABERRATIONS, Config, Optics
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
-from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.optics.forward import (
+    ForwardModel,
+    MassScale,
+    PixelGrid,
+    forward_model,
+    peak_per_amplitude,
+)
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
 
@@ -151,7 +158,7 @@ def _shifts(
     respond = _Response(
         replace(model, scale=MassScale()), grid, names, tuple(free),
         level=config.background.method == "sliding",
-        frames=(int(table["n_before"].median()), int(table["n_after"].median())),
+        frames=_frames(table),
         contrast=_is_about_contrast(config),
     )  # fmt: skip
     by_amplitude = _lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
@@ -165,12 +172,70 @@ def _shifts(
         shifts[near] += weight[near, None, None] * found
     shifts[:, 4] *= table["contrast"].to_numpy(dtype=float)[:, None]
     if free[3]:
-        shifts[:, 3] *= amplitude[:, None]
-        if model.scale.calibration is not None:
-            peak = np.array([mass_drift(model, a, names) / a for a in nodes])
-            drift = amplitude[:, None] * (by_amplitude @ peak)
-            shifts[:, 3] = _calibrated(config, model, respond, amplitude, shifts[:, 3], drift)
+        shifts[:, 3] *= (amplitude * model.scale.slopes(amplitude))[:, None]
+        if _standards_share(config):
+            line, scale = config.calibration, model.scale
+            gradient = line.gradient_per_kda if line is not None else 1.0
+            contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
+            shifts[:, 3] -= (contrast / gradient)[:, None] * respond.faint()
     return shifts
+
+
+def _standards_share(config: Config) -> bool:
+    """Tell whether the optics of the standards are those of the movie, errors included.
+
+    Line and contrasts are then off by the same factor, that of a faint particle, and only what
+    others have beyond it remains.
+    """
+    line, optics = config.calibration, config.optics
+    if line is None:
+        return False
+    if line.optics is None:
+        return True
+    names = optics.covariance.names if optics.covariance is not None else ()
+    here, there = settings_of(optics, names), settings_of(line.optics, names)
+    return line.covariance == optics.covariance and np.allclose(here, there, rtol=1e-9, atol=0)
+
+
+def settings_of(optics: Optics, names: Sequence[str]) -> FloatArray:
+    """Give measurable parameters of optics.
+
+    Shapes: result (len(names),).
+    """
+    terms = optics.aberrations_nm
+    return np.array(
+        [terms.get(name, 0.0) if name in ABERRATIONS else getattr(optics, name) for name in names]
+    )
+
+
+def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what the learned optics of the standards may be wrong by, where they are others."""
+    line, pixel = config.calibration, config.camera.pixel_size_nm
+    if line is None or line.optics is None or line.covariance is None or pixel is None:
+        return {}
+    if line.optics.psf == "measured" or _standards_share(config):
+        return {}
+    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode]:
+        return {}
+    height = config.particle.height_nm if line.height_nm is None else line.height_nm
+    particle = config.particle.model_copy(update={"height_nm": height})
+    there = config.model_copy(
+        update={"optics": line.optics, "particle": particle, "calibration": None}
+    )
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    free = [name in FREE_PARAMETERS["mass"] for name in PARAMETERS]
+    respond = _Response(
+        forward_model(there, 1.05 * grid.diagonal_nm / 2), grid, line.covariance.names,
+        tuple(free), level=config.background.method == "sliding", frames=_frames(table),
+        contrast=False,
+    )  # fmt: skip
+    relative = respond.faint()
+    variance = float(relative @ np.array(line.covariance.matrix) @ relative)
+    return {"mass_kda": np.abs(table["mass_kda"].to_numpy(float)) * math.sqrt(max(variance, 0.0))}
+
+
+def _frames(table: pd.DataFrame) -> tuple[int, int]:
+    return int(table["n_before"].median()), int(table["n_after"].median())
 
 
 @dataclass(frozen=True)
@@ -211,37 +276,15 @@ class _Response:
                 out[index, 4] = (own @ moved[:4] + shared) / contrast
         return out
 
+    def faint(self) -> FloatArray:
+        """Relative shift of the amplitude of a faint particle at the model's height, (k,)."""
+        faint = 1e-6 / peak_per_amplitude(self.model)
+        moved: FloatArray = self.at(self.model.height_nm, np.array([faint]))[0, 3]
+        return moved
+
     @property
     def _centre(self) -> tuple[float, float]:
         return float(np.mean(self.grid.x_nm)), float(np.mean(self.grid.y_nm))
-
-
-def _calibrated(
-    config: Config,
-    model: ForwardModel,
-    respond: _Response,
-    amplitude: FloatArray,
-    moves: FloatArray,
-    drift: FloatArray,
-) -> FloatArray:
-    """Turn shifts of the amplitude (n, k) into those of a mass that a line ties to the contrast.
-
-    The peak contrast C = L a + Q a² moves less than the amplitude, because L moves too: `drift`.
-    Where the optics come from a file, the standards were fitted with the same: line and contrasts
-    are off by the same factor, that of a faint particle, and only what bright ones have beyond it
-    remains.
-    """
-    scale, names = model.scale, respond.names
-    gradient = float(scale.slope(0.0))
-    slope = scale.slopes(amplitude)
-    shifts = slope[:, None] * moves + drift
-    if config.optics.file is not None:
-        faint = 1e-6 * np.abs(amplitude).max()
-        relative = respond.at(model.height_nm, np.array([faint]))[0, 3]
-        relative = relative + mass_drift(model, faint, names) / (faint * gradient)
-        contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
-        shifts -= (contrast * gradient / scale.linear)[:, None] * relative
-    return np.asarray(shifts)
 
 
 def _amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
@@ -298,4 +341,9 @@ def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatA
     return {"mass_kda": np.abs(mass) * relative, "contrast": np.abs(contrast) * relative}
 
 
-_SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics, _of_the_template)
+_SOURCES: tuple[Source, ...] = (
+    _of_the_line,
+    _of_the_optics,
+    _of_the_standards,
+    _of_the_template,
+)
