@@ -33,6 +33,7 @@ from iscat_analysis.config.instrument import (
     OpticsCovariance,
     Particle,
     StandardsCamera,
+    Uncertainty,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import Config
@@ -81,6 +82,7 @@ __all__ = [
     "Simulation",
     "StandardsCamera",
     "TrackConfig",
+    "Uncertainty",
     "config_to_toml",
     "configure",
     "load_config",

@@ -193,7 +193,7 @@ def with_absolute_paths(config: Config) -> Config:
     for section, keys in _PATH_KEYS.items():
         name, _, inner = section.partition(".")
         whole: Any = changed.get(name, getattr(config, name))
-        table = getattr(whole, inner, None) if inner else whole
+        table: Any = getattr(whole, inner, None) if inner else whole
         paths = {
             key: str(Path(value).absolute())
             for key in keys

@@ -299,6 +299,9 @@ class Calibration(Section):
     correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
         0.0, description="of the errors of gradient_per_kda and offset"
     )
+    dof: Annotated[int, Field(ge=0)] | None = Field(
+        None, description="degrees of freedom of the line: standards beyond two"
+    )
     optics: Optics | None = Field(
         None, description="keys of [optics] with which the standards were analysed"
     )
@@ -325,3 +328,20 @@ class Calibration(Section):
                 "cent or ppm, nor per Da or MDa"
             )
         return self
+
+
+class Uncertainty(Section):
+    """Standard deviations of inputs that nobody measured; 0 turns one off.
+
+    Where standards were recorded with the same optics, they share these errors, which cancel.
+    """
+
+    wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
+    n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
+    n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
+    height_nm: NonNegative = Field(
+        2.0, description="of the mean height of particles, where particle.height_nm is fixed"
+    )
+    magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
+        0.005, description="of camera.pixel_size_nm, as a share of it"
+    )

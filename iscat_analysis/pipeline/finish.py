@@ -38,6 +38,7 @@ from iscat_analysis.records import (
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
+from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
 
 
@@ -64,7 +65,7 @@ def gather(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    table, achieved = reported_rows(found)
+    table, achieved, budget = reported_rows(found)
     scale = scene.model.scale
     for doubt in (
         scale_warning(scale),
@@ -120,6 +121,7 @@ def gather(
     )
     summary |= {
         **further,
+        **({"budget": budget} if budget else {}),
         "input": {
             "path": provenance.input_path,
             "sha256": provenance.input_sha256,
@@ -147,7 +149,14 @@ def gather(
         tracks=tracks,
         films=films,
     )
-    return replace(analysis, summary=summary | species_of(scene, table))
+    described = species_of(scene, table)
+    explained = {"explained_kda": explained_kda(budget)}
+    described["across_particles"] = [one | explained for one in described["across_particles"]]
+    wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)
+    if wide:
+        run.tell(wide)
+    warned = {"warnings": run.warnings}
+    return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 
 
 def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

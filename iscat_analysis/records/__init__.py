@@ -18,6 +18,7 @@ from iscat_analysis.records.arrays import (
     silent,
 )
 from iscat_analysis.records.columns import (
+    BUDGET_COLUMNS,
     EVENT_COLUMNS,
     FRAME_COLUMN,
     FREE_PARAMETERS,
@@ -46,6 +47,7 @@ from iscat_analysis.records.frames import (
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
+    "BUDGET_COLUMNS",
     "EVENT_COLUMNS",
     "FRAME_COLUMN",
     "FREE_PARAMETERS",

@@ -53,6 +53,10 @@ TRACK_COLUMNS = (
 """The columns of ``tracks.csv``, in order."""
 
 
+BUDGET_COLUMNS = ("name", "kind", "common", "sigma_mass_kda", "sigma_rel", "dof", "remedy")
+"""What is said of each source of the error of a mass."""
+
+
 def flagged(table: pd.DataFrame, flag: str) -> pd.DataFrame:
     """Add a flag to all rows of a table of events or tracks; it is the status of those ok."""
     before = table["flags"].fillna("").astype(str)

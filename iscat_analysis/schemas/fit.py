@@ -247,6 +247,7 @@ class Across(Closed):
     width_high: Number = key("The other end [kDa]")
     count: Number = key("Its events")
     spread_over_sigma: Number = key("Scatter of its events over their median σ")
+    explained_kda: NotNegative = maybe("Width that the budget explains [kDa]")
 
 
 class Repeats(Closed):
@@ -330,6 +331,18 @@ class Distribution(Document):
     notes: list[str] = key("What the user should know")
 
 
+class BudgetEntry(Closed):
+    """One source of the error of a mass: medians over the rows that are ok."""
+
+    name: str = key("What it is")
+    kind: Literal["measured", "learned", "assumed"] = key("How its size is known")
+    common: bool = key("Whether all rows share it; these add up to systematic_mass_kda")
+    sigma_mass_kda: Number = key("Its standard deviation [kDa]; null where nothing tells it")
+    sigma_rel: Number = key("The same over the mass")
+    dof: Number = key("Degrees of freedom; null where there are many, or it was not measured")
+    remedy: str = key("What would shrink it")
+
+
 class Scale(Closed):
     """How far the scale of masses was carried from the optics of its standards."""
 
@@ -372,6 +385,7 @@ class Summary(Document):
     blocks: Blocks = maybe("Mode track: blocks of frames that have a background each")
     tracks: Count = maybe("Mode track: tracks found")
     motion: Motion = maybe("Mode track: what the tracks come to")
+    budget: list[BudgetEntry] = maybe("Where masses are fitted: what their error is made of")
     across_particles: list[Across] = maybe(
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )

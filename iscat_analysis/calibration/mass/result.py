@@ -102,6 +102,7 @@ class MassCalibration:
             f"gradient_se_per_kda = {s_se:.4g}  # {100 * abs(s_se / self.gradient_per_kda):.2g} %\n"
             f"offset_se = {o_se:.4g}\n"
             f"correlation = {self.covariance[0, 1] / (s_se * o_se):.5f}\n"
+            f"dof = {self.dof}\n"
             f"{self.recorded.to_toml() if self.recorded else ''}"
         )
 
