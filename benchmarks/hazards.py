@@ -40,7 +40,7 @@ from instruments import (
 import iscat_analysis as ia
 
 RESULTS = Path(__file__).resolve().parent / "results"
-SHAPE, COUNT = (700, 128, 128), 24
+SHAPE, COUNT = (900, 160, 160), 36
 PIXEL_NM, GAIN = 84.0, 4.0
 NOMINAL = Instrument(emission="reciprocal")
 SIGMAS, BEYOND, NEAR_PX, NEAR_FRAMES = 2.0, 5.0, 3.0, 8
@@ -157,7 +157,7 @@ def analyse(row: Row, strength: float, seed: int) -> tuple[pd.DataFrame, dict[st
     """Analyse one movie; its rows with their truth, and what the summary says."""
     case = row.make(strength, seed)
     result = ia.fit_movie(case.counts, settings={**SETUP, **case.settings}, name="movie")
-    table = matched(case, result.events)
+    table = matched(case, result.table)
     if "systematic_mass_kda" not in table:
         table["systematic_mass_kda"] = 0.0
     return table.assign(seed=seed), dict(result.summary)
@@ -184,7 +184,9 @@ def judge(name: str, row: Row, strength: float, seeds: range) -> dict[str, Any]:
     beyond = int((pulls[good].abs() > BEYOND).sum())
     bias = float(relative.mean() - 1)
     kept = flagged == 1.0 or (abs(bias) <= SIGMAS * whole and not beyond)
-    said = [text for text in found[0][1]["warnings"] if "scale of masses" in text]
+    said = sorted(
+        {text for _, summary in found for text in summary["warnings"] if "masses" in text}
+    )
     return {
         "row": name, "strength": strength, "movies": len(seeds), "rows": len(table),
         "ok": int((table["status"] == "ok").sum()), "flagged": flagged,
