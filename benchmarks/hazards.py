@@ -1,4 +1,4 @@
-"""Movies that break what an analysis takes for granted: is the error bar right, or a flag set?
+"""Movies that break what an analysis takes for granted: the error bar is right, or a flag is set.
 
     python benchmarks/hazards.py [--quick] [--movies 5] [--seed N] [--only TEXT]
 

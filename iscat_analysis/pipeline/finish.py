@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.calibration.mass import as_given
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.diagnosis.causes import (
     bend_warning,
@@ -134,7 +135,7 @@ def gather(
     }
     frames, first = _each_once(compared)
     analysis = Analysis(
-        config_toml=config_to_toml(config),
+        config_toml=config_to_toml(as_given(config)),
         mode=scene.mode,
         scheme=config.optics.scheme,
         pixel_size_nm=scene.pixel_nm,

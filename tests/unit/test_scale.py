@@ -13,7 +13,12 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import mass_calibration
-from iscat_analysis.calibration.mass import contrast_over, standards_of, with_standards
+from iscat_analysis.calibration.mass import (
+    as_given,
+    contrast_over,
+    standards_of,
+    with_standards,
+)
 from iscat_analysis.config import Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
@@ -133,10 +138,12 @@ def test_a_gradient_without_a_record_is_taken_at_the_configured_optics() -> None
     assert pinned.calibration is not None
     assert pinned.calibration.optics_assumed
     assert with_standards(pinned) is pinned
+    assert as_given(pinned) == _config()
     learned = pinned.model_copy(
         update={"optics": pinned.optics.model_copy(update={"focus_nm": -330.0})}
     )
     assert forward_model(learned, 1000.0).scale.carried == pytest.approx(0.8789, abs=1e-4)
+    assert as_given(learned) is learned
     # whether the standards had the optics of the movie nobody knows: the budget has the factor
     scale = forward_model(learned, 1000.0).scale
     sure = configure(learned, settings={f"uncertainty.{key}": 0.0 for key in _INPUTS})

@@ -26,6 +26,7 @@ from iscat_analysis.calibration.mass.result import (
 )
 from iscat_analysis.calibration.mass.standards import (
     Standards,
+    as_given,
     contrast_over,
     standards_of,
     with_standards,
@@ -39,6 +40,7 @@ __all__ = [
     "Line",
     "MassCalibration",
     "Standards",
+    "as_given",
     "calibrate_mass",
     "contrast_over",
     "find_contrast_peaks",

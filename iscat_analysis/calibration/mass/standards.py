@@ -89,6 +89,15 @@ def with_standards(config: Config) -> Config:
     return config.model_copy(update={"calibration": line.model_copy(update=update)})
 
 
+def as_given(config: Config) -> Config:
+    """Take back what `with_standards` assumed, where the optics are still those configured."""
+    line = config.calibration
+    if line is None or not line.optics_assumed or standards_of(config).optics != line.optics:
+        return config
+    update = dict.fromkeys(("optics", "covariance", "height_nm"), None) | {"optics_assumed": False}
+    return config.model_copy(update={"calibration": line.model_copy(update=update)})
+
+
 def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     """Give the contrast per mass over that of standards, and why the model does not carry it."""
     config = config.model_copy(update={"calibration": None})
