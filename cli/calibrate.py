@@ -146,7 +146,9 @@ def mass(
 ) -> None:
     """Fit the line between contrast and mass through the peaks of standards.
 
-    Writes calibration.json, calibration.toml (a section to paste) and calibration.html.
+    Writes calibration.json, calibration.toml (a section to paste) and calibration.html.  Of the
+    folder of an analysis the section keeps the optics with which the standards were measured, so
+    that it serves movies at another focus too.
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.bounds import parse_scan, scan
 from iscat_analysis.config import Config
 from iscat_analysis.records import (
+    BUDGET_COLUMNS,
     FREE_PARAMETERS,
     Analysis,
     EventView,
@@ -82,6 +83,16 @@ class Result:
     def summary(self) -> Mapping[str, Any]:
         """Counts, medians, efficiency and provenance, as in ``summary.json``."""
         return self.analysis.summary
+
+    @property
+    def budget(self) -> pd.DataFrame:
+        """What the error of a mass is made of, one row per source, as in ``summary.json``.
+
+        Columns `name`, `kind` (measured, learned or assumed), `common` (shared by all rows: these
+        add up to ``systematic_mass_kda``), `sigma_mass_kda` [kDa], `sigma_rel`, `dof`, `remedy`;
+        medians over the rows that are ok.  Empty where no masses are fitted.
+        """
+        return pd.DataFrame(self.summary.get("budget", ()), columns=list(BUDGET_COLUMNS))
 
     @property
     def mode(self) -> str:

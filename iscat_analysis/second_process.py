@@ -18,7 +18,7 @@ from iscat_analysis.records import silent
 from iscat_analysis.threads import allotted, processors
 
 R = TypeVar("R")
-_Warned = tuple[Warning | str, type[Warning], str, int]
+_Warned = tuple[str, type[Warning], str, int]
 
 
 class SecondProcess:
@@ -91,4 +91,4 @@ def _with_half(job: Callable[..., R], *arguments: Any) -> tuple[R, list[_Warned]
         allotted(max(1, processors() // 2), lambda: None),
     ):
         result = job(*arguments, progress=silent)
-    return result, [(one.message, one.category, one.filename, one.lineno) for one in caught]
+    return result, [(str(one.message), one.category, one.filename, one.lineno) for one in caught]

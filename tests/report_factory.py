@@ -108,8 +108,9 @@ def make_analysis(
     status = np.array([Status.OK.value] * n, dtype=object)
     flags = np.array([""] * n, dtype=object)
     for k, verdict in enumerate([s for s in Status if s is not Status.OK]):
-        status[5 + 6 * k :: 41] = verdict.value
-        flags[5 + 6 * k :: 41] = f"{verdict.value};masked_pixels"
+        first = (5 + 6 * k) % 37
+        status[first::41] = verdict.value
+        flags[first::41] = f"{verdict.value};masked_pixels"
     frame = pd.DataFrame({**table, "status": status, "flags": flags}, columns=list(EVENT_COLUMNS))
     if n > 6:
         frame.loc[frame.index[5], [c for c in frame if c.startswith("sigma_")]] = np.nan
@@ -228,6 +229,23 @@ def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]
         "masked_pixels": np.int64(0),
         "detection_threshold_snr": 5.0,
         "medians": {},
+        "budget": [
+            {
+                "name": name,
+                "kind": kind,
+                "common": common,
+                "sigma_mass_kda": size,
+                "dof": dof,
+                "sigma_rel": None if size is None else size / 480,
+                "remedy": "more light",
+            }
+            for name, kind, common, size, dof in (
+                ("photon noise", "measured", False, 6.0, None),
+                ("line of the standards", "measured", True, 4.8, 1.0),
+                ("wavelength", "assumed", True, 3.6, None),
+                ("scale of the model", "assumed", True, None, None),
+            )
+        ],
         "precision": {"x_nm": {f"{name}_median": 1.5 for name in medians}},
         "seconds": {"fit": np.float64(1.25)},
         "input": {"path": HOSTILE, "sha256": "0" * 64},

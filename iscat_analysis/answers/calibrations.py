@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,15 @@ import numpy as np
 import pandas as pd
 import tifffile
 
-from iscat_analysis.calibration.mass import Landing, MassCalibration, calibrate_mass
+from iscat_analysis.calibration.mass import (
+    Landing,
+    MassCalibration,
+    calibrate_mass,
+    standards_of,
+)
 from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
-from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
+from iscat_analysis.config import Config, load_config
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.instrument.learner import OpticsCalibration
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.picture import MeasuredPicture, measure_template
@@ -53,6 +59,12 @@ TEMPLATE_FILES = frozenset({"template.json", "template.npz", "template.html", "o
 """Everything a measured picture may leave in its folder."""
 
 _BINS = 120
+
+_NO_RECORD = (
+    "does not say with what optics the standards were measured, so that [calibration] has no "
+    "record of them and is taken at those that are configured where it is used; give the folder "
+    "of an analysis, with its config.toml"
+)
 
 
 def camera_calibration(
@@ -165,10 +177,15 @@ def mass_calibration(
     *,
     standards_se_kda: Sequence[float] | None = None,
     landing: Landing | None = None,
+    standards: Config | None = None,
     overwrite: bool = False,
     notify: Callable[[str], None] | None = None,
 ) -> MassCalibration:
-    """Calibrate contrast against standards and write what was found."""
+    """Calibrate contrast against standards and write what was found.
+
+    The configuration of their analysis, which says with what optics they were measured, is that
+    beside ``fits.csv`` where none is given.
+    """
     check_output(out, overwrite, known=MASS_FILES)
     table = read_contrasts(events)
     contrast = table["contrast"].to_numpy(float)
@@ -183,6 +200,12 @@ def mass_calibration(
         landing=landing,
         name=str(events),
     )
+    standards = analysed_with(events) if standards is None else standards
+    if standards is None:
+        notes = (*found.notes, f"{events}: {_NO_RECORD}")
+        found = replace(found, notes=notes)
+    else:
+        found = replace(found, recorded=standards_of(standards))
     for note in found.notes:
         if notify is not None:
             notify(note)
@@ -205,9 +228,25 @@ def mass_calibration(
     return found
 
 
+def analysed_with(events: Path) -> Config | None:
+    """Read the configuration with which a table of this package was made; None where it is lost."""
+    path = _table(events)
+    beside = path.with_name("config.toml")
+    if path.name != "fits.csv" or not is_file(beside):
+        return None
+    try:
+        return load_config(beside)
+    except ConfigError:
+        return None
+
+
+def _table(path: Path) -> Path:
+    return path / "fits.csv" if is_file(path / "fits.csv") else path
+
+
 def read_contrasts(path: Path) -> pd.DataFrame:
     """Read contrasts and masses from a table of this package or of Refeyn's programs."""
-    path = path / "fits.csv" if is_file(path / "fits.csv") else path
+    path = _table(path)
     try:
         with open_regular(path) as file:
             first = file.readline(4096)
@@ -226,7 +265,8 @@ def read_contrasts(path: Path) -> pd.DataFrame:
         return table
     try:
         table = pd.read_csv(path, sep=between, decimal=decimal_mark(between))
-        good = table[table["status"] == Status.OK.value]
+        # a scale that other optics have makes the masses wrong, not the contrasts
+        good = table[table["status"].isin([Status.OK.value, Status.UNCALIBRATED_OPTICS.value])]
         columns = good[["contrast", "mass_kda", "sigma_mass_kda"]].astype(float)
     except (ValueError, KeyError, UnicodeDecodeError) as error:
         raise DataError(

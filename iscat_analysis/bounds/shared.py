@@ -24,20 +24,28 @@ _PEAK_NM = 0.1  # to which it is found
 
 
 def joint_information(
-    likelihood: Likelihood, theta: FloatArray, names: Sequence[str]
+    likelihood: Likelihood,
+    theta: FloatArray,
+    names: Sequence[str],
+    others: Sequence[FloatArray] = (),
 ) -> FloatArray:
     """Fisher information of one particle about the microscope and about itself.
 
-    Shapes: `theta` (5,), result (len(names).
+    `others` are derivatives of the signal with respect to further parameters, which come first;
+    n is their number, that of the names, and 5.
+
+    Shapes: `theta` (5,), `others` (ny, nx) each, result (n, n).
     """
     x, y, z, amplitude, level = (float(value) for value in theta)
     model, grid = likelihood.model, likelihood.grid
     signal, own = model.amplitude_gradient(grid, x, y, z, amplitude)
-    rows = np.empty((len(names) + 5, signal.size))
+    further = [*others]
     if names:
         place = (grid, x, y, z, float(model.scale.mass(np.array(amplitude))))
-        rows[: len(names)] = model.joint_gradient(*place, names)[2].reshape(len(names), -1)
-    rows[len(names) : -1] = own.reshape(4, -1)
+        further += [*model.joint_gradient(*place, names)[2]]
+    rows = np.empty((len(further) + 5, signal.size))
+    for row, derivative in zip(rows, [*further, *own], strict=False):
+        row[:] = derivative.ravel()
     _, _, information, by_signal, by_level = likelihood.noise.terms(likelihood.data, signal, level)
     rows[:-1] *= by_signal.ravel()
     rows[-1] = by_level.ravel()
@@ -93,10 +101,12 @@ def displacement(
 def mass_drift(model: ForwardModel, amplitude: float, names: Sequence[str]) -> FloatArray:
     """Change of the mass that a calibration gives an amplitude, with the microscope.
 
+    A line that keeps the optics of its standards gives an amplitude one mass in any microscope.
+
     Shapes: result (len(names).
     """
     line = model.scale.calibration
-    if line is None or not names:
+    if line is None or line.optics is not None or not names:
         return np.zeros(len(names))
     *_, slopes = peak_gradient(model, model.height_nm, amplitude, names)
     return np.asarray(slopes / line.gradient_per_kda)

@@ -21,6 +21,7 @@ from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
     read_optics_file,
+    toml_value,
     with_absolute_paths,
 )
 from iscat_analysis.config.instrument import (
@@ -33,6 +34,8 @@ from iscat_analysis.config.instrument import (
     Optics,
     OpticsCovariance,
     Particle,
+    StandardsCamera,
+    Uncertainty,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.schema import Config
@@ -81,12 +84,15 @@ __all__ = [
     "SimulatedEvent",
     "SimulatedMover",
     "Simulation",
+    "StandardsCamera",
     "TrackConfig",
+    "Uncertainty",
     "config_to_toml",
     "configure",
     "load_config",
     "parse_config",
     "plausible_pixel",
     "read_optics_file",
+    "toml_value",
     "with_absolute_paths",
 ]

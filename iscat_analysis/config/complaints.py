@@ -64,7 +64,12 @@ def _nearest(word: str, location: list[str]) -> str:
         return known[small if small in known else begun[0]]
     if small in Config.model_fields:
         return f"section [{small}]"
-    sections = [section for section in Config.model_fields if small in known_keys([section])]
+    # [uncertainty] has keys of other sections, and nobody who writes those means an error
+    sections = [
+        section
+        for section in Config.model_fields
+        if section != "uncertainty" and small in known_keys([section])
+    ]
     if sections and len(location) < 2:
         return " or ".join(f"{section}.{small}" for section in sections)
     near = difflib.get_close_matches(small, list(known), n=1, cutoff=_ALIKE)

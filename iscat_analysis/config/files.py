@@ -144,28 +144,29 @@ def config_to_toml(
                 continue
             if value is None and not comments:
                 continue
-            line = f"# {key} =" if value is None else f"{key} = {_toml_value(value)}"
+            line = f"# {key} =" if value is None else f"{key} = {toml_value(value)}"
             lines.append(f"{line:<36} # {info.description}" if comments else line)
         blocks.append("\n".join([*lines, *tables]))
     return "\n\n".join(blocks) + "\n"
 
 
 def _table_toml(key: str, table: Section) -> str:
-    lines = [f"{k} = {_toml_value(v)}" for k, v in table.model_dump().items() if v is not None]
+    lines = [f"{k} = {toml_value(v)}" for k, v in table.model_dump().items() if v is not None]
     return "\n".join([f"[[simulation.{key}]]", *lines])
 
 
-def _toml_value(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """Write a value as TOML has it."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
         return in_toml(value)
     if isinstance(value, tuple):
-        return "[" + ", ".join(_toml_value(v) for v in value) + "]"
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
     if isinstance(value, Section):
-        return _toml_value(value.model_dump(exclude_none=True))
+        return toml_value(value.model_dump(exclude_none=True))
     if isinstance(value, dict):
-        items = ", ".join(f"{k} = {_toml_value(v)}" for k, v in value.items())
+        items = ", ".join(f"{k} = {toml_value(v)}" for k, v in value.items())
         return f"{{ {items} }}" if items else "{}"
     return repr(value)
 
@@ -174,6 +175,7 @@ _PATH_KEYS = {
     "optics": ("file", "template"),
     "camera": ("gain_e_per_adu", "offset_adu", "read_noise_e", "response"),
     "simulation": ("background",),
+    "calibration.optics": ("template",),
 }
 
 _NOT_PATHS = ("flat", "speckle", AUTO)
@@ -182,7 +184,9 @@ _NOT_PATHS = ("flat", "speckle", AUTO)
 def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
     """Make the relative paths of a file relative to the folder it lies in."""
     for section, keys in _PATH_KEYS.items():
-        table = values.get(section)
+        table: Any = values
+        for name in section.split("."):
+            table = table.get(name) if isinstance(table, dict) else None
         if not isinstance(table, dict):
             continue
         for key in keys:
@@ -193,14 +197,17 @@ def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
 
 def with_absolute_paths(config: Config) -> Config:
     """Name files so that a process that runs in another folder finds them."""
-    changed = {}
+    changed: dict[str, Any] = {}
     for section, keys in _PATH_KEYS.items():
-        table = getattr(config, section)
+        name, _, inner = section.partition(".")
+        whole: Any = changed.get(name, getattr(config, name))
+        table: Any = getattr(whole, inner, None) if inner else whole
         paths = {
             key: str(Path(value).absolute())
             for key in keys
-            if isinstance(value := getattr(table, key), str) and value not in _NOT_PATHS
+            if isinstance(value := getattr(table, key, None), str) and value not in _NOT_PATHS
         }
         if paths:
-            changed[section] = table.model_copy(update=paths)
+            table = table.model_copy(update=paths)
+            changed[name] = whole.model_copy(update={inner: table}) if inner else table
     return config.model_copy(update=changed) if changed else config

@@ -295,10 +295,24 @@ class Particle(Section):
         return self
 
 
+class StandardsCamera(Section):
+    """The detector with which the standards of a calibration were recorded."""
+
+    pixel_size_nm: Positive | None = Field(None, description="in the sample plane")
+    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(1, description="per axis")
+    gain_e_per_adu: Positive | None = Field(
+        None, description="photoelectrons per count, where it is one number"
+    )
+    offset_adu: Finite | None = Field(
+        None, description="counts in the dark, where they are one number"
+    )
+
+
 class Calibration(Section):
     """Contrast against mass; present, it replaces the model's absolute scale.
 
-    Signed peak contrast = gradient·mass + sign(mass)·offset.
+    Signed peak contrast = gradient·mass + sign(mass)·offset, at the optics of the standards; at
+    other optics the model carries it over.
     """
 
     gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
@@ -309,6 +323,22 @@ class Calibration(Section):
     offset_se: NonNegative = Field(0.0, description="standard error of offset")
     correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
         0.0, description="of the errors of gradient_per_kda and offset"
+    )
+    dof: Annotated[int, Field(ge=0)] | None = Field(
+        None, description="degrees of freedom of the line: standards beyond two"
+    )
+    optics: Optics | None = Field(
+        None, description="keys of [optics] with which the standards were analysed"
+    )
+    covariance: OpticsCovariance | None = Field(
+        None, description="of these where they were learned, { names, matrix }"
+    )
+    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
+        None, description="particle.height_nm with which the standards were analysed"
+    )
+    camera: StandardsCamera | None = Field(None, description="with which they were recorded")
+    optics_assumed: bool = Field(
+        False, description="true: nobody recorded the optics; those configured are taken"
     )
 
     @model_validator(mode="after")
@@ -323,3 +353,20 @@ class Calibration(Section):
                 "cent or ppm, nor per Da or MDa"
             )
         return self
+
+
+class Uncertainty(Section):
+    """Standard deviations of inputs that nobody measured; 0 turns one off.
+
+    Where standards were recorded with the same optics, they share these errors, which cancel.
+    """
+
+    wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
+    n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
+    n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
+    height_nm: NonNegative = Field(
+        2.0, description="of the mean height of particles, where particle.height_nm is fixed"
+    )
+    magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
+        0.005, description="of camera.pixel_size_nm, as a share of it"
+    )

@@ -17,7 +17,13 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.instrument import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.config.instrument import (
+    Calibration,
+    CameraConfig,
+    Optics,
+    Particle,
+    Uncertainty,
+)
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
 
@@ -39,6 +45,7 @@ class Config(Section):
     track: TrackConfig = Field(default_factory=TrackConfig)
     posterior: PosteriorConfig = Field(default_factory=PosteriorConfig)
     calibration: Calibration | None = None
+    uncertainty: Uncertainty = Field(default_factory=Uncertainty)
     simulation: Simulation = Field(default_factory=Simulation)
     bounds: BoundsConfig = Field(default_factory=BoundsConfig)
     compute: Compute = Field(default_factory=Compute)

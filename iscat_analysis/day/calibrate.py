@@ -14,7 +14,8 @@ from typing import Any
 import pandas as pd
 
 from iscat_analysis.answers.calibrations import camera_calibration, mass_calibration
-from iscat_analysis.config import Config
+from iscat_analysis.calibration.mass import contrast_over, standards_of
+from iscat_analysis.config import Calibration, Config, load_config
 from iscat_analysis.config.files import read_toml
 from iscat_analysis.day.plan import Movie, Plan, configured
 from iscat_analysis.day.run import Outcome, Runner
@@ -145,8 +146,8 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
 
     def work() -> dict[str, Any]:
         events = folder / "calibrants.csv"
-        frames = [pd.read_csv(path) for path in tables.values()]
-        joined = pd.concat([f for f in frames if len(f)] or frames, ignore_index=True)
+        frames, standards = _together(tables)
+        joined = pd.concat(frames, ignore_index=True)
         joined.to_csv(events, index=False, lineterminator="\n")
         try:
             found = mass_calibration(
@@ -154,6 +155,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
                 [mass for mass, _ in plan.standards],
                 out,
                 standards_se_kda=[se for _, se in plan.standards],
+                standards=standards,
                 overwrite=True,
             )
         except SignError as error:  # which way they land is what the configuration says
@@ -169,4 +171,23 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
     outcome = runner.job("mass", key, tables, out / "calibration.toml", work)
     if outcome.state != "done":
         return outcome, {}
-    return outcome, read_toml(out / "calibration.toml")["calibration"]
+    line = read_toml(out / "calibration.toml")["calibration"]
+    keys = Calibration.model_fields  # what this line does not say is not that of another
+    return outcome, {key: line.get(key) for key in keys}
+
+
+def _together(tables: Mapping[str, Path]) -> tuple[list[pd.DataFrame], Config]:
+    """Read the events of all calibrants, their contrasts as with the optics of the first."""
+    configs = {name: load_config(path.with_name("config.toml")) for name, path in tables.items()}
+    first = next(iter(configs.values()))
+    frames = []
+    for name, path in tables.items():
+        ratio, refusal = contrast_over(configs[name], standards_of(first))
+        if refusal:
+            raise DataError(
+                f"{name}: the contrasts of its standards do not go with those of "
+                f"{next(iter(configs))}: {refusal}; record calibrants with the same optics"
+            )
+        table = pd.read_csv(path)
+        frames.append(table.assign(contrast=table["contrast"] / ratio))
+    return [f for f in frames if len(f)] or frames, first

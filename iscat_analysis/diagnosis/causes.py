@@ -34,6 +34,7 @@ _LEAST_PIXELS = 100  # away from particles, of which the light is said to be une
 _GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
+_CARRIED = 0.01  # change of the scale that makes it worth a line
 _SWAPPED = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
@@ -189,6 +190,32 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
     return (
         f"[calibration] does not tell the mass of {count(number, 'fit')}, flagged at_bound: {why}; "
         "measure it with lighter standards, or set calibration.offset = 0 if its error allows it"
+    )
+
+
+def scale_warning(scale: MassScale) -> str:
+    """Say how far the scale of masses was carried from the optics of its standards, or refused."""
+    line = scale.calibration
+    if line is None or (not scale.refusal and abs(scale.carried - 1) < _CARRIED):
+        return ""
+    whose = "the configured optics, at which its gradient is taken" if line.optics_assumed else (
+        "the optics of its standards"
+    )  # fmt: skip
+    if scale.refusal:
+        return (
+            f"the scale of masses does not hold here: it belongs to {whose}, and {scale.refusal}; "
+            f"all rows are flagged {Status.UNCALIBRATED_OPTICS.value}, their contrasts are right: "
+            "measure standards as this movie is recorded (iscat calibrate mass)"
+        )
+    advice = (
+        "; if the standards were measured with the optics of this movie, masses are wrong by that "
+        "factor: calibrate with the folder of their analysis (iscat calibrate mass)"
+        if line.optics_assumed
+        else ""
+    )
+    return (
+        f"the scale of masses is carried over from {whose}: a particle has {scale.carried:.4g} "
+        f"times the contrast that it has there{advice}"
     )
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera.processed import Processing
 from iscat_analysis.camera.response import Response
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.fitting.background_mode import BackgroundMode
 from iscat_analysis.movie import Stack
+from iscat_analysis.records import Status
 
 
 @dataclass(frozen=True)
@@ -31,14 +33,15 @@ class Prepared:
     digest: Future[str]
     summary: Mapping[str, Any]
     response: Response | None = None
+    processing: Processing | None = None
 
     @property
-    def distorted(self) -> bool:
-        """Whether all masses are wrong, because counts are not in proportion to the light."""
+    def flags(self) -> tuple[Status, ...]:
+        """What is wrong with all rows, because it is wrong with the movie."""
         law = self.camera.law
-        if law is None:
-            return False
-        return law.bent or (law.dilutes and law.flickers)
+        bent = law is not None and (law.bent or (law.dilutes and law.flickers))
+        found = {Status.NONLINEAR: bent, Status.PROCESSED: self.processing is not None}
+        return tuple(flag for flag, true in found.items() if true)
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
 from iscat_analysis._kernels.radial import STEP
-from iscat_analysis.config import Calibration, Config, Optics
+from iscat_analysis.config import Calibration, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.optics.aperture import (
     NEAR_CRITICAL,
@@ -31,9 +31,10 @@ from iscat_analysis.optics.aperture import (
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.measured import MeasuredField, Template
+from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
+from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.scale import MassScale
+from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.waves import (
     Field,
     LatticeField,
@@ -64,6 +65,8 @@ of focus it lies on a ring, and a model made for a few pixels must have the scal
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
+
+_STANDARDS_KEPT = 16  # optics of standards whose contrast per kDa is at hand
 
 
 def forward_model(
@@ -138,7 +141,7 @@ def forward_model(
         model = with_template(model, template)
     if config.calibration is None:
         return model
-    return replace(model, scale=_mass_scale(model, config.calibration))
+    return replace(model, scale=_mass_scale(model, config.calibration, config.particle))
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
@@ -214,20 +217,70 @@ def _wave(
     )
 
 
-def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
+def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> MassScale:
+    """Let the line say what amplitude a mass has, at the optics of its standards."""
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
+    linear, quadratic = _peak_terms(model)
     measured = isinstance(model.wave, MeasuredField)
-    area = 0.0 if measured else collected_area_nm2(model, model.height_nm, 1.0)
-    weak = 1e-6 / (peak_per_amplitude(model) if measured else math.sqrt(area))
+    cause = "optics.template" if measured else f"optics.focus_nm = {model.optics.focus_nm:g}"
+    _refuse_sign(linear, line, cause, "" if measured else " or the focus")
+    if line.optics is None:
+        return MassScale(line, linear, quadratic)
+    if measured or line.optics.psf == "measured":  # whose contrasts are measured, not computed
+        same = _same_template(model.optics, line.optics)
+        refusal = "" if same else "they were measured with another picture of a particle"
+        return MassScale(line, linear, quadratic, linear, refusal)
+    height = particle.height_nm if line.height_nm is None else line.height_nm
+    there = particle.model_copy(update={"height_nm": height})
+    of_standards = _peak_of_standards(line.optics.model_dump_json(), there.model_dump_json())
+    _refuse_sign(of_standards[0], line, "calibration.optics", " or these optics")
+    refusal = carry_refusal(model.optics, line.optics, linear / of_standards[0])
+    return MassScale(line, *of_standards, linear, refusal)
+
+
+def _refuse_sign(linear: float, line: Calibration, cause: str, otherwise: str) -> None:
+    if linear * line.gradient_per_kda >= 0:
+        return
+    seen = "bright" if linear > 0 else "dark"
+    raise ContrastError(
+        f"calibration.gradient_per_kda = {line.gradient_per_kda:g} has the wrong sign: with "
+        f"{cause} the model's particles are {seen}; change the sign{otherwise}"
+    )
+
+
+def _peak_terms(model: ForwardModel) -> tuple[float, float]:
+    """Give L and Q of the peak contrast L·a + Q·a² of a faint particle of amplitude a."""
+    if isinstance(model.wave, MeasuredField):
+        weak = 1e-6 / peak_per_amplitude(model)
+    else:
+        weak = 1e-6 / math.sqrt(collected_area_nm2(model, model.height_nm, 1.0))
     linear, quadratic = model.wave.peak(model.height_nm, weak, model.rho)
-    linear, quadratic = linear / weak, quadratic / weak**2
-    if linear * line.gradient_per_kda < 0:
-        seen = "bright" if linear > 0 else "dark"
-        cause = "optics.template" if measured else f"optics.focus_nm = {model.optics.focus_nm:g}"
-        raise ContrastError(
-            f"calibration.gradient_per_kda = {line.gradient_per_kda:g} has the wrong sign: with "
-            f"{cause} the model's particles are {seen}; change the sign"
-            f"{'' if measured else ' or the focus'}"
+    return linear / weak, quadratic / weak**2
+
+
+def _same_template(here: Optics, there: Optics) -> bool:
+    """Tell whether two measured pictures are one."""
+    if here.psf != "measured" or there.psf != "measured":
+        return False
+    if here.template == there.template:
+        return True
+    try:
+        return (
+            len({sha256_of(Path(each.template or "").read_bytes()) for each in (here, there)}) == 1
         )
-    return MassScale(line, linear, quadratic)
+    except OSError:
+        return False
+
+
+def _standards_peak_terms(optics: str, particle: str) -> tuple[float, float]:
+    """Do what `_peak_terms` does, for the optics and the particles of standards, as JSON."""
+    config = Config(
+        optics=Optics.model_validate_json(optics), particle=Particle.model_validate_json(particle)
+    )
+    return _peak_terms(
+        forward_model(config, PEAK_REACH * config.optics.wavelength_nm / config.optics.na)
+    )
+
+
+_peak_of_standards = memoize(_STANDARDS_KEPT, _standards_peak_terms)

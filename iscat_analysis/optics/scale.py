@@ -1,4 +1,14 @@
-"""Mass and the amplitude of the scattered field: by the absolute model, or by a calibration."""
+"""Mass and the amplitude of the scattered field: by the absolute model, or by a calibration.
+
+A particle of mass m scatters a field of amplitude a, in any microscope.  The contrast that this
+amplitude has, C = L·a + Q·a², belongs to the optics: L and Q depend on focus, aperture, phase and
+height.  The line of a calibration was measured with the optics of its standards, so that
+
+    gradient·m + sign(m)·offset = L_there·a + Q_there·a²
+
+gives the mass of an amplitude that was fitted with any other optics.  For faint particles this is
+the gradient times the contrast per kDa of the model here over that of the model there.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +17,35 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis.config import Calibration
+from iscat_analysis.config import Calibration, Optics
 
 FloatArray = NDArray[np.float64]
+
+MOST_CHANGE = 1 / 3
+"""Change of the contrast per kDa, from the optics of the standards to others, that the model still
+carries: beyond it, small errors of the optics are large ones of the mass."""
+
+SAME_WAVELENGTH_NM = 1.0
+"""Wavelengths of one line of a laser differ by less."""
+
+
+def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
+    """Say why the model does not carry the scale of standards to other optics; else nothing."""
+    for key in ("scheme", "polarization", "analyzer", "psf"):
+        mine, theirs = getattr(here, key), getattr(there, key)
+        if mine != theirs:
+            return f"they were measured with optics.{key} = {theirs}, and this is {mine}"
+    if abs(here.wavelength_nm - there.wavelength_nm) > SAME_WAVELENGTH_NM:
+        return (
+            f"they were measured at {there.wavelength_nm:g} nm, and this is at "
+            f"{here.wavelength_nm:g} nm"
+        )
+    if not abs(ratio - 1) <= MOST_CHANGE:
+        return (
+            f"by the model the contrast per kDa is {ratio:.3g} of that with the standards' optics, "
+            "a change of more than a third"
+        )
+    return ""
 
 
 @dataclass(frozen=True)
@@ -17,8 +53,9 @@ class MassScale:
     """The map between mass and the amplitude a of the model's field.
 
     Without a calibration a is the mass in kDa.  With one, the signed peak contrast
-    C = L·a + Q·a² of the model at the calibration height equals gradient·m + sign(m)·offset, which
-    replaces the model's absolute scale.
+    C = L·a + Q·a² of the model, at the optics and the height of the standards, equals
+    gradient·m + sign(m)·offset, which replaces the model's absolute scale.  `here` is L at the
+    model's own optics; `refusal` says why these are beyond what the model carries.
 
     The line goes through no contrast at the mass −offset/gradient.  Where that is positive, each
     contrast up to the offset belongs to two masses of opposite sign, which differ by twice this
@@ -29,6 +66,13 @@ class MassScale:
     calibration: Calibration | None = None
     linear: float = 0.0
     quadratic: float = 0.0
+    here: float | None = None
+    refusal: str = ""
+
+    @property
+    def carried(self) -> float:
+        """Contrast per kDa at the model's own optics over that at the optics of the standards."""
+        return 1.0 if self.here is None else self.here / self.linear
 
     def amplitude(self, mass_kda: float) -> float:
         """Amplitude a of a particle of a given mass [kDa]."""

@@ -27,6 +27,7 @@ from iscat_analysis.records import (
     Candidate,
     FitResult,
     Status,
+    flagged,
     make_rows,
     verdict,
 )
@@ -153,7 +154,9 @@ def fit_rois(
     compile_kernels(counts.model, parts_of(FREE_PARAMETERS[mode], posteriors=False))
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    return make_rows(rows, event=range(count))
+    table = make_rows(rows, event=range(count))
+    refused = bool(counts.model.scale.refusal)
+    return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 
 
 def line_of(

@@ -10,25 +10,37 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.calibration.mass import as_given
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.diagnosis.causes import (
     bend_warning,
     course_warning,
     line_warning,
     plane_warning,
+    scale_warning,
     sign_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import versions
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.pipeline.rows import flagged_all, reported_rows
+from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
-from iscat_analysis.records import Analysis, Film, Provenance, Status, make_rows, silent
+from iscat_analysis.records import (
+    Analysis,
+    Film,
+    Provenance,
+    Status,
+    TrackStatus,
+    flagged,
+    make_rows,
+    silent,
+)
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
+from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
 
 
@@ -55,16 +67,18 @@ def gather(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    table, achieved = reported_rows(found)
+    table, achieved, budget = reported_rows(found)
     recorded = ready.movie.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
         table = make_rows(table, tick=ticks[table["frame"].to_numpy(int)])
-    if ready.distorted:
-        table = flagged_all(table, Status.NONLINEAR)
+    for flag in ready.flags:
+        table = flagged(table, flag)
+    scale = scene.model.scale
     for doubt in (
+        scale_warning(scale),
         line_warning(config, table),
-        bend_warning(scene.model.scale, table),
+        bend_warning(scale, table),
         sign_warning(config, table),
         course_warning(table) if ready.way == "sliding" else "",
     ):
@@ -101,6 +115,9 @@ def gather(
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(scene, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")
+    if scale.refusal:
+        table = flagged(table, Status.UNCALIBRATED_OPTICS)
+        tracks = None if tracks is None else flagged(tracks, TrackStatus.UNCALIBRATED_OPTICS)
     summary = summary_of(scene, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
@@ -112,6 +129,7 @@ def gather(
     )
     summary |= {
         **further,
+        **({"budget": budget} if budget else {}),
         "input": {
             "path": provenance.input_path,
             "sha256": provenance.input_sha256,
@@ -124,7 +142,7 @@ def gather(
     }
     frames, first = _each_once(compared)
     analysis = Analysis(
-        config_toml=config_to_toml(config),
+        config_toml=config_to_toml(as_given(config)),
         mode=scene.mode,
         scheme=config.optics.scheme,
         pixel_size_nm=scene.pixel_nm,
@@ -140,7 +158,14 @@ def gather(
         films=films,
         response=ready.response.table if ready.response is not None else None,
     )
-    return replace(analysis, summary=summary | species_of(scene, table))
+    described = species_of(scene, table)
+    explained = {"explained_kda": explained_kda(budget)}
+    described["across_particles"] = [one | explained for one in described["across_particles"]]
+    wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)
+    if wide:
+        run.tell(wide)
+    warned = {"warnings": run.warnings}
+    return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 
 
 def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
+from iscat_analysis.camera.processed import find_processing
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import law_said
 from iscat_analysis.diagnosis.causes import axes_warning
@@ -69,6 +71,9 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.tell(f"{movie.name}: {text}")
     if auto:
         run.notify(f"{movie.name}: {known.said}")
+    processing = find_processing(movie, camera, span)
+    if processing is not None:
+        run.tell(f"{movie.name}: {processing.message}")
     stop = min(stop, start + _OPENING, movie.shape[0])
     seen = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
@@ -78,6 +83,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if swapped:
         run.tell(swapped)
     summary: dict[str, Any] = {"camera": known.summary}
+    if processing is not None:
+        summary["processing"] = processing.summary
     looking: Future[Changes] | None = None
     opened: NoiseSurvey | None = None
 
@@ -108,10 +115,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         config, learned = learn_sign(
             steady, wrong, camera, tell=run.tell, notify=run.notify, opening=opened
         )
+        config = _with_standards(config, run)
     else:
         config, learned = learn_optics(
-            steady, config, camera, tell=run.tell, notify=run.notify, opening=opened
-        )
+            steady, _with_standards(config, run), camera,
+            tell=run.tell, notify=run.notify, opening=opened,
+        )  # fmt: skip
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
@@ -128,8 +137,22 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         _refuse_what_only_slides(run, movie.name)
     return Prepared(
         movie, steady, config, camera, way, lines, opened, other_kind, digest, summary,
-        known.response,
+        known.response, processing,
     )  # fmt: skip
+
+
+def _with_standards(config: Config, run: Run) -> Config:
+    """Say once that a gradient came without the optics of its standards, and where it is taken."""
+    found = with_standards(config)
+    if found is not config:
+        optics = found.optics
+        run.notify(
+            "[calibration] does not say with what optics its standards were measured: the gradient "
+            f"is taken at those of the configuration (focus {optics.focus_nm:g} nm, NA "
+            f"{optics.na:g}, height {found.particle.height_nm:g} nm); `iscat calibrate mass` "
+            "writes a line with its optics"
+        )
+    return found
 
 
 def _landing_light(

@@ -8,36 +8,36 @@ beginning.
 
 from __future__ import annotations
 
+from typing import Any
+
 import pandas as pd
 
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FloatArray, Status, make_rows, verdict
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, make_rows
 from iscat_analysis.tracking.tracked_optics import mass_error
+from iscat_analysis.trust.budget import budget_of
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
-from iscat_analysis.trust.systematic import systematic
+from iscat_analysis.trust.systematic import contributions, total
 
 
-def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread]]:
-    """Make the rows of all events of a movie."""
+def reported_rows(
+    found: DetectionResult,
+) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread], list[dict[str, Any]]]:
+    """Make the rows of all events of a movie, and the budget of their masses."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    shared = systematic(config, fits, mass_error(found.optics), found.scene.model.scale)
-    columns |= {f"systematic_{name}": sigma for name, sigma in shared.items()}
+    shared = contributions(config, fits, mass_error(found.optics), found.scene.model.scale)
+    columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
-    return make_rows(fits, **columns), achieved
-
-
-def flagged_all(table: pd.DataFrame, flag: Status) -> pd.DataFrame:
-    """Flag all rows of a movie with what is wrong with the movie itself."""
-    flags = [
-        verdict([*map(Status, filter(None, text.split(";"))), flag]) for text in table["flags"]
-    ]
-    return table.assign(
-        status=[str(worst) for worst, _ in flags], flags=[";".join(all_) for _, all_ in flags]
-    )
+    table = make_rows(fits, **columns)
+    budget = budget_of(
+        table, shared, achieved,
+        calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",
+    ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
+    return table, achieved, budget

@@ -57,6 +57,7 @@ def summary_of(
         "emission": scene.model.optics.emission,
         "convention": scene.model.optics.convention,
         "mass_scale": "calibration" if scene.config.calibration else "absolute model",
+        **_carried(scene),
         "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
         "frames_before": list(compared.frames_before),
@@ -74,6 +75,20 @@ def summary_of(
         "distribution": None,
         "across_particles": [],
         "seconds": {name: round(value, 3) for name, value in timings.items()},
+    }
+
+
+def _carried(scene: Scene) -> dict[str, Any]:
+    """Say how far the scale was carried from the optics of its standards."""
+    scale = scene.model.scale
+    if scale.calibration is None:
+        return {}
+    return {
+        "scale": {
+            "carried": scale.carried,
+            "optics": "configured" if scale.calibration.optics_assumed else "recorded",
+            "refusal": scale.refusal or None,
+        }
     }
 
 

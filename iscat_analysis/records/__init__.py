@@ -18,6 +18,7 @@ from iscat_analysis.records.arrays import (
     silent,
 )
 from iscat_analysis.records.columns import (
+    BUDGET_COLUMNS,
     EVENT_COLUMNS,
     EVENTS,
     FRAME_COLUMN,
@@ -27,6 +28,7 @@ from iscat_analysis.records.columns import (
     TRACK_COLUMNS,
     TRACKS,
     Column,
+    flagged,
     free_parameters,
     track_numbers,
 )
@@ -49,6 +51,7 @@ from iscat_analysis.records.rows import make_rows
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
+    "BUDGET_COLUMNS",
     "EVENTS",
     "EVENT_COLUMNS",
     "FRAME_COLUMN",
@@ -82,6 +85,7 @@ __all__ = [
     "Trace",
     "TrackStatus",
     "Windows",
+    "flagged",
     "free_parameters",
     "make_rows",
     "silent",

@@ -16,8 +16,10 @@ class Status(StrEnum):
     POOR_FIT = "poor_fit"
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
+    UNCALIBRATED_OPTICS = "uncalibrated_optics"
     SIDELOBE = "sidelobe"
     NONLINEAR = "nonlinear"
+    PROCESSED = "processed"
 
     @property
     def advice(self) -> str:
@@ -39,7 +41,11 @@ _ADVICE = {
     "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
     "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
+    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass is on a scale that was "
+    "measured with other optics: measure standards with these (iscat calibrate mass).",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, so that neither their "
+    "noise nor their particles are as the camera gave them: analyse the camera's own frames.",
     Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
     "all masses are wrong by the same factor: a line says by how much and why.",
 }
@@ -53,11 +59,14 @@ SEVERITY = (
     Status.AMBIGUOUS_Z,
     Status.TOO_CLOSE,
     Status.SATURATED,
+    Status.UNCALIBRATED_OPTICS,
     Status.NONLINEAR,
+    Status.PROCESSED,
 )
 """What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
 a model that does not describe the data; one of several heights; a mass shared with a neighbour;
-pixels left out; counts that are not in proportion to the light."""
+pixels left out; a mass on the scale of other optics; counts that are not in proportion to the
+light; frames that are not as the camera gave them."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
@@ -77,6 +86,7 @@ class TrackStatus(StrEnum):
     NOT_FREE = "not_free"
     STANDS_STILL = "stands_still"
     NEAR_WALL = "near_wall"
+    UNCALIBRATED_OPTICS = "uncalibrated_optics"
     OK = "ok"
 
     @property
@@ -107,4 +117,5 @@ _TRACK_ADVICE = {
     "upper limit, or record for longer.",
     TrackStatus.NEAR_WALL: "The coverslip, so near, slows it by more than 5 %: its diameter "
     "is too large, its index too small.",
+    TrackStatus.UNCALIBRATED_OPTICS: Status.UNCALIBRATED_OPTICS.advice,
 }

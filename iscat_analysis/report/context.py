@@ -21,6 +21,8 @@ from iscat_analysis.records import (
     Status,
     free_parameters,
 )
+from iscat_analysis.report.budget import COLUMNS as BUDGET_HEADINGS
+from iscat_analysis.report.budget import budget_rows
 from iscat_analysis.report.event_figures import event_details
 from iscat_analysis.report.headline import (
     caution,
@@ -75,6 +77,8 @@ def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
         "has_common": any(math.isfinite(p.systematic) for p in precision),
         "has_measured": any(p.is_measured for p in precision),
         "single_frames": analysis.mode == "track",
+        "budget_rows": budget_rows(analysis),
+        "budget_columns": BUDGET_HEADINGS,
         "spread_lines": species_widths(analysis.summary),
         "has_holevo": any(math.isfinite(p.holevo) for p in precision),
         "precision_rows": precision_rows(analysis, precision),

@@ -19,6 +19,7 @@ from iscat_analysis.records import (
     Status,
     free_parameters,
 )
+from iscat_analysis.report.budget import budget_figure
 from iscat_analysis.report.event_figures import HALO, scale_bar
 from iscat_analysis.report.field import field_axes
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
@@ -55,6 +56,7 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
     if fitted:
         yield "precision", partial(precision, analysis, table)
     yield "spread", partial(spread_figure, analysis, label_of)
+    yield "budget", partial(budget_figure, analysis)
     yield "diagnostics", partial(diagnostics, analysis, table)
     power_known = np.isfinite(np.asarray(analysis.power, float))
     if power_known.size > 1 and power_known.any():

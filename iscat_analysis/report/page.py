@@ -93,6 +93,7 @@ def page_context(
         *([("films", "Films")] if tracked and context["films"] else []),
         *([(species["id"], species["title"])] if species else []),
         *([("precision", "Precision")] if len(table) else []),
+        *([("budget", "Budget")] if context["budget_rows"] and len(table) else []),
         *([("events", "Tracks" if tracked else "Events")] if context["n_events"] else []),
         *(
             [("posterior", "Posterior")]

@@ -63,9 +63,14 @@ def species_widths(summary: Mapping[str, Any]) -> list[str]:
             values = [100 * value / one["mass_kda"] for value in values]
         decimals = decimals_for([(values[2] - values[1]) / 2])
         width, low, high = (fixed(value, decimals) for value in values)
+        explained = one.get("explained_kda")
+        budget = ""
+        if explained is not None:
+            known = explained if calibrated else 100 * explained / one["mass_kda"]
+            budget = f" The budget explains {fixed(known, decimals)}{unit} of that."
         lines.append(
             f"Across particles: beyond the σ of its {one['count']:.0f} events the species {name} "
             f"is {width}{unit} ({low} to {high}) wide, so that its events scatter by "
-            f"{number(one['spread_over_sigma'])} times σ."
+            f"{number(one['spread_over_sigma'])} times σ.{budget}"
         )
     return lines

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from iscat_analysis.schemas.base import (
     Closed,
@@ -99,6 +99,31 @@ class Histogram(Closed):
     counts: list[Count] = key("Events in each")
 
 
+class StandardsCamera(Closed):
+    """The camera of the standards."""
+
+    pixel_size_nm: NotNegative = maybe("Pixel side [nm]")
+    samples_per_pixel: Count = key("Samples per pixel, per axis")
+    gain_e_per_adu: NotNegative = maybe("Photoelectrons per count, where it is one number")
+    offset_adu: float = maybe("Counts in the dark, where they are one number")
+
+
+class StandardsCovariance(Closed):
+    """Errors of the optics of the standards."""
+
+    names: list[str] = key("Learned keys of [optics]")
+    matrix: list[list[float]] = key("Their covariance")
+
+
+class Standards(Closed):
+    """With what the standards were recorded and analysed."""
+
+    optics: dict[str, Any] = key("Keys of [optics]")
+    covariance: StandardsCovariance | None = key("Of these, where they were learned")
+    height_nm: NotNegative = key("Height of the particles [nm]")
+    camera: StandardsCamera = key("The camera")
+
+
 class MassCalibration(Document):
     """What iscat calibrate mass prints and writes as calibration.json.
 
@@ -118,6 +143,7 @@ class MassCalibration(Document):
     standards: list[Standard] = key("The standards, lightest first")
     peaks: list[ContrastPeak] = key("Every peak that was found")
     notes: list[str] = key("What the user should know, one line each")
+    recorded: Standards | None = key("With what the standards were recorded, null where unknown")
     histogram: Histogram = maybe("In the file: sizes of the contrasts")
     out: str = maybe("The folder that was written; not in the file")
 

@@ -191,6 +191,7 @@ class Across(Closed):
     width_high: Number = key("The other end [kDa]")
     count: Number = key("Its events")
     spread_over_sigma: Number = key("Scatter of its events over their median σ")
+    explained_kda: NotNegative = maybe("Width that the budget explains [kDa]")
 
 
 class Repeats(Closed):
@@ -237,6 +238,14 @@ class CameraNumbers(Closed):
     offset_adu: CameraNumber = key("Counts in the dark [counts]")
     read_noise_e: CameraNumber = key("Read noise, standard deviation per frame [e]")
     law: CameraLaw = maybe("Where the pixels differ in brightness: how counts grow with the light")
+
+
+class Processed(Closed):
+    """What was done to the frames since the camera gave them."""
+
+    kind: Literal["interpolated", "smoothed", "sharpened"] = key("What it was")
+    finest: NotNegative = key("Noise of the finest patterns over that of coarser ones; 1 where raw")
+    uneven: NotNegative = key("By how much of itself it changes from frame to frame; 0 where raw")
 
 
 class Changes(Closed):
@@ -312,6 +321,28 @@ class Distribution(Document):
     notes: list[str] = key("What the user should know")
 
 
+class BudgetEntry(Closed):
+    """One source of the error of a mass: medians over the rows that are ok."""
+
+    name: str = key("What it is")
+    kind: Literal["measured", "learned", "assumed"] = key("How its size is known")
+    common: bool = key("Whether all rows share it; these add up to systematic_mass_kda")
+    sigma_mass_kda: Number = key("Its standard deviation [kDa]; null where nothing tells it")
+    sigma_rel: Number = key("The same over the mass")
+    dof: Number = key("Degrees of freedom; null where there are many, or it was not measured")
+    remedy: str = key("What would shrink it")
+
+
+class Scale(Closed):
+    """How far the scale of masses was carried from the optics of its standards."""
+
+    carried: Number = key("Contrast per kDa with these optics over that with the standards'")
+    optics: Literal["recorded", "configured"] = key(
+        "Where the standards' are from: their record, or the configuration for want of one"
+    )
+    refusal: str | None = key("Why the model does not carry the scale so far; rows are flagged")
+
+
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
@@ -321,6 +352,7 @@ class Summary(Document):
     emission: Emission = key("Emission model")
     convention: Convention = key("Formulas")
     mass_scale: str = key("Where the mass scale comes from: a calibration, or the model")
+    scale: Scale = maybe("With a calibration: how far it was carried")
     status: dict[str, Count] = key("Events by status")
     frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")
     frames_after: tuple[Count, Count] | None = key("Fitted frames [start, stop)")
@@ -340,10 +372,12 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    processing: Processed = maybe("Where the frames are not as the camera gave them")
     changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
     blocks: Blocks = maybe("Mode track: blocks of frames that have a background each")
     tracks: Count = maybe("Mode track: tracks found")
     motion: Motion = maybe("Mode track: what the tracks come to")
+    budget: list[BudgetEntry] = maybe("Where masses are fitted: what their error is made of")
     across_particles: list[Across] = maybe(
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )

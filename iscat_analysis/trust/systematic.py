@@ -2,42 +2,124 @@
 
 Each source of such an error gives, for every event, a standard deviation of the parameters that it
 moves; independent sources add in quadrature.  A new source is a function like `_of_the_line` and an
-entry in `_SOURCES`.  These errors are columns of their own and are never mixed into σ: they do not
-shrink when events are averaged.
+entry in `sources_of`.  These errors are columns of their own and are never mixed into σ: they do
+not shrink when events are averaged.  What they come to, source by source, is the `budget`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.bounds import imitation, joint_information, mass_drift, peak_gradient
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
+from iscat_analysis.trust.assumed import INPUTS, assumed_error
+from iscat_analysis.trust.response import (
+    COMMON,
+    amplitude_nodes,
+    at_standards,
+    height_weights,
+    lagrange,
+    response_of,
+    standards_share,
+)
 
-_AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
 _BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _BENT_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _TOLD = 0.5  # of σ, beyond which it is told of every row
+_SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 _NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
-_HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 
-Source = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
-"""Gives, by name in `_COMMON`, the standard deviation for every event; none for what it does not
+Errors = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
+"""Gives, by name in `COMMON`, the standard deviation for every event; none for what it does not
 move."""
 
-_COMMON = (*PARAMETERS, "contrast")
-"""What such errors are told of; of the contrast where it is the result, without a calibration."""
+Kind = Literal["measured", "learned", "assumed"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """One reason why all masses of a movie may be wrong together, and what would shrink it."""
+
+    name: str
+    kind: Kind
+    errors: Errors
+    remedy: str
+    dof: float | None = None
+
+
+def sources_of(
+    config: Config, mass_share: float = 0.0, scale: MassScale | None = None
+) -> tuple[Source, ...]:
+    """Name the sources of errors that the events of a movie share."""
+    line = config.calibration
+    left_over = partial(_of_what_is_left_over, mass_share)
+    sources = (
+        Source("line of the standards", "measured", _of_the_line,
+               "more standards, and more events of each",
+               None if line is None or line.dof is None else float(line.dof)),
+        Source("optics of the movie", "learned", _of_the_optics,
+               "more or brighter particles, from which the optics are learned"),
+        Source("optics of the standards", "learned", _of_the_standards,
+               "more or brighter standards, or standards and sample at one focus"),
+        Source("measured picture", "measured", _of_the_template,
+               "more particles for the picture, or standards measured with it"),
+        Source("optics that do not describe the pictures", "measured", left_over,
+               "find what the model lacks: focus, aperture, aberrations, pixel size"),
+        *(Source(each.label, "assumed", partial(assumed_error, each.key), each.remedy)
+          for each in INPUTS),
+    )  # fmt: skip
+    if scale is None:
+        return sources
+    return (
+        *sources,
+        Source("standards measured with unknown optics", "assumed",
+               partial(_of_the_missing_record, scale),
+               "calibrate with the folder of the standards' analysis"),
+        Source("square of the scattered light", "measured", partial(_of_heavy_particles, scale),
+               "standards as heavy as the particles"),
+    )  # fmt: skip
+
+
+Contribution = tuple[Source, Mapping[str, FloatArray]]
+"""A source with what it makes of every event, by name in `COMMON`."""
+
+
+def contributions(
+    config: Config,
+    table: pd.DataFrame,
+    mass_share: float = 0.0,
+    scale: MassScale | None = None,
+) -> list[Contribution]:
+    """Give what each source makes of the events of a movie, where it makes anything of them."""
+    found = [
+        (source, source.errors(config, table)) for source in sources_of(config, mass_share, scale)
+    ]
+    return [(source, errors) for source, errors in found if errors]
+
+
+def total(found: Sequence[Contribution], rows: int) -> dict[str, FloatArray]:
+    """Add independent contributions in quadrature.
+
+    Shapes: result (rows,) each.
+    """
+    squares: dict[str, FloatArray] = {}
+    for _, errors in found:
+        for name, sigma in errors.items():
+            squares[name] = squares.get(name, np.zeros(rows)) + np.square(sigma)
+    sums = {name: np.sqrt(squares[name]) for name in COMMON if name in squares}
+    return {name: np.where(sigma > _NOTHING, sigma, 0.0) for name, sigma in sums.items()}
 
 
 def systematic(
@@ -47,15 +129,21 @@ def systematic(
     scale: MassScale | None = None,
 ) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share."""
-    squares: dict[str, FloatArray] = {}
-    sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
-    if scale is not None:
-        sources += (partial(_of_heavy_particles, scale),)
-    for source in sources:
-        for name, sigma in source(config, table).items():
-            squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
-    sums = {name: np.sqrt(squares[name]) for name in _COMMON if name in squares}
-    return {name: np.where(sigma > _NOTHING, sigma, 0.0) for name, sigma in sums.items()}
+    return total(contributions(config, table, mass_share, scale), len(table))
+
+
+def _of_the_missing_record(
+    scale: MassScale, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give what the carried scale is wrong by, if the standards had the optics of the movie."""
+    line, share = config.calibration, abs(scale.carried - 1)
+    if line is None or not line.optics_assumed or share < _SAME or not _fits_masses(config):
+        return {}
+    return {"mass_kda": share * np.abs(table["mass_kda"].to_numpy(float))}
+
+
+def _fits_masses(config: Config) -> bool:
+    return "mass_kda" in FREE_PARAMETERS[config.fit.mode]
 
 
 def _of_what_is_left_over(
@@ -70,7 +158,7 @@ def _of_heavy_particles(
     scale: MassScale, config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
     """Give what a line of faint standards makes of particles that are not, where it matters."""
-    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode]:
+    if not _fits_masses(config):
         return {}
     off, sigma = _off_the_line(scale, table)
     return {"mass_kda": off} if (off > _TOLD * sigma).any() else {}
@@ -113,13 +201,12 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     suited = suited and config.optics.psf == "model"
     if errors is None or not errors.names or pixel is None or not suited:
         return {}
-    side = config.fit.roi_px(pixel)
-    grid = PixelGrid.centred(side, pixel)
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     model = forward_model(config, 1.05 * grid.diagonal_nm / 2)
-    shifts = np.full((len(table), len(_COMMON), len(errors.names)), np.nan)
+    shifts = np.full((len(table), len(COMMON), len(errors.names)), np.nan)
     if known.any():
-        shifts[known] = _shifts(config, model, grid, table[known])
+        shifts[known] = _shifts(config, model, table[known])
     covariance = np.array(errors.matrix)
     variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
     sigma = np.sqrt(np.maximum(variance, 0.0))
@@ -127,7 +214,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
         *FREE_PARAMETERS[config.fit.mode],
         *(["contrast"] if _is_about_contrast(config) else []),
     ]
-    return {name: sigma[:, k] for k, name in enumerate(_COMMON) if name in told}
+    return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in told}
 
 
 def _is_about_contrast(config: Config) -> bool:
@@ -135,9 +222,7 @@ def _is_about_contrast(config: Config) -> bool:
     return "mass_kda" in FREE_PARAMETERS[config.fit.mode] and config.calibration is None
 
 
-def _shifts(
-    config: Config, model: ForwardModel, grid: PixelGrid, table: pd.DataFrame
-) -> FloatArray:
+def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatArray:
     """Shift of x, y, z, mass and contrast of every event per unit of the optics, (n, 5, k).
 
     D changes smoothly with the amplitude and along z with the fringes: a few amplitudes at each of
@@ -145,142 +230,41 @@ def _shifts(
     """
     errors = config.optics.covariance
     names = errors.names if errors is not None else ()
-    free = [name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS]
     amplitude = model.scale.amplitudes(table["mass_kda"].to_numpy(float))
-    nodes = _amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
-    respond = _Response(
-        replace(model, scale=MassScale()), grid, names, tuple(free),
-        level=config.background.method == "sliding",
-        frames=(int(table["n_before"].median()), int(table["n_after"].median())),
-        contrast=_is_about_contrast(config),
-    )  # fmt: skip
-    by_amplitude = _lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
-    heights, by_height = _height_weights(
+    nodes = amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
+    respond = response_of(config, table, names, contrast=_is_about_contrast(config))
+    by_amplitude = lagrange(nodes, np.clip(amplitude, nodes.min(), nodes.max()))
+    heights, by_height = height_weights(
         table["z_nm"].to_numpy(dtype=float), model.z_range_nm, model.fringe_nm
     )
-    shifts = np.zeros((len(table), len(_COMMON), len(names)))
+    shifts = np.zeros((len(table), len(COMMON), len(names)))
     for height, weight in zip(heights, by_height.T, strict=True):
         near = weight != 0
         found = np.einsum("en,nik->eik", by_amplitude[near], respond.at(float(height), nodes))
         shifts[near] += weight[near, None, None] * found
     shifts[:, 4] *= table["contrast"].to_numpy(dtype=float)[:, None]
-    if free[3]:
-        shifts[:, 3] *= amplitude[:, None]
-        if model.scale.calibration is not None:
-            peak = np.array([mass_drift(model, a, names) / a for a in nodes])
-            drift = amplitude[:, None] * (by_amplitude @ peak)
-            shifts[:, 3] = _calibrated(config, model, respond, amplitude, shifts[:, 3], drift)
+    if _fits_masses(config):
+        shifts[:, 3] *= (amplitude * model.scale.slopes(amplitude))[:, None]
+        if standards_share(config):
+            line, scale = config.calibration, model.scale
+            gradient = line.gradient_per_kda if line is not None else 1.0
+            contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
+            shifts[:, 3] -= (contrast / gradient)[:, None] * respond.faint()
     return shifts
 
 
-@dataclass(frozen=True)
-class _Response:
-    """How the estimates of a particle at the centre of a region move with the optics."""
-
-    model: ForwardModel  # with masses that are amplitudes
-    grid: PixelGrid
-    names: tuple[str, ...]
-    free: tuple[bool, ...]
-    level: bool
-    frames: tuple[int, int]
-    contrast: bool
-
-    def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
-        """D of (x, y, z [nm], ln a, ln contrast) per unit of each parameter, (amplitudes, 5, k).
-
-        The contrast is left at 0 where it is not the result.
-        """
-        count, (before, after) = len(self.names), self.frames
-        kept = np.flatnonzero([*self.free, self.level])
-        chosen = np.concatenate([np.arange(count), count + kept])
-        out = np.zeros((len(amplitudes), len(_COMMON), count))
-        for index, amplitude in enumerate(amplitudes):
-            theta = np.array([*self._centre, z_nm, amplitude, 0.0])
-            expected = (
-                asimov_conditional(self.model, self.grid, theta, 1.0, before, after)
-                if before
-                else asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
-            )
-            whole = joint_information(expected, theta, self.names)
-            moved = np.zeros((theta.size, count))
-            moved[kept] = imitation(whole[np.ix_(chosen, chosen)], count)
-            out[index, :3] = moved[:3]
-            out[index, 3] = moved[3] / amplitude
-            if self.contrast:
-                contrast, own, shared = peak_gradient(self.model, z_nm, amplitude, self.names)
-                out[index, 4] = (own @ moved[:4] + shared) / contrast
-        return out
-
-    @property
-    def _centre(self) -> tuple[float, float]:
-        return float(np.mean(self.grid.x_nm)), float(np.mean(self.grid.y_nm))
-
-
-def _calibrated(
-    config: Config,
-    model: ForwardModel,
-    respond: _Response,
-    amplitude: FloatArray,
-    moves: FloatArray,
-    drift: FloatArray,
-) -> FloatArray:
-    """Turn shifts of the amplitude (n, k) into those of a mass that a line ties to the contrast.
-
-    The peak contrast C = L a + Q a² moves less than the amplitude, because L moves too: `drift`.
-    Where the optics come from a file, the standards were fitted with the same: line and contrasts
-    are off by the same factor, that of a faint particle, and only what bright ones have beyond it
-    remains.
-    """
-    scale, names = model.scale, respond.names
-    gradient = float(scale.slope(0.0))
-    slope = scale.slopes(amplitude)
-    shifts = slope[:, None] * moves + drift
-    if config.optics.file is not None:
-        faint = 1e-6 * np.abs(amplitude).max()
-        relative = respond.at(model.height_nm, np.array([faint]))[0, 3]
-        relative = relative + mass_drift(model, faint, names) / (faint * gradient)
-        contrast = scale.linear * amplitude + scale.quadratic * amplitude**2
-        shifts -= (contrast * gradient / scale.linear)[:, None] * relative
-    return np.asarray(shifts)
-
-
-def _amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
-    """Amplitudes for which the response is computed; they span those of the good fits."""
-    spanned = amplitude[good] if good.any() else amplitude
-    low, high = float(spanned.min()), float(spanned.max())
-    middle, half = (low + high) / 2, (high - low) / 2
-    if half <= 1e-9 * abs(middle):
-        return np.array([middle or 1e-9])
-    angles = np.pi * (np.arange(_AMPLITUDES) + 0.5) / _AMPLITUDES
-    nodes = middle + half * np.cos(angles)
-    return np.where(np.abs(nodes) > 1e-6 * half, nodes, 1e-6 * half)
-
-
-def _height_weights(
-    z_nm: FloatArray, span: tuple[float, float], fringe_nm: float
-) -> tuple[FloatArray, FloatArray]:
-    """Heights and the weights (events, heights) of a cubic through the four nearest of them."""
-    if not np.ptp(z_nm):
-        return z_nm[:1], np.ones((z_nm.size, 1))
-    low, high = span
-    count = max(int(np.ceil((high - low) * _HEIGHTS_PER_FRINGE / fringe_nm)), 3)
-    place = (np.clip(z_nm, low, high) - low) / (high - low) * count
-    first = np.clip(np.floor(place).astype(int) - 1, 0, count - 3)
-    weights = np.zeros((z_nm.size, count + 1))
-    cubic = _lagrange(np.arange(4.0), place - first)
-    np.put_along_axis(weights, first[:, None] + np.arange(4), cubic, axis=1)
-    used = np.flatnonzero(np.any(weights != 0, axis=0))
-    heights = np.asarray(low + (high - low) / count * used, dtype=np.float64)
-    return heights, weights[:, used]
-
-
-def _lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
-    """Weights of the polynomial through values at the nodes, shape (points, nodes)."""
-    weights = np.ones((points.size, nodes.size))
-    for k, node in enumerate(nodes):
-        for other in np.delete(nodes, k):
-            weights[:, k] *= (points - other) / (node - other)
-    return weights
+def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what the learned optics of the standards may be wrong by, where they are others."""
+    line, pixel = config.calibration, config.camera.pixel_size_nm
+    if line is None or line.optics is None or line.covariance is None or pixel is None:
+        return {}
+    if line.optics.psf == "measured" or standards_share(config):
+        return {}
+    if not _fits_masses(config):
+        return {}
+    relative = response_of(at_standards(config), table, line.covariance.names).faint()
+    variance = float(relative @ np.array(line.covariance.matrix) @ relative)
+    return {"mass_kda": np.abs(table["mass_kda"].to_numpy(float)) * math.sqrt(max(variance, 0.0))}
 
 
 def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
@@ -296,6 +280,3 @@ def _of_the_template(config: Config, table: pd.DataFrame) -> Mapping[str, FloatA
     contrast = table["contrast"].to_numpy(dtype=float)
     relative = Template.read(Path(optics.template)).peak_se
     return {"mass_kda": np.abs(mass) * relative, "contrast": np.abs(contrast) * relative}
-
-
-_SOURCES: tuple[Source, ...] = (_of_the_line, _of_the_optics, _of_the_template)

@@ -77,6 +77,7 @@ def _analysed(counts: np.ndarray, calibrate: str) -> ia.Result:
             "optics.focus_nm": -300.0,
             "optics.calibrate": calibrate,
             "calibration.gradient_per_kda": -PEAK_PER_KDA,
+            "calibration.optics": {"focus_nm": -300.0, "aberrations_nm": {"z11": 20.0}},
             "posterior.enabled": False,
             "detection.false_alarms_per_movie": 1e-3,
             "compute.workers": 1,

@@ -10,7 +10,7 @@ import pytest
 from instruments import Instrument, InstrumentMovie, Pictures, draw_landings
 
 import iscat_analysis as ia
-from iscat_analysis.config import configure
+from iscat_analysis.config import Uncertainty, configure
 from iscat_analysis.diagnosis.causes import bend_warning
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.scale import MassScale
@@ -23,6 +23,7 @@ SETTINGS = {
     "calibration.gradient_per_kda": GRADIENT,
     "optics.calibrate": "never",
     "posterior.enabled": False,
+    **{f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields},
 }
 
 

@@ -132,6 +132,16 @@ class TestFolder:
         assert {"overview", "precision", "mass_histogram", "power", "event_0000"} <= stems
         assert {stem for stem in stems if "corner" in stem} == {"corner_0001", "corner_0002"}
 
+    def test_the_budget_is_drawn_and_adds_up(self, folder: Path) -> None:
+        page = (folder / "report.html").read_text(encoding="utf-8")
+        assert (folder / "figures" / "budget.svg").is_file()
+        rows = re.findall(r"<tr>(.*?)</tr>", page[page.index('id="budget"') :], re.DOTALL)
+        cells = [re.findall(r"<td[^>]*>(.*?)</td>", row, re.DOTALL) for row in rows[:6]]
+        said = {row[0]: row[3:5] for row in cells if row}
+        assert said["photon noise"] == ["6.00", "1.2 %"]
+        assert said["scale of the model"] == ["—", "—"]
+        assert said["all that is shared"] == ["6.00", "1.2 %"]  # of 4.8 and 3.6
+
     def test_page_fetches_nothing(self, folder: Path) -> None:
         page = (folder / "report.html").read_text(encoding="utf-8")
         outside = set(re.findall(r"https?://[^\"' )]+", page))

@@ -10,7 +10,15 @@ import pandas as pd
 import pytest
 
 from iscat_analysis.bounds import joint_information
-from iscat_analysis.config import Calibration, Config, config_to_toml, configure
+from iscat_analysis.config import (
+    Calibration,
+    Config,
+    Optics,
+    OpticsCovariance,
+    Uncertainty,
+    config_to_toml,
+    configure,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL
@@ -24,6 +32,12 @@ SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
 CORRELATION = np.array([[1, 0.5, 0, -0.9], [0.5, 1, 0, -0.4], [0, 0, 1, 0], [-0.9, -0.4, 0, 1.0]])
 COVARIANCE = CORRELATION * np.outer(SIGMA, SIGMA)
 LIGHT = 1e8
+LINE = Calibration(
+    gradient_per_kda=-3.1e-5, offset=-2e-4, optics=Optics(focus_nm=-280.0), height_nm=5.0
+)
+"""Of standards whose optics are known without error."""
+
+SURE = {f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields}
 
 
 def _config(covariance: np.ndarray[Any, Any] = COVARIANCE, **settings: Any) -> Config:
@@ -36,7 +50,7 @@ def _config(covariance: np.ndarray[Any, Any] = COVARIANCE, **settings: Any) -> C
         "particle.mass_kda": 480.0,
         "background.frames": (0, 200),
     }
-    return configure(settings=base | settings)
+    return configure(settings=base | SURE | settings)
 
 
 def _fitted(
@@ -79,7 +93,7 @@ def _moved(config: Config, shifts: np.ndarray[Any, Any], names: tuple[str, ...] 
 
 
 @pytest.mark.parametrize("mode", ["mass", "joint"])
-@pytest.mark.parametrize("line", [None, Calibration(gradient_per_kda=-3.1e-5, offset=-2e-4)])
+@pytest.mark.parametrize("line", [None, LINE])
 def test_a_small_error_of_one_parameter_moves_the_fit_as_predicted(
     mode: str, line: Calibration | None
 ) -> None:
@@ -125,7 +139,7 @@ def test_the_column_is_the_spread_over_draws_of_the_optics() -> None:
 def test_a_line_from_the_same_optics_takes_the_common_factor_away() -> None:
     """Standards and sample through the same wrong microscope: only bright particles differ."""
     standard, light, bright = 10.0, 480.0, 3e5
-    line = Calibration(gradient_per_kda=-0.01)
+    line = Calibration(gradient_per_kda=-0.01, optics=_config().optics, height_nm=5.0)
 
     def masses(config: Config) -> np.ndarray[Any, Any]:
         contrasts = [
@@ -138,16 +152,17 @@ def test_a_line_from_the_same_optics_takes_the_common_factor_away() -> None:
     shifts = 0.03 * np.sqrt(np.diag(COVARIANCE)) * np.array([1, 0, 0, 0])
     up, down = (masses(_moved(config, s * shifts)) for s in (1, -1))
     remains = np.abs(np.log(up / down)) / 2
-    single = np.diag(shifts**2)
-    filed = _config(single).optics.model_copy(update={"file": "optics.toml"})
-    for optics, factor in ((filed, 1.0), (_config(single).optics, 0.0)):
-        same = config.model_copy(update={"optics": optics})
+    single = _config(np.diag(shifts**2))
+    theirs = OpticsCovariance(names=NAMES, matrix=tuple(map(tuple, np.diag(4 * shifts**2))))
+    for covariance, shared in ((single.optics.covariance, True), (theirs, False)):
+        known = line.model_copy(update={"covariance": covariance})
+        same = single.model_copy(update={"calibration": known})
         for amplitude, left in zip((light, bright), remains, strict=True):
             event = _event(same, 5.0, amplitude)
             share = systematic(same, event)["mass_kda"][0] / abs(event["mass_kda"][0])
-            if factor:
+            if shared:
                 assert share == pytest.approx(left, rel=0.05, abs=2e-7)
-            else:
+            else:  # standards learned alone, with errors of their own that are twice as large
                 assert share > 1e-5
     assert remains[1] > 5 * remains[0]
 
@@ -165,7 +180,7 @@ def test_many_events_share_what_is_computed(monkeypatch: pytest.MonkeyPatch) -> 
         computed.append(theta[2])
         return joint_information(likelihood, theta, names)
 
-    monkeypatch.setattr("iscat_analysis.trust.systematic.joint_information", counted)
+    monkeypatch.setattr("iscat_analysis.trust.response.joint_information", counted)
     found = systematic(config, table)
     fringes = 1000.0 / forward_model(config, 2000.0).fringe_nm
     assert len(set(computed)) <= 10 * fringes + 2

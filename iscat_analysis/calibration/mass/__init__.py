@@ -10,7 +10,7 @@ likelihood inside the peak's own window.  The line through the peaks is that of 
 Phys. 72, 367 (2004).
 
 `calibrate` is the whole of it: `peaks` finds them, `matching` says which belongs to which standard,
-`line` fits, and `result` converts.
+`line` fits, and `result` converts.  `standards` keeps with what optics all that was measured.
 """
 
 from __future__ import annotations
@@ -24,6 +24,13 @@ from iscat_analysis.calibration.mass.result import (
     line_sigma_kda,
     mass_from_contrast,
 )
+from iscat_analysis.calibration.mass.standards import (
+    Standards,
+    as_given,
+    contrast_over,
+    standards_of,
+    with_standards,
+)
 
 __all__ = [
     "LEAST_EVENTS",
@@ -32,9 +39,14 @@ __all__ = [
     "Landing",
     "Line",
     "MassCalibration",
+    "Standards",
+    "as_given",
     "calibrate_mass",
+    "contrast_over",
     "find_contrast_peaks",
     "line_sigma_kda",
     "mass_from_contrast",
+    "standards_of",
+    "with_standards",
     "york_line",
 ]

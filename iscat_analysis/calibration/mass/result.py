@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from iscat_analysis.calibration.mass.peaks import ContrastPeak
+from iscat_analysis.calibration.mass.standards import Standards
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import FloatArray
 
@@ -66,6 +67,7 @@ class MassCalibration:
     landing: Landing
     events: int
     notes: tuple[str, ...] = ()
+    recorded: Standards | None = None
 
     def mass_kda(self, contrast: ArrayLike) -> FloatArray:
         """Convert signed peak contrasts to masses."""
@@ -89,7 +91,8 @@ class MassCalibration:
         """Write the section ``[calibration]`` to paste into a configuration.
 
         The standard errors of the line and their correlation are part of it, so that analyses can
-        say what the calibration contributes to the error of each mass.
+        say what the calibration contributes to the error of each mass; and so are the optics of
+        the standards, where they are known.
         """
         s_se, o_se = (math.sqrt(self.covariance[k, k]) for k in (0, 1))
         return (
@@ -99,6 +102,8 @@ class MassCalibration:
             f"gradient_se_per_kda = {s_se:.4g}  # {100 * abs(s_se / self.gradient_per_kda):.2g} %\n"
             f"offset_se = {o_se:.4g}\n"
             f"correlation = {self.covariance[0, 1] / (s_se * o_se):.5f}\n"
+            f"dof = {self.dof}\n"
+            f"{self.recorded.to_toml() if self.recorded else ''}"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -116,4 +121,5 @@ class MassCalibration:
             "standards": self.standards.to_dict("records"),
             "peaks": [vars(peak) for peak in self.peaks],
             "notes": list(self.notes),
+            "recorded": None if self.recorded is None else self.recorded.to_dict(),
         }

@@ -1,0 +1,222 @@
+"""How the estimates of a particle answer to a microscope that is not the one assumed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from iscat_analysis.bounds import eliminated, imitation, joint_information, peak_gradient
+from iscat_analysis.config import ABERRATIONS, Config, Optics
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
+from iscat_analysis.optics.forward import (
+    ForwardModel,
+    PixelGrid,
+    forward_model,
+    peak_per_amplitude,
+)
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
+
+COMMON = (*PARAMETERS, "contrast")
+"""What such errors are told of; of the contrast where it is the result, without a calibration."""
+
+_AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
+_HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
+_FAINT = 1e-6  # peak contrast of a particle whose scattered light alone is nothing
+_UNDETERMINED = 1e-7  # of the information, below which pictures do not tell a parameter
+
+
+@dataclass(frozen=True)
+class Response:
+    """How the estimates of a particle at the centre of a region move with the optics."""
+
+    model: ForwardModel  # with masses that are amplitudes
+    grid: PixelGrid
+    names: tuple[str, ...]
+    free: tuple[bool, ...]
+    level: bool
+    frames: tuple[int, int]
+    contrast: bool
+
+    def expected(self, theta: FloatArray) -> Likelihood:
+        """Likelihood of the counts that are expected of a particle.
+
+        Shapes: `theta` (5,).
+        """
+        before, after = self.frames
+        if before:
+            return asimov_conditional(self.model, self.grid, theta, 1.0, before, after)
+        return asimov_poisson(self.model, self.grid, theta, 1.0, 1.0)
+
+    def theta(self, z_nm: float, amplitude: float) -> FloatArray:
+        """Parameters of a particle at the centre of the region, (5,)."""
+        x, y = float(np.mean(self.grid.x_nm)), float(np.mean(self.grid.y_nm))
+        return np.array([x, y, z_nm, amplitude, 0.0])
+
+    def at(self, z_nm: float, amplitudes: FloatArray) -> FloatArray:
+        """D of (x, y, z [nm], ln a, ln contrast) per unit of each parameter, (amplitudes, 5, k).
+
+        The contrast is left at 0 where it is not the result.
+        """
+        count, kept = len(self.names), self._kept
+        chosen = np.concatenate([np.arange(count), count + kept])
+        out = np.zeros((len(amplitudes), len(COMMON), count))
+        for index, amplitude in enumerate(amplitudes):
+            theta = self.theta(z_nm, float(amplitude))
+            whole = joint_information(self.expected(theta), theta, self.names)
+            moved = np.zeros((theta.size, count))
+            moved[kept] = imitation(whole[np.ix_(chosen, chosen)], count)
+            out[index, :3] = moved[:3]
+            out[index, 3] = moved[3] / amplitude
+            if self.contrast:
+                contrast, own, shared = peak_gradient(self.model, z_nm, amplitude, self.names)
+                out[index, 4] = (own @ moved[:4] + shared) / contrast
+        return out
+
+    def faint(self) -> FloatArray:
+        """Relative shift of the amplitude of a faint particle at the model's height, (k,)."""
+        moved: FloatArray = self.at(self.model.height_nm, np.array([self.faint_amplitude]))[0, 3]
+        return moved
+
+    @property
+    def faint_amplitude(self) -> float:
+        """Amplitude of a particle whose scattered light alone is nothing."""
+        return _FAINT / peak_per_amplitude(self.model)
+
+    def to_input(self, derivative: FloatArray, amplitude: float) -> tuple[float, FloatArray]:
+        """Shift of ln a and of the optics where pictures differ by a derivative from the model.
+
+        Parameters of the optics that were learned from such pictures imitate the difference as far
+        as they can, and the particle the rest.
+
+        Shapes: `derivative` (ny, nx), `optics` (k,).
+        """
+        theta = self.theta(self.model.height_nm, amplitude)
+        whole = joint_information(self.expected(theta), theta, self.names, [derivative])
+        count = 1 + len(self.names)
+        chosen = np.concatenate([np.arange(count), count + self._kept])
+        whole = whole[np.ix_(chosen, chosen)]
+        information = eliminated(whole, count)
+        size = np.sqrt(np.maximum(np.diag(information)[1:], 1e-300))
+        inverse = np.linalg.pinv(
+            information[1:, 1:] / np.outer(size, size), rcond=_UNDETERMINED, hermitian=True
+        )
+        optics = (inverse @ (information[1:, 0] / size)) / size
+        moved = imitation(whole, count)
+        row = int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
+        return float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics
+
+    @property
+    def _kept(self) -> NDArray[np.intp]:
+        return np.flatnonzero([*self.free, self.level])
+
+
+def response_of(
+    config: Config, table: pd.DataFrame, names: Sequence[str], *, contrast: bool = False
+) -> Response:
+    """Give the response of the particles of a movie, of as many frames as its events have."""
+    pixel = config.camera.pixel_size_nm
+    if pixel is None:
+        raise ConfigError("camera.pixel_size_nm is needed")
+    grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
+    bare = config.model_copy(update={"calibration": None})
+    return Response(
+        forward_model(bare, 1.05 * grid.diagonal_nm / 2), grid, tuple(names),
+        tuple(name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS),
+        level=config.background.method == "sliding",
+        frames=(int(table["n_before"].median()), int(table["n_after"].median())),
+        contrast=contrast,
+    )  # fmt: skip
+
+
+def at_standards(config: Config) -> Config:
+    """Give the configuration with which the standards of the calibration were seen.
+
+    Their heights were known, their masses fitted.
+    """
+    line = config.calibration
+    if line is None or line.optics is None:
+        return config
+    height = config.particle.height_nm if line.height_nm is None else line.height_nm
+    camera = config.camera
+    if line.camera is not None and line.camera.pixel_size_nm is not None:
+        camera = camera.model_copy(update={"pixel_size_nm": line.camera.pixel_size_nm})
+    return config.model_copy(
+        update={
+            "optics": line.optics.model_copy(update={"covariance": line.covariance}),
+            "particle": config.particle.model_copy(update={"height_nm": height}),
+            "camera": camera,
+            "fit": config.fit.model_copy(update={"mode": "mass"}),
+        }
+    )
+
+
+def standards_share(config: Config) -> bool:
+    """Tell whether the optics of the standards are those of the movie, errors included.
+
+    Line and contrasts are then off by the same factor, that of a faint particle, and only what
+    others have beyond it remains.
+    """
+    line, optics = config.calibration, config.optics
+    if line is None:
+        return False
+    if line.optics is None:
+        return True
+    names = optics.covariance.names if optics.covariance is not None else ()
+    here, there = _settings_of(optics, names), _settings_of(line.optics, names)
+    return line.covariance == optics.covariance and np.allclose(here, there, rtol=1e-9, atol=0)
+
+
+def _settings_of(optics: Optics, names: Sequence[str]) -> FloatArray:
+    """Give measurable parameters of optics.
+
+    Shapes: result (len(names),).
+    """
+    terms = optics.aberrations_nm
+    return np.array(
+        [terms.get(name, 0.0) if name in ABERRATIONS else getattr(optics, name) for name in names]
+    )
+
+
+def amplitude_nodes(amplitude: FloatArray, good: NDArray[np.bool_]) -> FloatArray:
+    """Amplitudes for which the response is computed; they span those of the good fits."""
+    spanned = amplitude[good] if good.any() else amplitude
+    low, high = float(spanned.min()), float(spanned.max())
+    middle, half = (low + high) / 2, (high - low) / 2
+    if half <= 1e-9 * abs(middle):
+        return np.array([middle or 1e-9])
+    angles = np.pi * (np.arange(_AMPLITUDES) + 0.5) / _AMPLITUDES
+    nodes = middle + half * np.cos(angles)
+    return np.where(np.abs(nodes) > 1e-6 * half, nodes, 1e-6 * half)
+
+
+def height_weights(
+    z_nm: FloatArray, span: tuple[float, float], fringe_nm: float
+) -> tuple[FloatArray, FloatArray]:
+    """Heights and the weights (events, heights) of a cubic through the four nearest of them."""
+    if not np.ptp(z_nm):
+        return z_nm[:1], np.ones((z_nm.size, 1))
+    low, high = span
+    count = max(int(np.ceil((high - low) * _HEIGHTS_PER_FRINGE / fringe_nm)), 3)
+    place = (np.clip(z_nm, low, high) - low) / (high - low) * count
+    first = np.clip(np.floor(place).astype(int) - 1, 0, count - 3)
+    weights = np.zeros((z_nm.size, count + 1))
+    cubic = lagrange(np.arange(4.0), place - first)
+    np.put_along_axis(weights, first[:, None] + np.arange(4), cubic, axis=1)
+    used = np.flatnonzero(np.any(weights != 0, axis=0))
+    heights = np.asarray(low + (high - low) / count * used, dtype=np.float64)
+    return heights, weights[:, used]
+
+
+def lagrange(nodes: FloatArray, points: FloatArray) -> FloatArray:
+    """Weights of the polynomial through values at the nodes, shape (points, nodes)."""
+    weights = np.ones((points.size, nodes.size))
+    for k, node in enumerate(nodes):
+        for other in np.delete(nodes, k):
+            weights[:, k] *= (points - other) / (node - other)
+    return weights
