@@ -25,6 +25,7 @@ from iscat_analysis.config.files import (
 )
 from iscat_analysis.config.instrument import (
     ABERRATIONS,
+    LARGEST_SD_NM,
     MEASURABLE,
     Calibration,
     CameraConfig,
@@ -54,6 +55,7 @@ from iscat_analysis.config.values import (
 __all__ = [
     "ABERRATIONS",
     "ALL",
+    "LARGEST_SD_NM",
     "MEASURABLE",
     "PIXEL_NM",
     "SIMULATED",

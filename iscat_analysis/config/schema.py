@@ -99,6 +99,12 @@ class Config(Section):
                 f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
             )
+        spread = self.particle.height_sd_nm or self.particle.height_nm == "auto"
+        if self.optics.psf == "measured" and spread:
+            raise ValueError(
+                'optics.psf = "measured" has the picture at one height: with it set '
+                "particle.height_sd_nm = 0 and particle.height_nm to a number"
+            )
         return self
 
     @model_validator(mode="after")

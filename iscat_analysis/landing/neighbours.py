@@ -63,7 +63,7 @@ class Neighbours:
         self._roi_px = scene.roi_px
         nominal = scene.model.material.mass_kda
         self._contrast_per_kda = (
-            scene.model.peak_contrast(scene.config.particle.height_nm, nominal) / nominal
+            scene.model.peak_contrast(scene.config.particle.nominal_height_nm, nominal) / nominal
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
 

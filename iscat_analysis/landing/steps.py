@@ -203,9 +203,7 @@ class ChunkFitter:
         if "mass_kda" not in FREE_PARAMETERS[scene.mode]:
             mass = scene.model.material.mass_kda
         mass = max(mass, 1e-3 * scene.model.material.mass_kda)
-        start = Candidate(
-            peak.x_px, peak.y_px, scene.config.particle.height_nm, mass, abs(peak.snr)
-        )
+        start = Candidate(peak.x_px, peak.y_px, scene.height_nm(mass), mass, abs(peak.snr))
         return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     # ---- one step --------------------------------------------------------------------------
@@ -217,9 +215,11 @@ class ChunkFitter:
         z_range = self._scene.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
-            likelihood, start = task.likelihood, _displaced(step.start, *task.offset_px)
+            likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
             box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
             theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
+            if not box.free[2]:
+                theta[2] = start.z_nm
             theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
             best = likelihood.maximize(theta, box.free, box.lower, box.upper)
             if likelihood.model.scale.mass(best.theta[3]) <= 0:
@@ -259,6 +259,12 @@ class ChunkFitter:
             refitted[index] = step
         return refitted
 
+    def _seated(self, step: Step) -> Candidate:
+        """Put a step where a particle of its mass is expected, unless its height is free."""
+        if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+            return step.start
+        return replace(step.start, z_nm=self._scene.height_nm(step.start.mass_kda))
+
     def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
         """Put a step where a fit found it."""
         likelihood, (y_px, x_px) = task.likelihood, task.offset_px
@@ -290,7 +296,7 @@ class ChunkFitter:
         if likelihood.n_pixels < 0.5 * math.prod(likelihood.grid.shape):
             return None
         y_px, x_px = task.offset_px
-        start = _displaced(step.start, y_px, x_px)
+        start = _displaced(self._seated(step), y_px, x_px)
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
@@ -305,8 +311,9 @@ class ChunkFitter:
         seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
         others = tuple(steps[i] for i in seen)
         repeats = step_repeats(
-            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern
-        )
+            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern,
+            scene.mode,
+        )  # fmt: skip
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:

@@ -125,6 +125,7 @@ class TaskBuilder:
             read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
             masked=~used,
         )  # fmt: skip
+        likelihood = scene.with_prior(likelihood, step.start.mass_kda)
         windows = Windows(
             before_e=before,
             after_e=after,

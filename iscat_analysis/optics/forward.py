@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
 from iscat_analysis._kernels.radial import STEP
-from iscat_analysis.config import Calibration, Config, Optics
+from iscat_analysis.config import LARGEST_SD_NM, Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.optics.aperture import (
     NEAR_CRITICAL,
@@ -78,7 +78,7 @@ def forward_model(
     optics = config.optics
     if config.calibration is not None:
         reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
-    height = config.particle.height_nm
+    height = config.particle.nominal_height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm
     ns, ng, ni = optics.n_sample, optics.n_glass, optics.n_immersion
@@ -129,7 +129,7 @@ def forward_model(
         wave=wave,
         strength=strength,
         reach_nm=wave.reach_nm,
-        z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
+        z_range_nm=(min(config.fit.z_range_nm[0], height, _lowest_nm(config)), z_max_nm),
         samples=(points / 2, weights / 2),
     )
     if optics.psf == "measured":
@@ -212,6 +212,15 @@ def _wave(
         analyzer=optics.analyzer,
         like=before if isinstance(before, RadialField) else None,
     )
+
+
+def _lowest_nm(config: Config) -> float:
+    """Give the lowest height that a normal prior lets a fit look at, below the coverslip too."""
+    particle = config.particle
+    sd_nm = LARGEST_SD_NM / 5 if particle.height_is_open else particle.height_sd_nm
+    if config.fit.mode != "mass" or not sd_nm:
+        return math.inf
+    return min(particle.mean_height_nm(0.0), particle.nominal_height_nm) - 5 * sd_nm
 
 
 def _mass_scale(model: ForwardModel, line: Calibration) -> MassScale:
