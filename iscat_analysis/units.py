@@ -22,7 +22,7 @@ def sphere_mass_kda(diameter_nm: float, density_kg_m3: float) -> float:
 
 def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
     """Diameter of a sphere."""
-    return (6 * mass_kda * KILODALTON_KG / (math.pi * density_kg_m3)) ** (1 / 3) / NM
+    return math.cbrt(6 * mass_kda * KILODALTON_KG / (math.pi * density_kg_m3)) / NM
 
 
 def count(n: int, noun: str) -> str:

@@ -42,6 +42,9 @@ DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "pr
 USUAL_HEIGHT_NM = 5.0
 """Height of a protein on glass, at which masses are calibrated unless something else is said."""
 
+UNKNOWN_SD_NM = 20.0
+"""Spread of heights before a movie has told them: a tenth of a fringe."""
+
 TYPICAL_DIAMETER_NM = 30.0
 """Of a particle whose size is not given, unless it is a protein."""
 
@@ -265,8 +268,8 @@ class Particle(Section):
     )
     height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         USUAL_HEIGHT_NM,
-        description='z where it is fixed; start value elsewhere | "contact": radius of the particle '
-        '+ linker_nm | "auto": 5 nm for optics and mass scale, and learned from the movie for the '
+        description='z where it is fixed; start value elsewhere | "contact": radius of particle + '
+        'linker_nm | "auto": 5 nm for optics and mass scale, and learned from the movie for the '
         "particles, mean and spread",
     )
     linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
@@ -344,6 +347,11 @@ class Particle(Section):
     def height_is_open(self) -> bool:
         """Whether heights are to be learned from the movie."""
         return self.height_nm == "auto" and self.learned_height_nm is None
+
+    @property
+    def height_prior_sd_nm(self) -> float:
+        """Standard deviation of the prior of heights; wide before a movie has told them."""
+        return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
 
 
 class Calibration(Section):

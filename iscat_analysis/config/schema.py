@@ -99,7 +99,7 @@ class Config(Section):
                 f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
             )
-        spread = self.particle.height_sd_nm or self.particle.height_nm == "auto"
+        spread = self.particle.height_prior_sd_nm
         if self.optics.psf == "measured" and spread:
             raise ValueError(
                 'optics.psf = "measured" has the picture at one height: with it set '

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds.classical import ComplexArray
@@ -14,6 +15,7 @@ from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.height_spread import height_evidence
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of, lines_from, numbered
 from iscat_analysis.records import (
@@ -72,6 +74,7 @@ class DetectionResult:
     followed: Followed | None = None
     trajectory: Trajectory | None = None
     optics: Mapping[str, Any] = field(default_factory=dict)
+    heights: FloatArray | None = None  # of every row, from `height_evidence`
     interrupted: bool = False
 
 
@@ -96,6 +99,19 @@ def lines_of(
         (height,) = heights
         known[height] = quantum_information(scene.model, height)
     return list(mapper(lambda event: _line(scene, event, known), events))
+
+
+def heights_of(
+    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+) -> FloatArray:
+    """Give what the light of each event says of its height, where masses are fitted.
+
+    Shapes: result (n, 3).
+    """
+    if scene.mode != "mass":
+        return np.full((len(events), 3), np.nan)
+    told = mapper(lambda event: height_evidence(event.likelihood, event.fit), events)
+    return np.array(list(told)).reshape(-1, 3)
 
 
 def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:

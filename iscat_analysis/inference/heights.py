@@ -52,9 +52,9 @@ def height_prior(config: Config, mass_kda: float) -> HeightPrior | None:
     particle = config.particle
     if not has_prior(config):
         return None
-    return HeightPrior(particle.mean_height_nm(mass_kda), particle.height_sd_nm)
+    return HeightPrior(particle.mean_height_nm(mass_kda), particle.height_prior_sd_nm)
 
 
 def has_prior(config: Config) -> bool:
     """Tell whether heights are a nuisance with a normal prior."""
-    return config.fit.mode == "mass" and config.particle.height_sd_nm > 0
+    return config.fit.mode == "mass" and config.particle.height_prior_sd_nm > 0

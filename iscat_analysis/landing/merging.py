@@ -42,6 +42,7 @@ class Done:
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
     cause: str = ""  # what the model probably has wrong
     empty: EmptySpread | None = None  # noise where nothing lands or leaves
+    heights: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # of every row
 
 
 class Merged:
@@ -54,6 +55,7 @@ class Merged:
         self.sampled = 0
         self.cause = ""
         self.empty: EmptySpread | None = None
+        self.heights = np.empty((0, 3))  # of the rows of `result`
 
     def note(self, number: int, done: Done) -> None:
         """Note when the events of a finished chunk happen, whose turn may not have come yet."""
@@ -113,6 +115,7 @@ class Merged:
             if number < VIEWS and row < len(done.views):
                 view = replace(done.views[row], event=number)
                 views.append(view if number < CLIPS else replace(view, clip=None))
+        self.heights = np.array([homes[i][0].heights[homes[i][1]] for i in order]).reshape(-1, 3)
         rows = numbered(table.iloc[order], range(len(order)))
         return rows, tuple(views), tuple(repeats)
 

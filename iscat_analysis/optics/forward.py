@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.lattice import LATTICE_STEP, reach_of_samples
 from iscat_analysis._kernels.pupil import rectangle
 from iscat_analysis._kernels.radial import STEP
-from iscat_analysis.config import LARGEST_SD_NM, Calibration, Config, Optics
+from iscat_analysis.config import Calibration, Config, Optics
 from iscat_analysis.errors import ConfigError, ContrastError
 from iscat_analysis.optics.aperture import (
     NEAR_CRITICAL,
@@ -217,7 +217,7 @@ def _wave(
 def _lowest_nm(config: Config) -> float:
     """Give the lowest height that a normal prior lets a fit look at, below the coverslip too."""
     particle = config.particle
-    sd_nm = LARGEST_SD_NM / 5 if particle.height_is_open else particle.height_sd_nm
+    sd_nm = particle.height_prior_sd_nm
     if config.fit.mode != "mass" or not sd_nm:
         return math.inf
     return min(particle.mean_height_nm(0.0), particle.nominal_height_nm) - 5 * sd_nm

@@ -15,10 +15,13 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FloatArray
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
+from iscat_analysis.trust.heights import Heights
 from iscat_analysis.trust.systematic import systematic
 
 
-def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread]]:
+def reported_rows(
+    found: DetectionResult, heights: Heights | None
+) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread]]:
     """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
@@ -27,7 +30,10 @@ def reported_rows(found: DetectionResult) -> tuple[pd.DataFrame, dict[str, Empir
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
         if name == "flags":
-            shared = systematic(config, fits, mass_error(found.optics), found.scene.model.scale)
+            shared = systematic(
+                config, fits, mass_error(found.optics), found.scene.model.scale,
+                None if heights is None else heights.mass_shift_kda,
+            )  # fmt: skip
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

@@ -45,12 +45,15 @@ def systematic(
     table: pd.DataFrame,
     mass_share: float = 0.0,
     scale: MassScale | None = None,
+    of_heights_kda: FloatArray | None = None,
 ) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share."""
     squares: dict[str, FloatArray] = {}
     sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
     if scale is not None:
         sources += (partial(_of_heavy_particles, scale),)
+    if of_heights_kda is not None and of_heights_kda.any():
+        sources += (lambda *_: {"mass_kda": of_heights_kda},)
     for source in sources:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)

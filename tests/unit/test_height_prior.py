@@ -24,7 +24,7 @@ def heights() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def counts(heights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Counts before and after particles landed, from the heights of `heights`."""
+    """Draw counts before and after particles landed at these heights."""
     rng = np.random.default_rng(6)
     signal = ia.psf(
         OPTICS, ia.Particle(mass_kda=MASS_KDA), CAMERA, calibration=LINE, z_nm=heights,
