@@ -388,7 +388,8 @@ def add_prior(
     away = theta[2] - mean
     score[2] -= information * away
     fisher[2, 2] += information
-    return -0.5 * information * away * away
+    density: float = -0.5 * information * away * away
+    return density
 
 
 @kernel()

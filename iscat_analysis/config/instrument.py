@@ -279,6 +279,11 @@ class Particle(Section):
         0.0,
         description="standard deviation of heights; > 0: mode mass fits z with this normal prior",
     )
+    wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
+        0.0,
+        description="standard deviation along each axis of the places between which particles move "
+        "while they are seen, as on a tether",
+    )
     learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
         None,
         description='mean of the heights that a movie showed, where height_nm = "auto" found it; '

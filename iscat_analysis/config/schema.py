@@ -105,6 +105,11 @@ class Config(Section):
                 'optics.psf = "measured" has the picture at one height: with it set '
                 "particle.height_sd_nm = 0 and particle.height_nm to a number"
             )
+        if self.optics.psf == "measured" and self.particle.wiggle_nm:
+            raise ValueError(
+                'optics.psf = "measured" has the wiggle of the particles it shows: set '
+                "particle.wiggle_nm = 0"
+            )
         return self
 
     @model_validator(mode="after")

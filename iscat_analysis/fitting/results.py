@@ -15,7 +15,7 @@ from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import Scene
-from iscat_analysis.inference.height_spread import height_evidence
+from iscat_analysis.inference.nuisances import NOTHING, evidence_of
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of, lines_from, numbered
 from iscat_analysis.records import (
@@ -74,7 +74,7 @@ class DetectionResult:
     followed: Followed | None = None
     trajectory: Trajectory | None = None
     optics: Mapping[str, Any] = field(default_factory=dict)
-    heights: FloatArray | None = None  # of every row, from `height_evidence`
+    evidence: FloatArray | None = None  # of every row, in the order of `Evidence`
     interrupted: bool = False
 
 
@@ -101,17 +101,17 @@ def lines_of(
     return list(mapper(lambda event: _line(scene, event, known), events))
 
 
-def heights_of(
+def evidence_beside(
     scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> FloatArray:
-    """Give what the light of each event says of its height, where masses are fitted.
+    """Give what the light of each event says beside its fit, where masses are fitted.
 
-    Shapes: result (n, 3).
+    Shapes: result (n, 10), in the order of `Evidence`.
     """
     if scene.mode != "mass":
-        return np.full((len(events), 3), np.nan)
-    told = mapper(lambda event: height_evidence(event.likelihood, event.fit), events)
-    return np.array(list(told)).reshape(-1, 3)
+        return np.full((len(events), len(NOTHING)), np.nan)
+    told = mapper(lambda event: evidence_of(event.likelihood, event.fit), events)
+    return np.array(list(told)).reshape(-1, len(NOTHING))
 
 
 def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.records import FitResult, FloatArray
+from iscat_analysis.records import FloatArray
 
 FEWEST = 6
 """Events without which nothing is said of the spread of heights."""
@@ -86,32 +85,3 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
         float(widths[best]), float(inside.min()), float(inside.max()),
         2 * float(value[best] - value[0]), int(z.size),
     )  # fmt: skip
-
-
-def height_evidence(likelihood: Likelihood, fit: FitResult) -> FloatArray:
-    """Give what the light alone says of a height: estimate, its σ [nm], and what mass follows it.
-
-    One step of scoring from the fit, with what the prior said taken off, and everything else that
-    was fitted following the height; the last is ∂mass/∂z of a height that is held [kDa/nm].
-
-    Shapes: result (3,).
-    """
-    theta, free, z = fit.theta, fit.box.free.copy(), 2
-    if likelihood.model.is_measured or not free[3]:
-        return np.full(3, np.nan)
-    _, score, fisher = likelihood.score_fisher(theta)
-    mean, known = likelihood.height_prior
-    pull, own = score[z] + known * (theta[z] - mean), fisher[z, z] - known
-    free[z] = False
-    others = np.flatnonzero(free)
-    if not np.all(np.diag(fisher)[others] > 0):
-        return np.full(3, np.nan)
-    unit = 1 / np.sqrt(np.diag(fisher)[others])
-    scaled = fisher[np.ix_(others, others)] * np.outer(unit, unit)
-    follow = -unit * np.linalg.solve(scaled, unit * fisher[others, z])
-    information = own + fisher[z, others] @ follow
-    if not information > 0:
-        return np.full(3, np.nan)
-    slope = likelihood.model.scale.slope(float(theta[3]))
-    mass = follow[others.tolist().index(3)] * slope
-    return np.array([theta[z] + pull / information, information**-0.5, mass])

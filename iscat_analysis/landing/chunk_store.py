@@ -26,7 +26,7 @@ class Store(Checkpoint):
                 core=(low, high),
                 lines=lines,
                 repeats=data["repeats"],
-                heights=data["heights"],
+                evidence=data["evidence"],
                 views=unpacked_views(data),
                 good=data["good"],
                 light=data["light"],
@@ -46,7 +46,7 @@ class Store(Checkpoint):
         arrays = {
             "core": np.array(done.core),
             "repeats": done.repeats,
-            "heights": done.heights,
+            "evidence": done.evidence,
             **packed_views(done.views),
             "good": done.good,
             "light": done.light,

@@ -93,7 +93,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     )  # fmt: skip
     run.clock.lap("heights")
     good = (found.fits["status"] == Status.OK).to_numpy()
-    told = None if found.heights is None else spread_of_heights(*found.heights[good, :2].T)
+    told = None if found.evidence is None else spread_of_heights(*found.evidence[good, :2].T)
     if told is None or told.mean_se_nm > particle.height_prior_sd_nm / 2:
         run.tell(
             "the heights cannot be learned from so few or so faint particles: they are taken as "
@@ -231,7 +231,7 @@ def analyse_landings(
         summary=summary,
         repeats=repeats,
         empty=merged.empty,
-        heights=merged.heights,
+        evidence=merged.evidence,
         trajectory=merged.trajectory(),
         interrupted=interrupted,
     )

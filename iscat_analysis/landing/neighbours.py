@@ -110,8 +110,8 @@ class Neighbours:
         whole = power[frames.stop] - power[frames.start]
         if whole <= 0:
             return 0.0
-        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
-        later = (power[frames.stop] - power[turn]) / whole
+        turns = np.clip(step.at.turns - self._chunk.first, frames.start, frames.stop)
+        later = (power[frames.stop] - power[turns].mean()) / whole
         return float(later if step.sign > 0 else 1 - later)
 
     def box(self, step: Step) -> tuple[slice, slice]:
@@ -144,8 +144,8 @@ class Neighbours:
         self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
     ) -> None:
         """Multiply the pixels of a region that a step's image covers with `factor`."""
-        turn = step.at.frame - self._chunk.first
-        if self._pattern is None and not before.start < turn < after.stop:
+        turns = step.at.turns - self._chunk.first
+        if self._pattern is None and not (before.start < turns[-1] and turns[0] < after.stop):
             return  # there in all of these frames, or in none
         shared = self.shared(step, region)
         if shared is None:

@@ -89,7 +89,8 @@ def step_repeats(
                 continue
             here, image = shown
             height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
-            known += np.outer(other.sign * height, frames >= other.at.frame)
+            there = (frames >= other.at.turns[:, None]).mean(axis=0)
+            known += np.outer(other.sign * height, there)
         if pattern and local:
             known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
         series.append(Series(one.values - known * one.power, one.power, one.shot, one.read))

@@ -332,7 +332,7 @@ class ChunkFitter:
                 self._scene, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
-                poor_fit=steps[number].at.p_constant < POOR_FIT_P,
+                changing=steps[number].at.p_constant < POOR_FIT_P,
             )  # fmt: skip
             judged.append(replace(own.fitted, event=replace(event, flags=flags)))
         return judged

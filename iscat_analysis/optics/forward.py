@@ -28,6 +28,7 @@ from iscat_analysis.optics.aperture import (
     harmonics,
     weight_on,
 )
+from iscat_analysis.optics.blur import wiggled
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
@@ -136,9 +137,9 @@ def forward_model(
         template = Template.read(Path(optics.template or ""))
         template.refuse_mismatch(config.camera.pixel_size_nm, config.fit.roi_nm)
         model = with_template(model, template)
-    if config.calibration is None:
-        return model
-    return replace(model, scale=_mass_scale(model, config.calibration))
+    if config.calibration is not None:  # of a particle that rests
+        model = replace(model, scale=_mass_scale(model, config.calibration))
+    return wiggled(model, config.particle.wiggle_nm)
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:

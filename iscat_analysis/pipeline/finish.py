@@ -30,7 +30,6 @@ from iscat_analysis.report.spread import rejection
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
 from iscat_analysis.trust.empirical_spread import spread_verdict
-from iscat_analysis.trust.heights import Heights
 
 
 def gather(
@@ -57,12 +56,13 @@ def gather(
         further["optics"] = found.optics
     further |= extra
     learned = bool(ready.summary.get("optics", {}).get("calibrated"))
-    heights = Heights.of(config, found.fits, found.heights, learned_optics=learned)
-    table, achieved = reported_rows(found, heights)
-    if heights is not None:
-        further["heights"] = heights.summary
-        if heights.message:
-            run.tell(heights.message)
+    rows = reported_rows(found, learned_optics=learned)
+    table, achieved = rows.table, rows.achieved
+    for name, beside in (("heights", rows.heights), ("extension", rows.extension)):
+        if beside is not None:
+            further[name] = beside.summary
+            if beside.message:
+                run.tell(beside.message)
     for doubt in (
         line_warning(config, table),
         bend_warning(scene.model.scale, table),

@@ -182,7 +182,7 @@ def inject_and_recover(
     )
     if again.interrupted:
         raise KeyboardInterrupt
-    rows, _ = reported_rows(again)
+    rows = reported_rows(again).table
     return recovery(
         particles,
         rows[rows["status"] != Status.SIDELOBE],

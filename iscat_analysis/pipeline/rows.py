@@ -8,33 +8,73 @@ beginning.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FloatArray
+from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.records import BoolArray, FloatArray, Status, verdict
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
+from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.heights import Heights
+from iscat_analysis.trust.shared_places import at_a_shared_place
 from iscat_analysis.trust.systematic import systematic
 
 
-def reported_rows(
-    found: DetectionResult, heights: Heights | None
-) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread]]:
+@dataclass(frozen=True)
+class ReportedRows:
+    """The rows of all events of a movie, and what they say together."""
+
+    table: pd.DataFrame
+    achieved: Mapping[str, EmpiricalSpread]
+    heights: Heights | None = None
+    extension: Extension | None = None
+
+
+def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
     """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
+    heights, extension = None, None
+    if found.evidence is not None and len(found.evidence):
+        told = Evidence(*found.evidence.T)
+        heights = Heights.of(config, fits, told, learned_optics=learned_optics)
+        extension = Extension.of(fits, told, achieved)
+    shifts = [beside.mass_shift_kda for beside in (heights, extension) if beside is not None]
+    if extension is not None:
+        fits = flagged(fits, extension.flagged, Status.EXTENDED)
+    if found.heading == "landing":
+        fits = flagged(fits, at_a_shared_place(fits), Status.CHANGING)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     columns: dict[str, pd.Series | FloatArray] = {}
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
         if name == "flags":
             shared = systematic(
-                config, fits, mass_error(found.optics), found.scene.model.scale,
-                None if heights is None else heights.mass_shift_kda,
-            )  # fmt: skip
+                config, fits, mass_error(found.optics), found.scene.model.scale, shifts
+            )
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
-    return pd.DataFrame(columns), achieved
+    return ReportedRows(pd.DataFrame(columns), achieved, heights, extension)
+
+
+def flagged(fits: pd.DataFrame, which: BoolArray, flag: Status) -> pd.DataFrame:
+    """Add a flag to rows.
+
+    Shapes: `which` (rows,).
+    """
+    if not which.any():
+        return fits
+    fits = fits.copy()
+    for row in np.flatnonzero(which).tolist():
+        said = [Status(name) for name in str(fits["flags"].iat[row] or "").split(";") if name]
+        status, flags = verdict([*said, flag])
+        fits.iloc[row, fits.columns.get_loc("status")] = str(status)
+        fits.iloc[row, fits.columns.get_loc("flags")] = ";".join(str(one) for one in flags)
+    return fits

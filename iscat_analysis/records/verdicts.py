@@ -17,6 +17,8 @@ class Status(StrEnum):
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
     SIDELOBE = "sidelobe"
+    CHANGING = "changing"
+    EXTENDED = "extended"
 
     @property
     def advice(self) -> str:
@@ -39,6 +41,11 @@ _ADVICE = {
     Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
     "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
+    Status.CHANGING: "The light of the particle goes on changing beside its step: it settles, "
+    "bleaches or blinks, moves on, or another one shares its place; the mass is that of the mean "
+    "change.",
+    Status.EXTENDED: "The picture is wider than that of a point: the particle wiggles by more than "
+    "particle.wiggle_nm says, or has parts that are apart; its mass is too small.",
 }
 
 
@@ -47,13 +54,15 @@ SEVERITY = (
     Status.NOT_CONVERGED,
     Status.AT_BOUND,
     Status.POOR_FIT,
+    Status.CHANGING,
+    Status.EXTENDED,
     Status.AMBIGUOUS_Z,
     Status.TOO_CLOSE,
     Status.SATURATED,
 )
 """What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
-a model that does not describe the data; one of several heights; a mass shared with a neighbour;
-pixels left out."""
+a model that does not describe the data, their course or their width; one of several heights; a mass
+shared with a neighbour; pixels left out."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:

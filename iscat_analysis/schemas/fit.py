@@ -294,6 +294,14 @@ class Heights(Closed):
     )
 
 
+class Extension(Closed):
+    """Width of the particles' pictures beyond that of the model's."""
+
+    variance_nm2: Number = key("Mean variance of places along each axis [nm²]; null of few events")
+    variance_se_nm2: Number = key("Its standard error [nm²]")
+    flagged: Count = key("Rows that are flagged extended for it")
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -380,6 +388,7 @@ class Summary(Document):
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
+    extension: Extension = maybe("Mode mass: width of the pictures beyond that of the model's")
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
         "Where rows, columns or a smooth part of the light changed, and were corrected"

@@ -12,6 +12,7 @@ import pandas as pd
 from iscat_analysis.config import Config
 from iscat_analysis.inference.height_spread import HeightSpread, spread_of_heights
 from iscat_analysis.inference.heights import has_prior
+from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import FloatArray, Status
 
 _DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
@@ -29,24 +30,19 @@ class Heights:
 
     @classmethod
     def of(
-        cls, config: Config, table: pd.DataFrame, told: FloatArray | None, *, learned_optics: bool
+        cls, config: Config, table: pd.DataFrame, told: Evidence, *, learned_optics: bool
     ) -> Heights | None:
-        """Judge the evidence of every row; None where there is too little.
-
-        Shapes: `told` (rows, 3).
-        """
-        if told is None or not len(told):
-            return None
+        """Judge the evidence of every row; None where there is too little."""
         held = not has_prior(config)
         kinds = _DESCRIBED if held else {Status.OK.value}
         said = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in said])
-        spread = spread_of_heights(told[good, 0], told[good, 1])
+        spread = spread_of_heights(told.z_nm[good], told.sigma_z_nm[good])
         if spread is None:
             return None
-        shift = np.zeros(len(told))
+        shift = np.zeros(len(table))
         if held and spread.is_spread:
-            shift = np.abs(np.nan_to_num(told[:, 2])) * spread.sd_nm
+            shift = np.abs(np.nan_to_num(told.mass_per_z)) * spread.sd_nm
         return cls(spread, held, shift, learned_optics)
 
     @property

@@ -8,7 +8,7 @@ shrink when events are averaged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -45,15 +45,14 @@ def systematic(
     table: pd.DataFrame,
     mass_share: float = 0.0,
     scale: MassScale | None = None,
-    of_heights_kda: FloatArray | None = None,
+    of_nuisances_kda: Sequence[FloatArray] = (),
 ) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share."""
     squares: dict[str, FloatArray] = {}
     sources: tuple[Source, ...] = (*_SOURCES, partial(_of_what_is_left_over, mass_share))
     if scale is not None:
         sources += (partial(_of_heavy_particles, scale),)
-    if of_heights_kda is not None and of_heights_kda.any():
-        sources += (lambda *_: {"mass_kda": of_heights_kda},)
+    sources += tuple(partial(_of_a_nuisance, shift) for shift in of_nuisances_kda if shift.any())
     for source in sources:
         for name, sigma in source(config, table).items():
             squares[name] = squares.get(name, np.zeros(len(table))) + np.square(sigma)
@@ -67,6 +66,11 @@ def _of_what_is_left_over(
     """Give what masses are wrong by where the optics were rejected, and no others learned."""
     del config
     return {"mass_kda": mass_share * table["mass_kda"].to_numpy(float)} if mass_share else {}
+
+
+def _of_a_nuisance(shift_kda: FloatArray, *_: object) -> Mapping[str, FloatArray]:
+    """Give what a height or a width that was held does to masses."""
+    return {"mass_kda": shift_kda}
 
 
 def _of_heavy_particles(

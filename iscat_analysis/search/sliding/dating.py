@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis._kernels.stepping import frame_scores, one_change, projector
 from iscat_analysis.records import FloatArray
@@ -20,6 +21,8 @@ from iscat_analysis.search.sliding.frames import Patch
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
+_RISES = 10.0  # log-likelihood by which a rise describes the frames better than a step
+_RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)
 _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 
 
@@ -32,20 +35,36 @@ class StepFrame:
     height: float
     per_frame_snr: float
     p_constant: float
+    rise: int = 0
 
     @property
     def gap(self) -> int:
-        """Frames on either side of the step that may belong to the other state.
+        """Frames on either side of the step that may belong to the other state, or to neither.
 
         They stay out of the fit: where the frame was chosen by their noise, that noise would
-        count as signal.
+        count as signal, and while the light rises the contrast is not yet that of the particle.
         """
-        return _gap(self.per_frame_snr)
+        return max(_gap(self.per_frame_snr), _half(self.rise))
+
+    def kept_out(self, window: int) -> int:
+        """Frames on either side that stay out of a fit on windows of so many frames."""
+        doubtful = min(_gap(self.per_frame_snr), window // 5)
+        return max(doubtful, min(_half(self.rise), window // 2))
+
+    @property
+    def turns(self) -> NDArray[np.int64]:
+        """Frames at each of which an equal part of the light turns up."""
+        half = self.rise // 2
+        return np.arange(self.frame - half, self.frame + half + 1)
 
     @classmethod
     def undated(cls, frame: int, half_width: int) -> StepFrame:
         """Date a step as the search did, before its own frames are looked at."""
         return cls(frame, half_width, height=1.0, per_frame_snr=1.0, p_constant=1.0)
+
+
+def _half(rise: int) -> int:
+    return math.ceil(rise / 2) + 1 if rise else 0
 
 
 def _gap(per_frame_snr: float) -> int:
@@ -83,10 +102,64 @@ def locate_step(
     half_width = int(distance[order][np.searchsorted(held, CREDIBLE * (1 - 1e-12))])
     height = float(jump[best])
     snr = abs(height) * math.sqrt(scale)
-    turn, gap = best + 1, _gap(snr)
+    rise, centre = _rise(heights, weight, best + 1, log[best])
+    if rise:
+        height, turn = _height_beside(heights, weight, centre, _half(rise)), centre
+        snr = abs(height) * math.sqrt(scale)
+    else:
+        turn = best + 1
+    gap = max(_gap(snr), _half(rise))
     sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
     p = min(_p_constant(heights[side], weight[side]) for side in sides)
-    return StepFrame(int(frames[best]), half_width, height, snr, 1 - (1 - p) ** 2)
+    frame = patch.first + turn
+    return StepFrame(frame, max(half_width, rise // 2), height, snr, 1 - (1 - p) ** 2, rise)
+
+
+def _rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> tuple[int, int]:
+    """Find over how many frames the light rises, and the middle of them; 0 where at once.
+
+    A line from one level to the other is set against a step, whose log-likelihood above none is
+    given: it must describe the frames better by `_RISES`.  It is tried about the best step, which
+    lies inside it.
+
+    Shapes: `heights` (t,), `weight` (t,).
+    """
+    if step < _RISES:
+        return 0, turn
+    lit = np.flatnonzero(weight > 0)
+    w, y = weight[lit], heights[lit]
+    mean = np.average(y, weights=w)
+    best, found = step + _RISES, (0, turn)
+    for rise in _RISE_FRAMES:
+        if 2 * rise > heights.size:
+            break
+        reach = rise // 2
+        centres = np.arange(turn - reach, turn + reach + 1, max(rise // 8, 1))
+        centres = centres[(centres > reach) & (centres < heights.size - reach)]
+        if not centres.size:
+            continue
+        line = np.clip((lit + 0.5 - centres[:, None]) / rise + 0.5, 0.0, 1.0)
+        line -= (line @ w / w.sum())[:, None]
+        along = line @ (w * (y - mean))
+        known = (line**2) @ w
+        gain = np.where(along > 0, 0.5 * along**2 / np.maximum(known, 1e-300), 0.0)
+        top = int(np.argmax(gain))
+        if gain[top] > best:
+            best, found = float(gain[top]), (rise, int(centres[top]))
+    return found
+
+
+def _height_beside(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
+    """Give what frames after a gap have beyond those before it.
+
+    Shapes: `heights` (t,), `weight` (t,).
+    """
+    sides = (slice(0, turn - gap), slice(turn + gap, None))
+    light = [float(weight[side].sum()) for side in sides]
+    if min(light) <= 0:
+        return 0.0
+    first, last = (float(weight[side] @ heights[side]) for side in sides)
+    return last / light[1] - first / light[0]
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:
