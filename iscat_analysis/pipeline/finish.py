@@ -58,7 +58,10 @@ def gather(
     learned = bool(ready.summary.get("optics", {}).get("calibrated"))
     rows = reported_rows(found, learned_optics=learned)
     table, achieved = rows.table, rows.achieved
-    for name, beside in (("heights", rows.heights), ("extension", rows.extension)):
+    for name, beside in (
+        ("heights", rows.heights), ("extension", rows.extension),
+        ("fluctuation", rows.fluctuation),
+    ):  # fmt: skip
         if beside is not None:
             further[name] = beside.summary
             if beside.message:
@@ -73,8 +76,9 @@ def gather(
             run.tell(doubt)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
+        had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
         verdict = spread_verdict(
-            achieved, found.summary,
+            {name: one for name, one in achieved.items() if name not in had}, found.summary,
             scaled=scaled, rejected=bool(rejection(table)), sliding=ready.way == "sliding",
         )  # fmt: skip
         further["repeats"] = verdict

@@ -21,6 +21,7 @@ from iscat_analysis.records import BoolArray, FloatArray, Status, verdict
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
+from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.heights import Heights
 from iscat_analysis.trust.shared_places import at_a_shared_place
 from iscat_analysis.trust.systematic import systematic
@@ -34,6 +35,7 @@ class ReportedRows:
     achieved: Mapping[str, EmpiricalSpread]
     heights: Heights | None = None
     extension: Extension | None = None
+    fluctuation: Fluctuation | None = None
 
 
 def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
@@ -51,6 +53,12 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     if found.heading == "landing":
         fits = flagged(fits, at_a_shared_place(fits), Status.CHANGING)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
+    fluctuation = None
+    if not scale:  # which has all that the frames show
+        fluctuation = Fluctuation.of(mode, fits, found.repeats, achieved)
+    if fluctuation is not None:
+        sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
+        fits = fits.assign(sigma_mass_kda=sigma)
     columns: dict[str, pd.Series | FloatArray] = {}
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
@@ -61,7 +69,8 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
             columns |= {f"systematic_{key}": sigma for key, sigma in shared.items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
-    return ReportedRows(pd.DataFrame(columns), achieved, heights, extension)
+    table = pd.DataFrame(columns)
+    return ReportedRows(table, achieved, heights, extension, fluctuation)
 
 
 def flagged(fits: pd.DataFrame, which: BoolArray, flag: Status) -> pd.DataFrame:

@@ -302,6 +302,14 @@ class Extension(Closed):
     flagged: Count = key("Rows that are flagged extended for it")
 
 
+class Fluctuation(Closed):
+    """Slow fluctuation of contrasts while particles are there, which sigma_mass_kda has."""
+
+    relative: NotNegative = key("Standard deviation over the contrast")
+    relative_se: NotNegative = key("Its standard error")
+    frames: NotNegative = key("Correlation time [frames]")
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -389,6 +397,7 @@ class Summary(Document):
     )
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
     extension: Extension = maybe("Mode mass: width of the pictures beyond that of the model's")
+    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, where it is seen")
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
         "Where rows, columns or a smooth part of the light changed, and were corrected"

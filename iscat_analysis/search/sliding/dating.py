@@ -52,10 +52,19 @@ class StepFrame:
         return max(doubtful, min(_half(self.rise), window // 2))
 
     @property
+    def first_turn(self) -> int:
+        """First frame in which light of the new state may be there."""
+        return self.frame - self.rise // 2
+
+    @property
+    def last_turn(self) -> int:
+        """Frame from which on all of it is there."""
+        return self.frame + self.rise // 2
+
+    @property
     def turns(self) -> NDArray[np.int64]:
         """Frames at each of which an equal part of the light turns up."""
-        half = self.rise // 2
-        return np.arange(self.frame - half, self.frame + half + 1)
+        return np.arange(self.first_turn, self.last_turn + 1)
 
     @classmethod
     def undated(cls, frame: int, half_width: int) -> StepFrame:
