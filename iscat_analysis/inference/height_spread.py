@@ -79,9 +79,11 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
     mean = (z / total).sum(axis=1) / (1 / total).sum(axis=1)
     value = -0.5 * (np.log(total) + (z - mean[:, None]) ** 2 / total).sum(axis=1)
     best = int(np.argmax(value))
-    inside = widths[2 * (value[best] - value) < _IN_95]
+    fallen = 2 * (value[best] - value)
+    low = float(np.interp(_IN_95, fallen[best::-1], widths[best::-1]))
+    high = float(np.interp(_IN_95, fallen[best:], widths[best:]))
     return HeightSpread(
         float(mean[best]), math.sqrt(1 / float((1 / total[best]).sum())),
-        float(widths[best]), float(inside.min()), float(inside.max()),
+        float(widths[best]), low, high,
         2 * float(value[best] - value[0]), int(z.size),
     )  # fmt: skip

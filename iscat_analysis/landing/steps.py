@@ -51,6 +51,7 @@ ROUNDS = 6
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 _EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
+_MUCH = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
 @dataclass(frozen=True)
@@ -332,7 +333,10 @@ class ChunkFitter:
                 self._scene, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
-                changing=steps[number].at.p_constant < POOR_FIT_P,
+                changing=steps[number].at.p_constant < POOR_FIT_P
+                or any(
+                    away[i] < self._roi_px / 2 and _outshines(steps[i], steps[number]) for i in near
+                ),
             )  # fmt: skip
             judged.append(replace(own.fitted, event=replace(event, flags=flags)))
         return judged
@@ -361,6 +365,11 @@ def _has_moved(old: Step, new: Step) -> bool:
         return True
     tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
     return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
+
+
+def _outshines(other: Step, step: Step) -> bool:
+    """Whether a step may be what is left of another, much stronger one whose light rises slowly."""
+    return other.at.rise > 0 and other.start.mass_kda > _MUCH * step.start.mass_kda
 
 
 def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:

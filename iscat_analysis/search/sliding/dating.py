@@ -112,14 +112,16 @@ def locate_step(
     height = float(jump[best])
     snr = abs(height) * math.sqrt(scale)
     rise, centre = _rise(heights, weight, best + 1, log[best])
+    turn, gap = best + 1, _gap(snr)
     if rise:
         height, turn = _height_beside(heights, weight, centre, _half(rise)), centre
         snr = abs(height) * math.sqrt(scale)
+        # two that land one after the other are no line, and then neither are the frames between
+        straight = heights - height * _line(np.arange(heights.size), rise, centre)
+        p = _p_constant(straight, weight)
     else:
-        turn = best + 1
-    gap = max(_gap(snr), _half(rise))
-    sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
-    p = min(_p_constant(heights[side], weight[side]) for side in sides)
+        sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
+        p = min(_p_constant(heights[side], weight[side]) for side in sides)
     frame = patch.first + turn
     return StepFrame(frame, max(half_width, rise // 2), height, snr, 1 - (1 - p) ** 2, rise)
 
@@ -137,25 +139,38 @@ def _rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> tu
         return 0, turn
     lit = np.flatnonzero(weight > 0)
     w, y = weight[lit], heights[lit]
-    mean = np.average(y, weights=w)
+    y = y - np.average(y, weights=w)
     best, found = step + _RISES, (0, turn)
-    for rise in _RISE_FRAMES:
-        if 2 * rise > heights.size:
-            break
+
+    def tried(rise: int, centres: NDArray[np.int64]) -> None:
+        nonlocal best, found
         reach = rise // 2
-        centres = np.arange(turn - reach, turn + reach + 1, max(rise // 8, 1))
         centres = centres[(centres > reach) & (centres < heights.size - reach)]
         if not centres.size:
-            continue
-        line = np.clip((lit + 0.5 - centres[:, None]) / rise + 0.5, 0.0, 1.0)
+            return
+        line = _line(lit, rise, centres[:, None])
         line -= (line @ w / w.sum())[:, None]
-        along = line @ (w * (y - mean))
-        known = (line**2) @ w
+        along, known = line @ (w * y), (line**2) @ w
         gain = np.where(along > 0, 0.5 * along**2 / np.maximum(known, 1e-300), 0.0)
         top = int(np.argmax(gain))
         if gain[top] > best:
             best, found = float(gain[top]), (rise, int(centres[top]))
+
+    for rise in _RISE_FRAMES:
+        if 2 * rise < heights.size:
+            half = rise // 2
+            tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
+    roughly, centre = found
+    for rise in range(round(0.7 * roughly), round(1.4 * roughly) + 1, max(roughly // 12, 1)):
+        reach = max(roughly // 5, 2)
+        if rise:
+            tried(rise, np.arange(centre - reach, centre + reach + 1))
     return found
+
+
+def _line(frames: NDArray[np.int64], rise: int, centre: int | NDArray[np.int64]) -> FloatArray:
+    """Give the share of the light that is there in frames over which it rises."""
+    return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
 
 
 def _height_beside(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
