@@ -66,6 +66,7 @@ class Event(Fitted):
     n_after: int
     sign: int = 1
     half_width: int | None = None
+    rise: int = 0
 
 
 def remarks(

@@ -106,11 +106,11 @@ def evidence_beside(
 ) -> FloatArray:
     """Give what the light of each event says beside its fit, where masses are fitted.
 
-    Shapes: result (n, 10), in the order of `Evidence`.
+    Shapes: result (n, 11), in the order of `Evidence`.
     """
     if scene.mode != "mass":
         return np.full((len(events), len(NOTHING)), np.nan)
-    told = mapper(lambda event: evidence_of(event.likelihood, event.fit), events)
+    told = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
     return np.array(list(told)).reshape(-1, len(NOTHING))
 
 

@@ -42,6 +42,8 @@ class Evidence(NamedTuple):
     across_nm2, along_nm2, sigma_across_nm2 : float or ndarray
         Half of what the variance along x has beyond that along y, their covariance, and the error
         of each [nm²].
+    rise_frames : float or ndarray
+        Frames over which the light of a step rises; 0 of one that rises at once, or seems to.
     """
 
     z_nm: FloatArray
@@ -54,16 +56,17 @@ class Evidence(NamedTuple):
     across_nm2: FloatArray
     along_nm2: FloatArray
     sigma_across_nm2: FloatArray
+    rise_frames: FloatArray
 
 
 NOTHING = (math.nan,) * len(Evidence._fields)
 """Evidence of an event that says nothing."""
 
 
-def evidence_of(likelihood: Likelihood, fit: FitResult) -> FloatArray:
-    """Look beside a fit of place and mass.
+def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatArray:
+    """Look beside a fit of place and mass, of a step whose light rises over so many frames.
 
-    Shapes: result (10,), in the order of `Evidence`.
+    Shapes: result (11,), in the order of `Evidence`.
     """
     theta, free = fit.theta, fit.box.free
     if likelihood.model.is_measured or not free[MASS]:
@@ -87,13 +90,13 @@ def evidence_of(likelihood: Likelihood, fit: FitResult) -> FloatArray:
         known={fitted.index(Z): likelihood.height_prior} if free[Z] else {}, at_nm=theta[Z],
     )  # fmt: skip
     if spread is None:
-        return np.array([*own, *NOTHING[3:]])
+        return np.array([*own, *NOTHING[3:-1], rise])
     up_, known_, follow = spread
     chi2 = float(up_ @ np.linalg.solve(known_, up_))
     wide = [up_[0] / known_[0, 0], known_[0, 0] ** -0.5, follow[0, fitted.index(MASS)] * slope]
     two = np.linalg.inv(known_[1:, 1:])
     error = np.linalg.det(two) ** 0.25  # geometric mean
-    return np.array([*own, *wide, chi2, *(two @ up_[1:]), error])
+    return np.array([*own, *wide, chi2, *(two @ up_[1:]), error, rise])
 
 
 def _slopes(

@@ -305,6 +305,7 @@ class ChunkFitter:
         event = Event(
             task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
             task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
+            task.at.rise,
         )  # fmt: skip
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None

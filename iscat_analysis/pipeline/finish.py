@@ -58,6 +58,8 @@ def gather(
     learned = bool(ready.summary.get("optics", {}).get("calibrated"))
     rows = reported_rows(found, learned_optics=learned)
     table, achieved = rows.table, rows.achieved
+    if rows.course:
+        run.tell(rows.course)
     for name, beside in (
         ("heights", rows.heights), ("extension", rows.extension),
         ("fluctuation", rows.fluctuation),

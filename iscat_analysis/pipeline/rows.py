@@ -19,11 +19,11 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import BoolArray, FloatArray, Status, verdict
 from iscat_analysis.tracking.tracked_optics import mass_error
+from iscat_analysis.trust.course import at_a_shared_place, may_rise, rise_said
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.heights import Heights
-from iscat_analysis.trust.shared_places import at_a_shared_place
 from iscat_analysis.trust.systematic import systematic
 
 
@@ -36,13 +36,14 @@ class ReportedRows:
     heights: Heights | None = None
     extension: Extension | None = None
     fluctuation: Fluctuation | None = None
+    course: str = ""
 
 
 def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
     """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
-    heights, extension = None, None
+    told, heights, extension = None, None, None
     if found.evidence is not None and len(found.evidence):
         told = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, told, learned_optics=learned_optics)
@@ -50,8 +51,14 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     shifts = [beside.mass_shift_kda for beside in (heights, extension) if beside is not None]
     if extension is not None:
         fits = flagged(fits, extension.flagged, Status.EXTENDED)
+    course = ""
     if found.heading == "landing":
         fits = flagged(fits, at_a_shared_place(fits), Status.CHANGING)
+        if told is not None:
+            unseen, frames = may_rise(fits, told)
+            fits = flagged(fits, unseen, Status.CHANGING)
+            rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
+            course = rise_said(frames, int(unseen.sum()), rising, len(fits))
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -70,7 +77,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = pd.DataFrame(columns)
-    return ReportedRows(table, achieved, heights, extension, fluctuation)
+    return ReportedRows(table, achieved, heights, extension, fluctuation, course)
 
 
 def flagged(fits: pd.DataFrame, which: BoolArray, flag: Status) -> pd.DataFrame:

@@ -72,7 +72,7 @@ class Extension:
             mean, error = max(
                 (
                     _mean(q[many], se[many]),
-                    _length(*(part[many] for part in told[7:])),
+                    _length(*(part[many] for part in told[7:10])),
                     _wiggle(table[many], in_time),
                 ),
                 key=lambda found: found[0] / found[1],

@@ -19,9 +19,9 @@ from iscat_analysis.inference.split_frames import Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
 from iscat_analysis.search.sliding import Patch, locate_step
+from iscat_analysis.trust.course import at_a_shared_place, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
-from iscat_analysis.trust.shared_places import at_a_shared_place
 
 MASS_KDA, LIGHT_E, TRIALS, SIGMAS = 205.0, 8e6, 40, 4.0
 GRID = PixelGrid.centred(33, 84.0)
@@ -137,7 +137,9 @@ def test_equal_heights_are_not_spread() -> None:
 
 
 def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
-    told = Evidence(*np.tile([5.0, 0.5, 1.0, 0.0, 1000.0, 0.015, 3.0, 0.0, 0.0, 400.0], (40, 1)).T)
+    told = Evidence(
+        *np.tile([5.0, 0.5, 1.0, 0.0, 1000.0, 0.015, 3.0, 0.0, 0.0, 400.0, 0.0], (40, 1)).T
+    )
     one = 4.0 * 40  # variance of a single frame [nm²]
 
     def spread(excess: float) -> EmpiricalSpread:
@@ -245,3 +247,15 @@ def test_steps_of_a_particle_that_is_there_are_told_from_others() -> None:
     assert at_a_shared_place(table).tolist() == [False, True, False, True, True, False, False]
     table.loc[1, "frame"] = 10  # before the particle came: another one
     assert not at_a_shared_place(table)[1]
+
+
+def test_faint_steps_may_rise_as_the_bright_ones_do() -> None:
+    table = rows(30)
+    table.loc[20:, "mass_kda"] = 40.0
+    rise = np.where(np.arange(30) < 15, 40.0, 0.0)
+    told = Evidence(*np.zeros((10, 30)), rise)
+    unseen, frames = may_rise(table, told)
+    assert frames == 40
+    assert unseen.tolist() == [False] * 20 + [True] * 10
+    few = Evidence(*np.zeros((10, 30)), np.where(np.arange(30) < 2, 40.0, 0.0))
+    assert not may_rise(table, few)[0].any()

@@ -21,7 +21,7 @@ from iscat_analysis.search.sliding.frames import Patch
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-_RISES = 10.0  # log-likelihood by which a rise describes the frames better than a step
+_RISES = 6.0  # log-likelihood by which a rise describes the frames better than a step
 _RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)
 _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 

@@ -1,16 +1,22 @@
-"""Steps at the place of a particle that is there: of its own light, or of another one on top.
+"""Light that goes on changing: at the place of a particle that is there, or as it comes.
 
 The light of a particle that settles, bleaches or breathes changes again and again at its place, and
 each change is found as a step of its own.  A second particle at the very place of a first one is
 rare, and cannot be told from that.
+
+Where particles take their time to settle, the rise of a faint one drowns in the noise of its
+frames: it is fitted as a step, and its mass is too small.  That is known from the bright ones.
 """
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import BoolArray, Status
 
 SAME_NM = 150.0
@@ -18,6 +24,8 @@ SAME_NM = 150.0
 
 _MUCH = 3.0  # times a step's own mass that a particle must have, whose light the step may be of
 _ALIKE = 3.0  # ratio of masses up to which two steps close in time may be the halves of one
+_SEEN = 10.0  # log-likelihood by which a rise is expected to be told from a step, to be always seen
+_FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
@@ -51,3 +59,37 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
         elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _ALIKE * abs(mass[j]):
             flagged[real[[i, j]]] = True
     return flagged
+
+
+def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
+    """Tell which steps may rise as slowly as others do, unseen; and over how many frames those do.
+
+    A line over r frames and the step nearest to it differ by r/12 times the squared signal-to-noise
+    ratio of one frame, of which the log-likelihood is half.
+
+    Shapes: result (rows,).
+    """
+    nothing = np.zeros(len(table), dtype=bool), 0.0
+    rise = np.nan_to_num(told.rise_frames)
+    rising = rise > 0
+    if rising.sum() < _FEWEST:
+        return nothing
+    frames = float(np.median(rise[rising]))
+    mass, crb = (table[name].to_numpy(float) for name in ("mass_kda", "crb_mass_kda"))
+    before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
+    one2 = (mass / crb) ** 2 * (before + after) / (before * after)
+    seen = np.nan_to_num(one2) * frames / 24 > _SEEN
+    if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
+        return nothing
+    return ~rising & ~seen, frames
+
+
+def rise_said(frames: float, unseen: int, rising: int, rows: int) -> str:
+    """Say that particles take their time; empty where none does."""
+    if not frames:
+        return ""
+    also = f"; in {unseen} more that could not be seen: they are flagged changing" if unseen else ""
+    return (
+        f"the light of {rising} of {rows} steps rises over some {math.ceil(frames)} frames, which "
+        f"stay out of their fits{also}"
+    )
