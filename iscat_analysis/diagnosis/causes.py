@@ -232,7 +232,7 @@ def course_warning(table: pd.DataFrame) -> str:
     Their pictures may agree with the model; `Status.CHANGING` is of the course of the light before
     and after.
     """
-    flags = table["flags"].fillna("").str.split(";")
+    flags = table["flags"].fillna("").astype(str).str.split(";")
     slow = int(flags.map(lambda said: Status.CHANGING.value in said).sum())
     if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
         return ""

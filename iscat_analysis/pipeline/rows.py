@@ -47,7 +47,8 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     if found.evidence is not None and len(found.evidence):
         told = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, told, learned_optics=learned_optics)
-        extension = Extension.of(fits, told, achieved)
+        if heights is None or not heights.are_wrong:  # which would look like widths
+            extension = Extension.of(fits, told, achieved)
     shifts = [beside.mass_shift_kda for beside in (heights, extension) if beside is not None]
     if extension is not None:
         fits = flagged(fits, extension.flagged, Status.EXTENDED)
@@ -62,7 +63,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
-        fluctuation = Fluctuation.of(mode, fits, found.repeats, achieved)
+        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved)
     if fluctuation is not None:
         sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
         fits = fits.assign(sigma_mass_kda=sigma)

@@ -25,6 +25,9 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import LENGTHS
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 
+FEWEST = 6
+"""Events without which nothing is said of fluctuations."""
+
 _SIGNIFICANT = 4.0  # standard errors of the variance beyond which it is there
 _LEAST_LENGTHS = 3
 _CORRELATIONS = np.geomspace(1.0, 300.0, 25)  # frames
@@ -72,7 +75,7 @@ class Fluctuation:
         said = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
         good &= np.isfinite(strength)
-        if not good.any():
+        if good.sum() < FEWEST:
             return None
         own = np.stack([repeat for repeat, kept in zip(repeats, good, strict=True) if kept])[:, 1:]
         squares, counts = own[:, :, FREE_PARAMETERS[mode].index("mass_kda")], own[:, :, -1]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -42,13 +43,19 @@ class Heights:
             return None
         shift = np.zeros(len(table))
         if held and spread.is_spread:
-            shift = np.abs(np.nan_to_num(told.mass_per_z)) * spread.sd_nm
+            off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
+            shift = np.abs(np.nan_to_num(told.mass_per_z)) * off
         return cls(spread, held, shift, learned_optics)
+
+    @property
+    def are_wrong(self) -> bool:
+        """Whether one height is held for particles that are not equally high."""
+        return self.held and self.spread.is_spread
 
     @property
     def message(self) -> str:
         """What the user should know; empty where heights and errors agree."""
-        if not (self.held and self.spread.is_spread):
+        if not self.are_wrong:
             return ""
         return (
             f"the particles are not equally high: {self.spread} where one height is held; their "
