@@ -338,7 +338,18 @@ class Particle(Section):
         return self._seated_nm(self.nominal_mass_kda)
 
     def mean_height_nm(self, mass_kda: float) -> float:
-        """Height at which a particle is expected: as given, or of contact, or as it was learned."""
+        """Height at which a particle is expected: as given, or of contact, or as it was learned.
+
+        Parameters
+        ----------
+        mass_kda : float
+            Its mass [kDa], which is its size for ``height_nm = "contact"``.
+
+        Returns
+        -------
+        float
+            The height [nm].
+        """
         learned = self.learned_height_nm
         shift = 0.0 if learned is None else learned - self.nominal_height_nm
         return self._seated_nm(mass_kda) + shift
