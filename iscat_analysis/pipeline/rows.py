@@ -48,7 +48,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
         told = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, told, learned_optics=learned_optics)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(fits, told, achieved)
+            extension = Extension.of(fits, told, achieved, config.particle.wiggle_nm)
     shifts = [beside.mass_shift_kda for beside in (heights, extension) if beside is not None]
     if extension is not None:
         fits = flagged(fits, extension.flagged, Status.EXTENDED)

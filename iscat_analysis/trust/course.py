@@ -62,7 +62,9 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
 
 
 def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
-    """Tell which steps may rise as slowly as others do, unseen; and over how many frames those do.
+    """Tell which steps may rise as others do, unseen; and over how many frames those rise.
+
+    Where many of those that rise go on rising after their lines, all may.
 
     A line over r frames and the step nearest to it differ by r/12 times the squared signal-to-noise
     ratio of one frame, of which the log-likelihood is half.
@@ -81,14 +83,16 @@ def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
     seen = np.nan_to_num(one2) * frames / 24 > _SEEN
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
-    return ~rising & ~seen, frames
+    goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
+    alike = rising if (goes_on & rising).sum() > _SHARE * rising.sum() else nothing[0]
+    return (~rising & ~seen) | alike, frames
 
 
 def rise_said(frames: float, unseen: int, rising: int, rows: int) -> str:
     """Say that particles take their time; empty where none does."""
     if not frames:
         return ""
-    also = f"; in {unseen} more that could not be seen: they are flagged changing" if unseen else ""
+    also = f"; {unseen} that may rise on unseen are flagged changing" if unseen else ""
     return (
         f"the light of {rising} of {rows} steps rises over some {math.ceil(frames)} frames, which "
         f"stay out of their fits{also}"

@@ -55,9 +55,13 @@ class Extension:
 
     @classmethod
     def of(
-        cls, table: pd.DataFrame, told: Evidence, in_time: Mapping[str, EmpiricalSpread]
+        cls,
+        table: pd.DataFrame,
+        told: Evidence,
+        in_time: Mapping[str, EmpiricalSpread],
+        wiggle_nm: float = 0.0,
     ) -> Extension | None:
-        """Judge the evidence of every row; None where no row has any."""
+        """Judge the evidence of rows, beyond a wiggle that is known; None where none has any."""
         said = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
         q, se = told.spread_nm2, told.sigma_spread_nm2
@@ -73,7 +77,7 @@ class Extension:
                 (
                     _mean(q[many], se[many]),
                     _length(*(part[many] for part in told[7:10])),
-                    _wiggle(table[many], in_time),
+                    _wiggle(table[many], in_time, wiggle_nm),
                 ),
                 key=lambda found: found[0] / found[1],
             )
@@ -146,7 +150,9 @@ def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[f
     return math.sqrt(wide2), math.sqrt(wide2) * error / (2 * beyond)
 
 
-def _wiggle(table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread]) -> tuple[float, float]:
+def _wiggle(
+    table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread], known_nm: float
+) -> tuple[float, float]:
     """Variance by which positions scatter from frame to frame beyond the noise, and its error.
 
     Half of the frames that are compared have no particle, whose wiggle then is twice the mean.
@@ -163,4 +169,4 @@ def _wiggle(table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread]) -> tupl
         error = 2 * spread.by_frames[0] * spread.by_frames_se[0]
         found.append((2 * excess * one, 2 * error * one))
     (x, x_se), (y, y_se) = found
-    return (x + y) / 2, math.hypot(x_se, y_se) / 2
+    return (x + y) / 2 - known_nm**2, math.hypot(x_se, y_se) / 2

@@ -28,7 +28,7 @@ from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 FEWEST = 6
 """Events without which nothing is said of fluctuations."""
 
-_SIGNIFICANT = 4.0  # standard errors of the variance beyond which it is there
+_SIGNIFICANT = 2.0  # standard errors of the variance beyond which it is there; 1 of 300 by chance
 _LEAST_LENGTHS = 3
 _CORRELATIONS = np.geomspace(1.0, 300.0, 25)  # frames
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})

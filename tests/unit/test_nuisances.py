@@ -152,6 +152,7 @@ def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
     found = Extension.of(rows(40), told, moved)
     assert found.variance_nm2 == pytest.approx(15.0**2, rel=1e-6)
     assert found.flagged.all()
+    assert not Extension.of(rows(40), told, moved, 15.0).flagged.any()  # the model has it
     still = Extension.of(rows(40), told, dict.fromkeys(moved, spread(0.0)))
     assert not still.flagged.any()
     assert not still.mass_shift_kda.any()
@@ -233,6 +234,16 @@ def test_a_step_does_not_rise_and_two_steps_are_no_line() -> None:
     assert dated(step + 0.5 * (frames >= 104)).p_constant < 1e-3
 
 
+def test_light_that_settles_exponentially_goes_on_rising() -> None:
+    frames = np.arange(160)
+    settling = -np.expm1(-np.maximum(frames + 0.5 - 70, 0) / 15.0)
+    found = [dated(settling, seed) for seed in range(20)]
+    assert sum(one.rise > 0 for one in found) == 20
+    assert sum(one.p_constant < 1e-3 for one in found) >= 15
+    straight = [dated(np.clip((frames - 80) / 40 + 0.5, 0, 1), seed) for seed in range(20)]
+    assert sum(one.p_constant < 1e-3 for one in straight) <= 1  # the control
+
+
 # ---- places that are shared ------------------------------------------------------------------
 
 
@@ -254,6 +265,7 @@ def test_faint_steps_may_rise_as_the_bright_ones_do() -> None:
     table.loc[20:, "mass_kda"] = 40.0
     rise = np.where(np.arange(30) < 15, 40.0, 0.0)
     told = Evidence(*np.zeros((10, 30)), rise)
+    table["flags"] = ""
     unseen, frames = may_rise(table, told)
     assert frames == 40
     assert unseen.tolist() == [False] * 20 + [True] * 10

@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.stepping import frame_scores, one_change, projector
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding.frames import Patch
+from iscat_analysis.search.sliding.rises import find_rise, line
 
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-_RISES = 6.0  # log-likelihood by which a rise describes the frames better than a step
-_RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)
 _STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 
 
@@ -111,79 +110,21 @@ def locate_step(
     half_width = int(distance[order][np.searchsorted(held, CREDIBLE * (1 - 1e-12))])
     height = float(jump[best])
     snr = abs(height) * math.sqrt(scale)
-    rise, centre = _rise(heights, weight, best + 1, log[best])
     turn, gap = best + 1, _gap(snr)
-    if rise:
-        height, turn = _height_beside(heights, weight, centre, _half(rise)), centre
-        snr = abs(height) * math.sqrt(scale)
-        # two that land one after the other are no line, and then neither are the frames between
-        straight = heights - height * _line(np.arange(heights.size), rise, centre)
-        p = _p_constant(straight, weight)
-    else:
+    rise = find_rise(heights, weight, turn, float(log[best]))
+    if rise is None:
         sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
         p = min(_p_constant(heights[side], weight[side]) for side in sides)
-    frame = patch.first + turn
-    return StepFrame(frame, max(half_width, rise // 2), height, snr, 1 - (1 - p) ** 2, rise)
-
-
-def _rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> tuple[int, int]:
-    """Find over how many frames the light rises, and the middle of them; 0 where at once.
-
-    A line from one level to the other is set against a step, whose log-likelihood above none is
-    given: it must describe the frames better by `_RISES`.  It is tried about the best step, which
-    lies inside it.
-
-    Shapes: `heights` (t,), `weight` (t,).
-    """
-    if step < _RISES:
-        return 0, turn
-    lit = np.flatnonzero(weight > 0)
-    w, y = weight[lit], heights[lit]
-    y = y - np.average(y, weights=w)
-    best, found = step + _RISES, (0, turn)
-
-    def tried(rise: int, centres: NDArray[np.int64]) -> None:
-        nonlocal best, found
-        reach = rise // 2
-        centres = centres[(centres > reach) & (centres < heights.size - reach)]
-        if not centres.size:
-            return
-        line = _line(lit, rise, centres[:, None])
-        line -= (line @ w / w.sum())[:, None]
-        along, known = line @ (w * y), (line**2) @ w
-        gain = np.where(along > 0, 0.5 * along**2 / np.maximum(known, 1e-300), 0.0)
-        top = int(np.argmax(gain))
-        if gain[top] > best:
-            best, found = float(gain[top]), (rise, int(centres[top]))
-
-    for rise in _RISE_FRAMES:
-        if 2 * rise < heights.size:
-            half = rise // 2
-            tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
-    roughly, centre = found
-    for rise in range(round(0.7 * roughly), round(1.4 * roughly) + 1, max(roughly // 12, 1)):
-        reach = max(roughly // 5, 2)
-        if rise:
-            tried(rise, np.arange(centre - reach, centre + reach + 1))
-    return found
-
-
-def _line(frames: NDArray[np.int64], rise: int, centre: int | NDArray[np.int64]) -> FloatArray:
-    """Give the share of the light that is there in frames over which it rises."""
-    return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
-
-
-def _height_beside(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
-    """Give what frames after a gap have beyond those before it.
-
-    Shapes: `heights` (t,), `weight` (t,).
-    """
-    sides = (slice(0, turn - gap), slice(turn + gap, None))
-    light = [float(weight[side].sum()) for side in sides]
-    if min(light) <= 0:
-        return 0.0
-    first, last = (float(weight[side] @ heights[side]) for side in sides)
-    return last / light[1] - first / light[0]
+    else:
+        turn, height = rise.centre, rise.height
+        snr = abs(height) * math.sqrt(scale)
+        # two that land one after the other are no line, and then neither are the frames between
+        straight = heights - height * line(np.arange(heights.size), rise.frames, turn)
+        p = min(_p_constant(straight, weight), rise.p_line)
+        half_width = max(half_width, rise.frames // 2)
+    p = 1 - (1 - p) ** 2
+    frames_of_rise = 0 if rise is None else rise.frames
+    return StepFrame(patch.first + turn, half_width, height, snr, p, frames_of_rise)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:
