@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 import pandas as pd
-from scipy.spatial import cKDTree
+import scipy
 
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import BoolArray, Status
@@ -47,7 +47,7 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
     mass, frame = table["mass_kda"].to_numpy(float)[real], table["frame"].to_numpy(float)[real]
     error = table["sigma_mass_kda"].to_numpy(float)[real]
     window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[real]
-    for i, j in cKDTree(place).query_pairs(SAME_NM):
+    for i, j in scipy.spatial.cKDTree(place).query_pairs(SAME_NM):
         if abs(mass[i]) < abs(mass[j]):
             i, j = j, i  # i is the larger
         apart = abs(frame[i] - frame[j])

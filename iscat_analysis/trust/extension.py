@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2
+from scipy.special import chdtrc, chdtri
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
@@ -68,7 +68,7 @@ class Extension:
         known = np.isfinite(q) & np.isfinite(se) & np.isfinite(told.sigma_across_nm2)
         if not known.any():
             return None
-        own = known & (q > 0) & (np.nan_to_num(told.chi2_spread) > chi2.isf(_CHANCE, 3))
+        own = known & (q > 0) & (np.nan_to_num(told.chi2_spread) > chdtri(3, _CHANCE))
         many = good & known
         mean, error = math.nan, math.nan
         shift = np.zeros(len(table))
@@ -141,7 +141,7 @@ def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[f
     squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
     squares = squares[squares < np.median(squares) * _OUTLYING**2]
     n = squares.size
-    if n < FEWEST or chi2.sf(squares.sum(), 2 * n - 2) > _CHANCE:
+    if n < FEWEST or chdtrc(2 * n - 2, squares.sum()) > _CHANCE:
         return 0.0, 1.0
     beyond = squares.sum() / n - 2
     error = squares.std() / math.sqrt(n)
