@@ -20,6 +20,11 @@ def sphere_mass_kda(diameter_nm: float, density_kg_m3: float) -> float:
     return density_kg_m3 * math.pi / 6 * (diameter_nm * NM) ** 3 / KILODALTON_KG
 
 
+def sphere_diameter_nm(mass_kda: float, density_kg_m3: float) -> float:
+    """Diameter of a sphere."""
+    return math.cbrt(6 * mass_kda * KILODALTON_KG / (math.pi * density_kg_m3)) / NM
+
+
 def count(n: int, noun: str) -> str:
     """Write so many of something, in the plural unless it is one."""
     return f"{n} {noun}{'' if n == 1 else 's'}"

@@ -183,10 +183,12 @@ def first_order_bias(
     rows: FloatArray,
     free: BoolArray,
     out: FloatArray,
+    height_known: float = 0.0,
 ) -> None:
     """Fill `out` (5) with the bias of order 1/N, NaN where the free parameters are not known."""
     fisher, inverse, score = np.empty((5, 5)), np.empty((5, 5)), np.empty(5)
     image_score(kind, data, level, rows, score, fisher)
+    fisher[2, 2] += height_known
     invert(fisher, fisher, free, inverse)
     t = np.empty((3, rows.shape[2]))
     sums = np.zeros(5)
@@ -208,16 +210,18 @@ def errors_and_bias(
     free: BoolArray,
     moving: BoolArray,
     slope: float,
+    height_known: float,
     sigma: FloatArray,
     covariance: FloatArray,
     bias: FloatArray,
 ) -> bool:
-    """Fill what the likelihood says of the errors of a fit.
+    """Fill what the likelihood says of the errors of a fit, with what a prior knows of z.
 
     Shapes: `like` (5, 5), `free, moving` (5,), `sigma` (4,), `covariance` (n, n), `bias` (5,).
     """
     information, inverse = np.empty((5, 5)), np.empty((5, 5))
     observed_information(kind, data, level, rows, information)
+    information[2, 2] += height_known
     known: bool = invert(information, like, free, inverse)
     n = 0
     for i in range(4):
@@ -232,7 +236,7 @@ def errors_and_bias(
             sigma[i] = np.sqrt(covariance[n, n])
             n += 1
     if known:
-        first_order_bias(kind, data, level, rows, moving, bias)
+        first_order_bias(kind, data, level, rows, moving, bias, height_known)
     else:
         bias[:] = np.nan
     return known

@@ -295,6 +295,19 @@ def scoring_step(
     return True
 
 
+@kernel(_nrt=False)
+def add_prior(
+    prior: tuple[float, float], theta: FloatArray, score: FloatArray, fisher: FloatArray
+) -> float:
+    """Add a normal prior of z to score (5) and Fisher matrix (5, 5); return its logarithm."""
+    mean, information = prior
+    away = theta[2] - mean
+    score[2] -= information * away
+    fisher[2, 2] += information
+    density: float = -0.5 * information * away * away
+    return density
+
+
 @kernel()
 def maximize(
     table: tuple[Any, ...],
@@ -311,8 +324,11 @@ def maximize(
     theta: FloatArray,
     fisher: FloatArray,
     least: float,
+    prior: tuple[float, float],
 ) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
+
+    `prior` is mean and information of a normal prior of z; without information there is none.
 
     Shapes: `data` (4, ny, nx), `free` (5,), `lower, upper, max_step` (5,), `theta` (5,), `fisher`
     (5, 5).
@@ -327,6 +343,7 @@ def maximize(
     start, stop = (0, width) if not free[2] else span(lens, pixels, theta, width)
     profile = picture_at(axial, lens, theta[2], start, stop, profile)
     value = score_pass(profile, lens, pixels, kind, data, theta, score, fisher)
+    value += add_prior(prior, theta, score, fisher)
     passes = 1
     while passes < iterations:
         for i in range(5):
@@ -366,6 +383,7 @@ def maximize(
         trial_value = score_pass(
             profile, lens, pixels, kind, data, trial, trial_score, trial_fisher
         )
+        trial_value += add_prior(prior, trial, trial_score, trial_fisher)
         passes += 1
         if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
             value = trial_value

@@ -82,7 +82,7 @@ def event_bounds(
     if model.is_measured:  # nothing is known of the light itself
         quantum, collected = np.zeros((4, 4), dtype=complex), 0.0
     if quantum is None:
-        quantum = quantum_information(model, theta[2])
+        quantum = quantum_information(model, max(theta[2], 0.0))  # a nuisance may be below
     slope = abs(model.scale.slope(theta[3]))
     relative = abs(theta[3]) * slope  # mass for a relative step of 1 [kDa]
     to_kda = np.array([1.0, 1.0, 1.0, 1 / slope])
@@ -92,6 +92,7 @@ def event_bounds(
     fisher = whole[:4, :4] * np.outer(to_kda, to_kda)
     per_kda = np.array([1.0, 1.0, 1.0, 1 / relative]) if relative else np.array([1.0] * 3 + [0.0])
     light = collected * quantum.real * np.outer(per_kda, per_kda)
+    light[2, 2] += likelihood.height_prior[1]  # as the Fisher matrix has it
     return bounds_from_matrices(fisher, light, free)
 
 

@@ -86,11 +86,11 @@ def plan(
             f"±{half:g} nm: move the particle, or enlarge bounds.pixels"
         )
     grid = PixelGrid.centred(at.pixels, pixel_nm)
-    height = config.particle.height_nm if at.z_nm is None else at.z_nm
+    height = config.particle.nominal_height_nm if at.z_nm is None else at.z_nm
     if model is None:
         reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
         optics = config if scale is None else config.model_copy(update={"calibration": None})
-        highest = max(height, config.particle.height_nm)
+        highest = max(height, config.particle.nominal_height_nm)
         model = forward_model(optics, reach, z_max_nm=highest, like=like)
         model = replace(model, z_range_nm=(height, height))  # one height needs no more
         model = model if scale is None else replace(model, scale=scale)

@@ -65,7 +65,7 @@ def optimize(
     line = AXES[axis]
     column = f"crb_joint_{parameter}"
     if axis == "focus":
-        height = config.particle.height_nm
+        height = config.particle.nominal_height_nm
         grid = height + np.arange(-FOCUS_REACH_NM, FOCUS_REACH_NM + 1, FOCUS_STEP_NM)
         note = "light on the particle held; the oil thickness follows the focus"
     else:

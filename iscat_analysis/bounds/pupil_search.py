@@ -174,7 +174,7 @@ class Search:
         return self._with(self.config.optics, changes)
 
     def _coding(self, key: str) -> tuple[Callable[[float], float], Callable[[float], float]]:
-        optics, height = self.config.optics, self.config.particle.height_nm
+        optics, height = self.config.optics, self.config.particle.nominal_height_nm
         wave = optics.wavelength_nm / _WAVES
         if key == "focus_nm":
             return (

@@ -56,7 +56,7 @@ def _pixel_nm(config: Config) -> float:
 
 def _height(config: Config) -> float:
     z_nm = config.bounds.z_nm
-    return config.particle.height_nm if z_nm is None else z_nm
+    return config.particle.nominal_height_nm if z_nm is None else z_nm
 
 
 def _attenuated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
@@ -201,7 +201,9 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
     if not axis.rebuilds:
         reach = max(_reach(one) for one in plans)
         heights = [_height(one) for one in plans]
-        model = forward_model(config, reach, z_max_nm=max(*heights, config.particle.height_nm))
+        model = forward_model(
+            config, reach, z_max_nm=max(*heights, config.particle.nominal_height_nm)
+        )
         model = replace(model, z_range_nm=(min(heights), max(heights)))
 
     def stretch(part: list[Config]) -> list[dict[str, Any]]:

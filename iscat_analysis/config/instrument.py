@@ -20,11 +20,15 @@ from iscat_analysis.config.values import (
     plausible_pixel,
     refractive_index,
 )
+from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
 
 Index = Annotated[Positive, AfterValidator(refractive_index)]
 
 MOST_WAVES = 0.5
 """Largest Zernike term over the wavelength; ten times that of a poor objective."""
+
+LARGEST_SD_NM = 100.0
+"""Largest spread of heights around a mean, half a fringe: beyond it, mode joint fits heights."""
 
 MOST_PASSES = 3.0
 """Largest attenuation: what passes of the reference against what passes of the scattered light."""
@@ -32,6 +36,21 @@ MOST_PASSES = 3.0
 PER_KDA = (1e-7, 0.01)
 """Magnitudes of a contrast per kDa: a protein has some 1e-5, and of the larger one 100 kDa would
 change all light."""
+
+DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "protein": 1350.0}
+"""Densities of the kinds of particles; protein as mass photometry has it."""
+
+USUAL_HEIGHT_NM = 5.0
+"""Height of a protein on glass, at which masses are calibrated unless something else is said."""
+
+UNKNOWN_SD_NM = 20.0
+"""Spread of heights before a movie has told them: a tenth of a fringe."""
+
+TYPICAL_DIAMETER_NM = 30.0
+"""Of a particle whose size is not given, unless it is a protein."""
+
+TYPICAL_PROTEIN_KDA = 150.0
+"""Mass of a protein where none is given."""
 
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
 """Zernike terms on offer, by Noll's index."""
@@ -272,8 +291,28 @@ class Particle(Section):
     diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
         None, description="in place of mass_kda"
     )
-    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
-        5.0, description="z where it is fixed; start value elsewhere"
+    height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
+        USUAL_HEIGHT_NM,
+        description='z where it is fixed; start value elsewhere | "contact": radius of particle + '
+        'linker_nm | "auto": 5 nm for optics and mass scale, and learned from the movie for the '
+        "particles, mean and spread",
+    )
+    linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
+        0.0, description='between coverslip and particle, for height_nm = "contact"'
+    )
+    height_sd_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
+        0.0,
+        description="standard deviation of heights; > 0: mode mass fits z with this normal prior",
+    )
+    wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
+        0.0,
+        description="standard deviation along each axis of the places between which particles move "
+        "while they are seen, as on a tether",
+    )
+    learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
+        None,
+        description='mean of the heights that a movie showed, where height_nm = "auto" found it; '
+        "the optics and the mass scale stay those of height_nm",
     )
     photons_per_frame: Positive | None = Field(
         None,
@@ -292,7 +331,76 @@ class Particle(Section):
                 raise ValueError('kind = "custom" needs permittivity or index')
             if self.density_kg_m3 is None:
                 raise ValueError('kind = "custom" needs density_kg_m3')
+        if self.linker_nm and self.height_nm != "contact":
+            raise ValueError(
+                f"linker_nm = {self.linker_nm:g} is of heights of contact, and height_nm is "
+                f'{self.height_nm}: set height_nm = "contact", or leave linker_nm out'
+            )
+        if self.learned_height_nm is not None and self.height_nm != "auto":
+            raise ValueError(
+                f'learned_height_nm = {self.learned_height_nm:g} is what height_nm = "auto" found: '
+                "set height_nm to it, or leave it out"
+            )
         return self
+
+    @property
+    def density(self) -> float:
+        """Its own density, or that of its kind [kg/m³]."""
+        return self.density_kg_m3 or DENSITIES_KG_M3.get(self.kind, 1000.0)
+
+    @property
+    def nominal_mass_kda(self) -> float:
+        """Mass that is given, by itself or by a diameter, else a typical one."""
+        if self.mass_kda is not None:
+            return self.mass_kda
+        if self.diameter_nm is None and self.kind == "protein":
+            return TYPICAL_PROTEIN_KDA
+        return sphere_mass_kda(self.diameter_nm or TYPICAL_DIAMETER_NM, self.density)
+
+    @property
+    def nominal_height_nm(self) -> float:
+        """Height, of a particle of the nominal mass, at which optics and mass scale are defined."""
+        return self._seated_nm(self.nominal_mass_kda)
+
+    def mean_height_nm(self, mass_kda: float) -> float:
+        """Height at which a particle is expected: as given, or of contact, or as it was learned.
+
+        Parameters
+        ----------
+        mass_kda : float
+            Its mass [kDa], which is its size for ``height_nm = "contact"``.
+
+        Returns
+        -------
+        float
+            The height [nm].
+        """
+        learned = self.learned_height_nm
+        shift = 0.0 if learned is None else learned - self.nominal_height_nm
+        return self._seated_nm(mass_kda) + shift
+
+    def _seated_nm(self, mass_kda: float) -> float:
+        if self.height_nm == "contact":
+            return sphere_diameter_nm(abs(mass_kda), self.density) / 2 + self.linker_nm
+        return USUAL_HEIGHT_NM if self.height_nm == "auto" else self.height_nm
+
+    def held_at(self, height_nm: float) -> Particle:
+        """Give a particle whose height is known."""
+        update = {
+            "height_nm": height_nm, "linker_nm": 0.0, "height_sd_nm": 0.0,
+            "learned_height_nm": None,
+        }  # fmt: skip
+        return self.model_copy(update=update)
+
+    @property
+    def height_is_open(self) -> bool:
+        """Whether heights are to be learned from the movie."""
+        return self.height_nm == "auto" and self.learned_height_nm is None
+
+    @property
+    def height_prior_sd_nm(self) -> float:
+        """Standard deviation of the prior of heights; wide before a movie has told them."""
+        return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
 
 
 class StandardsCamera(Section):

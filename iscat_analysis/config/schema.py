@@ -106,6 +106,17 @@ class Config(Section):
                 f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
             )
+        spread = self.particle.height_prior_sd_nm
+        if self.optics.psf == "measured" and spread:
+            raise ValueError(
+                'optics.psf = "measured" has the picture at one height: with it set '
+                "particle.height_sd_nm = 0 and particle.height_nm to a number"
+            )
+        if self.optics.psf == "measured" and self.particle.wiggle_nm:
+            raise ValueError(
+                'optics.psf = "measured" has the wiggle of the particles it shows: set '
+                "particle.wiggle_nm = 0"
+            )
         return self
 
     @model_validator(mode="after")

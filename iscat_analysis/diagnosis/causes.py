@@ -17,7 +17,7 @@ from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.inference.cause import likely_cause
-from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
+from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.records import FloatArray, Status, Windows
@@ -256,16 +256,16 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
 def course_warning(table: pd.DataFrame) -> str:
     """Say that the light of many steps does not change from one frame to the next.
 
-    Their pictures agree with the model, and the goodness of fit is theirs; `Status.POOR_FIT` is
-    then of the course of the light before and after.
+    Their pictures may agree with the model; `Status.CHANGING` is of the course of the light before
+    and after.
     """
-    poor = table["status"] == Status.POOR_FIT.value
-    slow = int((poor & (table["p_value"] >= POOR_FIT_P)).sum())
+    flags = table["flags"].fillna("").astype(str).str.split(";")
+    slow = int(flags.map(lambda said: Status.CHANGING.value in said).sum())
     if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
         return ""
     return (
-        f"{slow} of {int(poor.sum())} events that are poor_fit are described by the model, but "
-        "their light goes on changing before or after the step, not from one frame to the next: "
+        f"the light of {slow} of {len(table)} events, flagged changing, goes on changing before or "
+        "after the step, not from one frame to the next: "
         "particles that settle slowly, move on, bleach or blink; their masses are those of the "
         "mean change (sum frames before the analysis if they settle within a few, or lower "
         "background.window_frames if they change later)"

@@ -66,6 +66,7 @@ class Event(Fitted):
     n_after: int
     sign: int = 1
     half_width: int | None = None
+    rise: int = 0
 
 
 def remarks(
@@ -75,7 +76,7 @@ def remarks(
     *,
     sidelobe: bool,
     too_close: bool,
-    poor_fit: bool = False,
+    changing: bool = False,
 ) -> tuple[Status, ...]:
     """Add what the surroundings of a particle say of its fit."""
     fit, region = fitted.fit, fitted.region
@@ -83,7 +84,7 @@ def remarks(
     saturated = saturated_near(windows.saturated, fit.x_nm, fit.y_nm, scene.pixel_nm, corner=corner)
     said = (
         (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
-        (too_close, Status.TOO_CLOSE), (poor_fit, Status.POOR_FIT),
+        (too_close, Status.TOO_CLOSE), (changing, Status.CHANGING),
     )  # fmt: skip
     return verdict([*fit.flags, *(flag for true, flag in said if true)])[1]
 

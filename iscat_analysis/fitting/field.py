@@ -272,7 +272,6 @@ def _fit_all(
 
     Candidate i is event ``first + i``, where there is one of that number.
     """
-    height = scene.config.particle.height_nm
     nominal = scene.model.material.mass_kda
     free = FREE_PARAMETERS[scene.mode]
     taken: FloatArray | None = None
@@ -284,7 +283,7 @@ def _fit_all(
         replace(
             start,
             mass_kda=start.mass_kda if "mass_kda" in free else nominal,
-            z_nm=start.z_nm if "z_nm" in free else height,
+            z_nm=start.z_nm if "z_nm" in free else scene.height_nm(start.mass_kda),
         )
         for start in candidates
     ]
@@ -311,6 +310,7 @@ def _fit_all(
         if taken is not None:
             others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(scene, windows, region, others)
+        likelihood = scene.with_prior(likelihood, start.mass_kda)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)

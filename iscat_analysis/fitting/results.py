@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds.classical import ComplexArray
@@ -14,6 +15,7 @@ from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.nuisances import NOTHING, evidence_of
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
@@ -73,6 +75,7 @@ class DetectionResult:
     followed: Followed | None = None
     trajectory: Trajectory | None = None
     optics: Mapping[str, Any] = field(default_factory=dict)
+    evidence: FloatArray | None = None  # of every row, in the order of `Evidence`
     interrupted: bool = False
 
 
@@ -97,6 +100,19 @@ def lines_of(
         (height,) = heights
         known[height] = quantum_information(scene.model, height)
     return list(mapper(lambda event: _line(scene, event, known), events))
+
+
+def evidence_beside(
+    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+) -> FloatArray:
+    """Give what the light of each event says beside its fit, where masses are fitted.
+
+    Shapes: result (n, 11), in the order of `Evidence`.
+    """
+    if scene.mode != "mass":
+        return np.full((len(events), len(NOTHING)), np.nan)
+    told = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
+    return np.array(list(told)).reshape(-1, len(NOTHING))
 
 
 def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.records import FREE_PARAMETERS, Progress
 
@@ -52,5 +53,9 @@ class Run:
 
     def warm_up(self, scene: Scene) -> None:
         """Load the compiled kernels of fits, or compile them."""
-        posteriors = scene.config.samples_posterior
-        compile_kernels(scene.model, parts_of(FREE_PARAMETERS[scene.mode], posteriors=posteriors))
+        config = scene.config
+        parts = parts_of(
+            FREE_PARAMETERS[scene.mode], heights=has_prior(config),
+            posteriors=config.samples_posterior,
+        )  # fmt: skip
+        compile_kernels(scene.model, parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
@@ -12,6 +12,8 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.moving_focus import MovingFocus, refuse_moving_focus
 from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
 from iscat_analysis.inference.fit import window_nm
+from iscat_analysis.inference.heights import height_prior
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
@@ -48,6 +50,15 @@ class Scene:
     def wide_at(self, frame: int) -> ForwardModel:
         """Give the model for signals far away at a frame of the movie."""
         return self.wide if self.moving is None else self.moving[1].at(frame)
+
+    def height_nm(self, mass_kda: float) -> float:
+        """Height at which a particle is expected, where its height is not free."""
+        return self.config.particle.mean_height_nm(mass_kda)
+
+    def with_prior(self, likelihood: Likelihood, mass_kda: float) -> Likelihood:
+        """Give a likelihood what is known of the particle's height, in mode mass."""
+        prior = height_prior(self.config, mass_kda)
+        return likelihood if prior is None else replace(likelihood, prior=prior)
 
     @property
     def pixel_nm(self) -> float:

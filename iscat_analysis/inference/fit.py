@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 
 from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.inference.reach import reach, reaches_far
@@ -93,11 +94,14 @@ def _box_around(
 ) -> Box:
     """Bounds of the search around θ; see `search_box`."""
     names = FREE_PARAMETERS[mode]
+    prior = likelihood.prior
     grid = likelihood.grid
     reach, half = window_nm(grid.pixel_nm), grid.pixel_nm / 2
     x, y, _, amplitude, _ = fixed = theta.tolist()
     largest = 100 * max(abs(amplitude), abs(likelihood.model.nominal_amplitude))
     signed = "z_nm" not in names and likelihood.model.rho > 0
+    if prior is not None:
+        names, z_range_nm = (*names, "z_nm"), _searched(prior, likelihood.model.z_range_nm)
     free = [name in names for name in PARAMETERS] + [level]
     left, right = grid.x_nm.item(0) - half, grid.x_nm.item(-1) + half
     top, bottom = grid.y_nm.item(0) - half, grid.y_nm.item(-1) + half
@@ -106,6 +110,12 @@ def _box_around(
     )  # fmt: skip
     upper = min(x + reach, right), min(y + reach, bottom), z_range_nm[1], largest, 1.0
     return Box(np.array(free), _where(free, lower, fixed), _where(free, upper, fixed))
+
+
+def _searched(prior: HeightPrior, known_nm: tuple[float, float]) -> tuple[float, float]:
+    """Give the heights at which a prior and a model let a particle be searched."""
+    low, high = prior.range_nm
+    return max(low, known_nm[0]), min(high, known_nm[1])
 
 
 def _where(free: list[bool], ends: Sequence[float], fixed: Sequence[float]) -> FloatArray:
@@ -186,6 +196,8 @@ def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
     brighter as a whole is no evidence of a particle in it.
     """
     nothing = 0.0  # log-likelihoods count from no particle and no change of the level
+    if likelihood.prior is not None:  # whatever the height of a particle that is not there
+        nothing = float(likelihood.prior.log_density(best.theta[2]))
     if box.free[LEVEL]:
         alone = np.arange(box.free.size) == LEVEL
         empty = best.theta.copy()

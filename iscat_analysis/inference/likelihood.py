@@ -2,6 +2,8 @@
 
 `iscat_analysis.inference.noise` makes it of counts.
 
+With a prior of the height, each of these is of likelihood × prior.
+
 Parameters are always θ = (x [nm], y [nm], z [nm], a, g): a the model's amplitude (the mass in kDa
 unless a calibration is given), g the logarithm of a common level, normally fixed at 0.
 
@@ -26,6 +28,7 @@ from iscat_analysis._kernels.radial import AxialTable
 from iscat_analysis._kernels.scan import scan_heights
 from iscat_analysis._kernels.scoring import (
     CONVERGED,
+    add_prior,
     maximize,
     score_pass,
     value_batch,
@@ -33,6 +36,7 @@ from iscat_analysis._kernels.scoring import (
 from iscat_analysis._kernels.support import box_supported, supported
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
+from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.noise_models import NoiseModel
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.stamp import margin_nm
@@ -66,6 +70,7 @@ class Likelihood:
     grid: PixelGrid
     noise: NoiseModel
     data: FloatArray
+    prior: HeightPrior | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.noise, NoiseModel):
@@ -80,6 +85,11 @@ class Likelihood:
             object.__setattr__(self, "data", np.ascontiguousarray(self.data))
         if not np.all(np.isfinite(self.data)):
             raise DataError("data: holds values that are not finite; mask those pixels")
+
+    @property
+    def height_prior(self) -> tuple[float, float]:
+        """Mean and information of the prior of z, as kernels take them."""
+        return (0.0, 0.0) if self.prior is None else (self.prior.mean_nm, self.prior.information)
 
     @property
     def n_pixels(self) -> int:
@@ -108,6 +118,8 @@ class Likelihood:
             value_batch(self._table(points[inside, 2]), *self._arguments, points[inside], known)
             out[inside] = known
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
+        if self.prior is not None:
+            out += self.prior.log_density(points[:, 2])
         return out
 
     def supports(self, thetas: FloatArray) -> BoolArray:
@@ -129,6 +141,8 @@ class Likelihood:
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
         value = score_pass(profile, *self._arguments, point, score, fisher)
+        if self.prior is not None:
+            value += add_prior(self.height_prior, point, score, fisher)
         return value, score, fisher
 
     def maximize(
@@ -164,7 +178,7 @@ class Likelihood:
             table = self.model.height_table(theta[2])
         value, used, outcome = maximize(
             tuple(table), tuple(lens), tuple(pixels), kind, data, free, lower, upper,
-            self._farthest, tolerance, passes, theta, fisher, least,
+            self._farthest, tolerance, passes, theta, fisher, least, self.height_prior,
         )  # fmt: skip
         return Optimum(theta, value, used, outcome == CONVERGED, fisher)
 
@@ -187,6 +201,8 @@ class Likelihood:
             tuple(self.model.axial_table), tuple(lens), tuple(pixels), kind, data, known,
             amplitude_range or (0.0, 0.0), point, found, refitted,
         )  # fmt: skip
+        if self.prior is not None:
+            found += self.prior.log_density(known)
         if known is heights:
             return found, refitted
         values, amplitudes = np.full(heights.size, -np.inf), np.full(heights.size, np.nan)
@@ -208,6 +224,7 @@ class Likelihood:
         """
         rows, info = self.derivatives(theta), np.empty((5, 5))
         observed_information(self.noise.code, self.data, math.exp(theta[LEVEL]), rows, info)
+        info[2, 2] += self.height_prior[1]
         return info
 
     def residuals(self, theta: FloatArray) -> FloatArray:

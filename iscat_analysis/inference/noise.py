@@ -154,9 +154,9 @@ def asimov_poisson(
     return poisson(model, grid, counts, background_e, scale_e, extra_variance_e2=extra_variance_e2)
 
 
-def parts_of(free: Collection[str], *, posteriors: bool) -> tuple[str, ...]:
+def parts_of(free: Collection[str], *, heights: bool = False, posteriors: bool) -> tuple[str, ...]:
     """Name the kernels that some fits need and others do not."""
-    needed = {"heights": "z_nm" in free, "posteriors": posteriors}
+    needed = {"heights": heights or "z_nm" in free, "posteriors": posteriors}
     return tuple(part for part, is_needed in needed.items() if is_needed)
 
 

@@ -44,6 +44,6 @@ def precision(
     moving = free if walls is None else free & ~walls
     known = errors_and_bias(
         likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), derivatives, fisher, free,
-        moving, slope, sigma, covariance, bias,
+        moving, slope, likelihood.height_prior[1], sigma, covariance, bias,
     )  # fmt: skip
     return known, sigma, covariance, bias

@@ -347,7 +347,7 @@ def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     return ParticleImage(
         grid=grid, noise=likelihood.noise, data=likelihood.data,
         x_nm=float(grid.x_nm[0] + x * grid.pixel_nm), y_nm=float(grid.y_nm[0] + y * grid.pixel_nm),
-        z_nm=config.particle.height_nm, snr=snr,
+        z_nm=config.particle.nominal_height_nm, snr=snr,
     )  # fmt: skip
 
 

@@ -26,6 +26,7 @@ class Store(Checkpoint):
                 core=(low, high),
                 lines=lines,
                 repeats=data["repeats"],
+                evidence=data["evidence"],
                 views=unpacked_views(data),
                 good=data["good"],
                 light=data["light"],
@@ -45,6 +46,7 @@ class Store(Checkpoint):
         arrays = {
             "core": np.array(done.core),
             "repeats": done.repeats,
+            "evidence": done.evidence,
             **packed_views(done.views),
             "good": done.good,
             "light": done.light,

@@ -15,7 +15,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import misfit_warning
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
-from iscat_analysis.fitting.results import lines_of, view_of
+from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.merging import CLIPS, VIEWS, Done
 from iscat_analysis.landing.steps import ChunkFitter
@@ -116,6 +116,7 @@ def analyse_chunk(
         core=core,
         lines=make_rows(lines_of(scene, events, mapper=pool.map)),
         repeats=np.array([step.repeats for step in steps]),
+        evidence=evidence_beside(scene, events, mapper=pool.map),
         views=tuple(
             view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)
             for n, (trace, clip) in enumerate(shown)

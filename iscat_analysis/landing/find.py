@@ -20,23 +20,30 @@ import pandas as pd
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.camera.lines import Lines, SteadyFrames
-from iscat_analysis.config import Config, with_absolute_paths
+from iscat_analysis.config import LARGEST_SD_NM, Config, with_absolute_paths
 from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import FloodError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
-from iscat_analysis.fitting.run import Notify, Run
+from iscat_analysis.fitting.run import Notify, Run, unheard
 from iscat_analysis.fitting.scene import Scene, make_scene
+from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
 from iscat_analysis.landing.merging import Done, Merged
 from iscat_analysis.landing.odd_frames import frame_warnings
-from iscat_analysis.records import CountSource, Progress, Status
+from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
 from iscat_analysis.threads import beside, one_thread_algebra, threads
+
+TOLD_FRAMES = 2000
+"""Frames from which heights are learned, at most."""
+
+LEAST_SD_NM = 0.1
+"""Least spread that is learned: with none the height would be held again."""
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -47,9 +54,10 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
     for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
         run.notify(remark)
     try:
+        config = with_learned_heights(ready, run)
         found = analyse_landings(
             ready.movie,
-            ready.config,
+            config,
             ready.camera,
             tell=run.tell,
             progress=run.progress,
@@ -64,6 +72,40 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
         raise FloodError(ready.other_kind) if ready.other_kind else error from None
     run.clock.lap("landing")
     return found
+
+
+def with_learned_heights(ready: Prepared, run: Run) -> Config:
+    """Learn mean and spread of the heights, where that is left open, from the first frames.
+
+    There they are searched with a prior so wide that the light decides; what it does not tell
+    stays with that prior.
+    """
+    config = ready.config
+    particle = config.particle
+    if not particle.height_is_open or config.fit.mode != "mass":
+        return config
+    first, last = fitted_frames(ready.movie, config)
+    some = config.fit.model_copy(update={"frames": (first, min(last, first + TOLD_FRAMES))})
+    trial = config.model_copy(update={"fit": some})
+    found = analyse_landings(
+        ready.movie, trial, ready.camera, tell=unheard, progress=silent, prepare=run.warm_up,
+        lines=ready.lines,
+    )  # fmt: skip
+    run.clock.lap("heights")
+    good = (found.fits["status"] == Status.OK).to_numpy()
+    told = None if found.evidence is None else spread_of_heights(*found.evidence[good, :2].T)
+    if told is None or told.mean_se_nm > particle.height_prior_sd_nm / 2:
+        run.tell(
+            "the heights cannot be learned from so few or so faint particles: they are taken as "
+            f"{particle.nominal_height_nm:g} ± {particle.height_prior_sd_nm:g} nm"
+        )
+        return config
+    run.notify(f"{ready.movie.name}: {told}, learned from {told.events} particles")
+    learned = {
+        "learned_height_nm": max(round(told.mean_nm, 2), 0.0),
+        "height_sd_nm": min(max(round(told.sd_nm, 2), LEAST_SD_NM), LARGEST_SD_NM),
+    }
+    return config.model_copy(update={"particle": particle.model_copy(update=learned)})
 
 
 def _nothing(scene: Scene) -> None:
@@ -191,6 +233,7 @@ def analyse_landings(
         summary=summary,
         repeats=repeats,
         empty=merged.empty,
+        evidence=merged.evidence,
         trajectory=merged.trajectory(),
         interrupted=interrupted,
     )

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.drift import Trajectory, measure_drift
+from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
 from iscat_analysis.search.empty import EmptySpread
 
@@ -41,6 +42,9 @@ class Done:
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
     cause: str = ""  # what the model probably has wrong
     empty: EmptySpread | None = None  # noise where nothing lands or leaves
+    evidence: FloatArray = field(
+        default_factory=lambda: np.empty((0, len(NOTHING)))
+    )  # of every row
 
 
 class Merged:
@@ -53,6 +57,7 @@ class Merged:
         self.sampled = 0
         self.cause = ""
         self.empty: EmptySpread | None = None
+        self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
 
     def note(self, number: int, done: Done) -> None:
         """Note when the events of a finished chunk happen, whose turn may not have come yet."""
@@ -112,6 +117,8 @@ class Merged:
             if number < VIEWS and row < len(done.views):
                 view = replace(done.views[row], event=number)
                 views.append(view if number < CLIPS else replace(view, clip=None))
+        told = [homes[i][0].evidence[homes[i][1]] for i in order]
+        self.evidence = np.array(told).reshape(-1, len(NOTHING))
         rows = make_rows(table.iloc[order], event=range(len(order)))
         return rows, tuple(views), tuple(repeats)
 

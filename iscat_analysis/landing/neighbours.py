@@ -63,7 +63,7 @@ class Neighbours:
         self._roi_px = scene.roi_px
         nominal = scene.model.material.mass_kda
         self._contrast_per_kda = (
-            scene.model.peak_contrast(scene.config.particle.height_nm, nominal) / nominal
+            scene.model.peak_contrast(scene.config.particle.nominal_height_nm, nominal) / nominal
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
 
@@ -102,7 +102,8 @@ class Neighbours:
 
     def overlaps(self, step: Step, start: int, stop: int) -> bool:
         """Whether a step lies inside frames relative to the chunk."""
-        return start < step.at.frame - self._chunk.first < stop
+        first = self._chunk.first
+        return start < step.at.last_turn - first and step.at.first_turn - first < stop
 
     def presence(self, step: Step, frames: slice) -> float:
         """Share of the frames' light that shines while the particle is there."""
@@ -110,8 +111,13 @@ class Neighbours:
         whole = power[frames.stop] - power[frames.start]
         if whole <= 0:
             return 0.0
-        turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
-        later = (power[frames.stop] - power[turn]) / whole
+        if step.at.rise:
+            turns = np.clip(step.at.turns - self._chunk.first, frames.start, frames.stop)
+            turned = power[turns].mean()
+        else:
+            turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
+            turned = power[turn]
+        later = (power[frames.stop] - turned) / whole
         return float(later if step.sign > 0 else 1 - later)
 
     def box(self, step: Step) -> tuple[slice, slice]:
@@ -144,8 +150,7 @@ class Neighbours:
         self, ratio: FloatArray, step: Step, before: slice, after: slice, region: Region
     ) -> None:
         """Multiply the pixels of a region that a step's image covers with `factor`."""
-        turn = step.at.frame - self._chunk.first
-        if self._pattern is None and not before.start < turn < after.stop:
+        if self._pattern is None and not self.overlaps(step, before.start, after.stop):
             return  # there in all of these frames, or in none
         shared = self.shared(step, region)
         if shared is None:

@@ -27,7 +27,7 @@ from iscat_analysis.inference.split_frames import (
 )
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Windows
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk, Patch
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
@@ -59,12 +59,13 @@ def step_repeats(
     others: Sequence[Step],
     neighbours: Neighbours,
     pattern: MovingPattern | None,
+    mode: str,
 ) -> FloatArray:
     """Compare parts of the frames of one landing or leaving."""
     region, windows = event.region, event.windows
     response = _response(event)
     if response is None:
-        return nothing_repeated("mass")[:, : len(event.fit.free) + 1]
+        return nothing_repeated(mode)
     local = pattern.local(region, step.at.frame) if pattern else None
     light = patch.mean_e
     read = np.square(patch.read_noise_e) * np.ones(region.shape)
@@ -88,7 +89,8 @@ def step_repeats(
                 continue
             here, image = shown
             height = np.einsum("iyx,yx->i", weights[(slice(None), *here)], light[here] * image)
-            known += np.outer(other.sign * height, frames >= other.at.frame)
+            there = (frames >= other.at.turns[:, None]).mean(axis=0)
+            known += np.outer(other.sign * height, there)
         if pattern and local:
             known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
         series.append(Series(one.values - known * one.power, one.power, one.shot, one.read))
@@ -320,7 +322,7 @@ def _pieces(shape: tuple[int, int], start: int, stop: int) -> Iterator[tuple[int
 
 
 def _response(event: Event) -> Response | None:
-    fit, windows = event.fit, event.windows
-    return response_of(
-        event.likelihood, fit.theta, fit.box.free, windows.before_e, windows.power_ratio
-    )
+    fit, windows, free = event.fit, event.windows, event.fit.box.free
+    if event.likelihood.prior is not None:  # of a height of its own no part of the frames tells
+        free = free & (np.arange(free.size) != PARAMETERS.index("z_nm"))
+    return response_of(event.likelihood, fit.theta, free, windows.before_e, windows.power_ratio)

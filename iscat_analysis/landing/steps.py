@@ -51,6 +51,7 @@ ROUNDS = 6
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
 _EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
 _SAME_PX = 1.5
+_MUCH = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
 @dataclass(frozen=True)
@@ -203,9 +204,7 @@ class ChunkFitter:
         if "mass_kda" not in FREE_PARAMETERS[scene.mode]:
             mass = scene.model.material.mass_kda
         mass = max(mass, 1e-3 * scene.model.material.mass_kda)
-        start = Candidate(
-            peak.x_px, peak.y_px, scene.config.particle.height_nm, mass, abs(peak.snr)
-        )
+        start = Candidate(peak.x_px, peak.y_px, scene.height_nm(mass), mass, abs(peak.snr))
         return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     # ---- one step --------------------------------------------------------------------------
@@ -217,9 +216,11 @@ class ChunkFitter:
         z_range = self._scene.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
-            likelihood, start = task.likelihood, _displaced(step.start, *task.offset_px)
+            likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
             box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
             theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
+            if not box.free[2]:
+                theta[2] = start.z_nm
             theta = np.where(box.free, np.clip(theta, box.lower, box.upper), theta)
             best = likelihood.maximize(theta, box.free, box.lower, box.upper)
             if likelihood.model.scale.mass(best.theta[3]) <= 0:
@@ -259,6 +260,12 @@ class ChunkFitter:
             refitted[index] = step
         return refitted
 
+    def _seated(self, step: Step) -> Candidate:
+        """Put a step where a particle of its mass is expected, unless its height is free."""
+        if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+            return step.start
+        return replace(step.start, z_nm=self._scene.height_nm(step.start.mass_kda))
+
     def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
         """Put a step where a fit found it."""
         likelihood, (y_px, x_px) = task.likelihood, task.offset_px
@@ -290,7 +297,7 @@ class ChunkFitter:
         if likelihood.n_pixels < 0.5 * math.prod(likelihood.grid.shape):
             return None
         y_px, x_px = task.offset_px
-        start = _displaced(step.start, y_px, x_px)
+        start = _displaced(self._seated(step), y_px, x_px)
         fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
@@ -298,6 +305,7 @@ class ChunkFitter:
         event = Event(
             task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
             task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
+            task.at.rise,
         )  # fmt: skip
         if event.snr < _EXPLAINED * scene.templates.threshold:
             return None
@@ -305,8 +313,9 @@ class ChunkFitter:
         seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
         others = tuple(steps[i] for i in seen)
         repeats = step_repeats(
-            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern
-        )
+            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern,
+            scene.mode,
+        )  # fmt: skip
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
@@ -325,7 +334,10 @@ class ChunkFitter:
                 self._scene, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
-                poor_fit=steps[number].at.p_constant < POOR_FIT_P,
+                changing=steps[number].at.p_constant < POOR_FIT_P
+                or any(
+                    away[i] < self._roi_px / 2 and _outshines(steps[i], steps[number]) for i in near
+                ),
             )  # fmt: skip
             judged.append(replace(own.fitted, event=replace(event, flags=flags)))
         return judged
@@ -354,6 +366,11 @@ def _has_moved(old: Step, new: Step) -> bool:
         return True
     tolerance = max(old.start.mass_kda, new.start.mass_kda) / max(new.snr, 1.0)
     return abs(new.start.mass_kda - old.start.mass_kda) > tolerance
+
+
+def _outshines(other: Step, step: Step) -> bool:
+    """Whether a step may be what is left of another, much stronger one whose light rises slowly."""
+    return other.at.rise > 0 and other.start.mass_kda > _MUCH * step.start.mass_kda
 
 
 def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:

@@ -82,7 +82,7 @@ class TaskBuilder:
             local = moving.local(region, at.frame)
         step = replace(step, at=at)
         span, crowded = self._span(step, close)
-        gap = min(at.gap, self._window // 5)
+        gap = at.kept_out(self._window)
         begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
         first = (begin, max(at.frame - gap, begin))
         second = (min(at.frame + gap, end), end)
@@ -125,6 +125,7 @@ class TaskBuilder:
             read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
             masked=~used,
         )  # fmt: skip
+        likelihood = scene.with_prior(likelihood, step.start.mass_kda)
         windows = Windows(
             before_e=before,
             after_e=after,
@@ -157,7 +158,7 @@ class TaskBuilder:
         begin, end = frame - self._window, frame + self._window
         crowded = False
         for other in sorted(close, key=lambda s: abs(s.at.frame - frame)):
-            gap = min(other.at.gap, self._window // 5)
+            gap = other.at.kept_out(self._window)
             if other.at.frame <= frame - FEWEST_FRAMES - gap:
                 begin = max(begin, other.at.frame + gap)
             elif other.at.frame >= frame + FEWEST_FRAMES + gap:
@@ -223,7 +224,7 @@ class TaskBuilder:
             seen.append(other)
             images.append(padded)
         for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
-            known += other.sign * height * (frames >= other.at.frame)
+            known += other.sign * height * (frames >= other.at.turns[:, None]).mean(axis=0)
         own = self._neighbours.shared(step, region)
         if self._pattern and pattern and own is not None:
             known += self._drifting(step, image, own[1], patch, self._pattern, pattern)

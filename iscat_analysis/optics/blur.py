@@ -21,10 +21,13 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.waves import LatticeField, RadialField
+
+ComplexArray = NDArray[np.complex128]
 
 PATH_SPREAD = math.sqrt(2 / 5)
 """Standard deviation of a path's spread in one exposure over its mean, of both axes together."""
@@ -59,6 +62,27 @@ def blurred(model: ForwardModel, variance_nm2: float, *, upwards: bool) -> Forwa
     if upwards:
         exponent = exponent + wave.axial**2
     dimmed = sum(share * np.exp(-exponent * v / 2) for share, v in spreads(variance_nm2))
+    return _dimmed(model, np.asarray(dimmed))
+
+
+def wiggled(model: ForwardModel, sd_nm: float) -> ForwardModel:
+    """Average a model over normal places of a particle that wiggles about its mean one."""
+    if sd_nm == 0:
+        return model
+    wave = model.wave
+    if not isinstance(wave, RadialField | LatticeField):
+        raise ConfigError('optics.psf = "measured" has the wiggle of the particles it shows')
+    return _dimmed(model, np.exp(-0.5 * (wave.transverse * sd_nm) ** 2))
+
+
+def _dimmed(model: ForwardModel, dimmed: ComplexArray) -> ForwardModel:
+    """Multiply every plane wave of a model.
+
+    Shapes: `dimmed` (n,).
+    """
+    wave = model.wave
     if isinstance(wave, RadialField):
         return replace(model, wave=replace(wave, source=wave.source * dimmed))
-    return replace(model, wave=replace(wave, harmonics=wave.harmonics * dimmed))
+    if isinstance(wave, LatticeField):
+        return replace(model, wave=replace(wave, harmonics=wave.harmonics * dimmed))
+    return model

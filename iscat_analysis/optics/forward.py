@@ -28,6 +28,7 @@ from iscat_analysis.optics.aperture import (
     harmonics,
     weight_on,
 )
+from iscat_analysis.optics.blur import wiggled
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
@@ -81,7 +82,7 @@ def forward_model(
     optics = config.optics
     if config.calibration is not None:
         reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
-    height = config.particle.height_nm
+    height = config.particle.nominal_height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm
     ns, ng, ni = optics.n_sample, optics.n_glass, optics.n_immersion
@@ -132,16 +133,16 @@ def forward_model(
         wave=wave,
         strength=strength,
         reach_nm=wave.reach_nm,
-        z_range_nm=(min(config.fit.z_range_nm[0], height), z_max_nm),
+        z_range_nm=(min(config.fit.z_range_nm[0], height, _lowest_nm(config)), z_max_nm),
         samples=(points / 2, weights / 2),
     )
     if optics.psf == "measured":
         template = Template.read(Path(optics.template or ""))
         template.refuse_mismatch(config.camera.pixel_size_nm, config.fit.roi_nm)
         model = with_template(model, template)
-    if config.calibration is None:
-        return model
-    return replace(model, scale=_mass_scale(model, config.calibration, config.particle))
+    if config.calibration is not None:  # of a particle that rests
+        model = replace(model, scale=_mass_scale(model, config.calibration, config.particle))
+    return wiggled(model, config.particle.wiggle_nm)
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
@@ -217,6 +218,15 @@ def _wave(
     )
 
 
+def _lowest_nm(config: Config) -> float:
+    """Give the lowest height that a normal prior lets a fit look at, below the coverslip too."""
+    particle = config.particle
+    sd_nm = particle.height_prior_sd_nm
+    if config.fit.mode != "mass" or not sd_nm:
+        return math.inf
+    return min(particle.mean_height_nm(0.0), particle.nominal_height_nm) - 5 * sd_nm
+
+
 def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> MassScale:
     """Let the line say what amplitude a mass has, at the optics of its standards."""
     if not model.rho:
@@ -231,8 +241,8 @@ def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> M
         same = _same_template(model.optics, line.optics)
         refusal = "" if same else "they were measured with another picture of a particle"
         return MassScale(line, linear, quadratic, linear, refusal)
-    height = particle.height_nm if line.height_nm is None else line.height_nm
-    there = particle.model_copy(update={"height_nm": height})
+    height = particle.nominal_height_nm if line.height_nm is None else line.height_nm
+    there = particle.held_at(height)
     of_standards = _peak_of_standards(line.optics.model_dump_json(), there.model_dump_json())
     _refuse_sign(of_standards[0], line, "calibration.optics", " or these optics")
     refusal = carry_refusal(model.optics, line.optics, linear / of_standards[0])

@@ -1,9 +1,9 @@
-"""Refractive indices and densities of the particles, with their sources.
+"""Refractive indices of the particles, with their sources.
 
 Gold: P. B. Johnson and R. W. Christy, Phys. Rev. B 6, 4370 (1972), n and k against photon energy,
 interpolated linearly in vacuum wavelength.  Silica: I. H. Malitson, J. Opt. Soc. Am. 55, 1205
 (1965).  Polystyrene: N. Sultanova, S. Kasarova and I. Nikolov, Acta Phys. Pol. A 116, 585 (2009).
-Protein: index 1.46 and 1350 kg/m³, the values mass photometry works with.
+Protein: index 1.46, the value mass photometry works with.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from iscat_analysis.config import Particle
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.units import sphere_mass_kda
 
 _GOLD = np.array([
     [0.64, 0.92, 13.78], [0.77, 0.56, 11.21], [0.89, 0.43, 9.519], [1.02, 0.35, 8.145],
@@ -68,18 +67,11 @@ def _inside(kind: str, wavelength_nm: float, low: float, high: float) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Kind:
-    index: Callable[[float], complex]
-    density_kg_m3: float
-    default_mass_kda: float
-
-
-_KINDS = {
-    "gold": _Kind(_gold, 19300.0, sphere_mass_kda(30.0, 19300.0)),
-    "silica": _Kind(_silica, 2200.0, sphere_mass_kda(30.0, 2200.0)),
-    "polystyrene": _Kind(_polystyrene, 1050.0, sphere_mass_kda(30.0, 1050.0)),
-    "protein": _Kind(lambda _: 1.46 + 0j, 1350.0, 150.0),
+_INDICES: dict[str, Callable[[float], complex]] = {
+    "gold": _gold,
+    "silica": _silica,
+    "polystyrene": _polystyrene,
+    "protein": lambda _: 1.46 + 0j,
 }
 
 
@@ -94,20 +86,13 @@ class Material:
 
 def material(particle: Particle, wavelength_nm: float) -> Material:
     """Resolve a particle of the configuration at a wavelength."""
-    kind = _KINDS.get(particle.kind)
+    index = _INDICES.get(particle.kind)
     if particle.permittivity is not None:
         permittivity = complex(*particle.permittivity)
     elif particle.index is not None:
         permittivity = complex(particle.index**2)
-    elif kind is not None:
-        permittivity = kind.index(wavelength_nm) ** 2
+    elif index is not None:
+        permittivity = index(wavelength_nm) ** 2
     else:
         raise ConfigError('particle.kind = "custom" needs permittivity or index')
-    density = particle.density_kg_m3 or (kind.density_kg_m3 if kind else 1000.0)
-    if particle.mass_kda is not None:
-        mass = particle.mass_kda
-    elif particle.diameter_nm is not None:
-        mass = sphere_mass_kda(particle.diameter_nm, density)
-    else:
-        mass = kind.default_mass_kda if kind else sphere_mass_kda(30.0, density)
-    return Material(permittivity, density, mass)
+    return Material(permittivity, particle.density, particle.nominal_mass_kda)

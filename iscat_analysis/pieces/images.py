@@ -79,7 +79,7 @@ def psf(
     config = config_of(optics, particle, camera, calibration=calibration)
     side = int(number_in("pixels", pixels, least=1, most=LARGEST_REGION, whole=True))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
-    height = particle.height_nm if z_nm is None else z_nm
+    height = particle.nominal_height_nm if z_nm is None else z_nm
     reference = forward_model(config, pixel_nm)
     mass = reference.material.mass_kda if mass_kda is None else mass_kda
     at = together(
@@ -87,7 +87,7 @@ def psf(
     )
     half = side * pixel_nm / 2
     reach = math.hypot(*(half + np.abs(at[name]).max(initial=0.0) for name in ("x_nm", "y_nm")))
-    highest = max(float(at["z_nm"].max(initial=0.0)), particle.height_nm)
+    highest = max(float(at["z_nm"].max(initial=0.0)), particle.nominal_height_nm)
     model = forward_model(config, reach * 1.0001 + pixel_nm, z_max_nm=highest)
     unit = 1.0 if model.rho else photons_per_intensity(model, darkfield_photons(particle), pixel_nm)
     grid = PixelGrid.centred(side, pixel_nm)

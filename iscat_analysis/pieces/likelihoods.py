@@ -251,5 +251,5 @@ def log_likelihood(
         lower=np.array([*lower, -LARGEST_LEVEL])[free],
         upper=np.array([*upper, LARGEST_LEVEL])[free],
         _likelihood=counts.likelihood(0),
-        _fixed=np.array([0.0, 0.0, particle.height_nm, amplitude, 0.0]),
+        _fixed=np.array([0.0, 0.0, particle.nominal_height_nm, amplitude, 0.0]),
     )

@@ -260,7 +260,7 @@ class _Setups:
             {
                 "x_nm": x_nm,
                 "y_nm": y_nm,
-                "z_nm": config.particle.height_nm if z_nm is None else z_nm,
+                "z_nm": config.particle.nominal_height_nm if z_nm is None else z_nm,
                 "mass_kda": nominal.material.mass_kda if mass_kda is None else mass_kda,
                 "focus_nm": config.optics.focus_nm if focus_nm is None else focus_nm,
                 "photons_per_pixel": photons_per_pixel,
@@ -292,7 +292,7 @@ class _Setups:
         far = [half + float(np.abs(self._all[name]).max(initial=0.0)) for name in ("x_nm", "y_nm")]
         self._reach_nm = math.hypot(*far) * 1.0001
         highest = float(self._all["z_nm"].max(initial=0.0))
-        self._highest_nm = max(highest, config.particle.height_nm)
+        self._highest_nm = max(highest, config.particle.nominal_height_nm)
         self._models: dict[float, ForwardModel] = {}
 
     def at(self, place: tuple[int, ...]) -> _At:

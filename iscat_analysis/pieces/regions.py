@@ -17,6 +17,7 @@ from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.pieces.counts import Counts, gather
@@ -151,7 +152,8 @@ def fit_rois(
         z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[mode] else None,
         field_px=counts.grid.shape,
     )  # fmt: skip
-    compile_kernels(counts.model, parts_of(FREE_PARAMETERS[mode], posteriors=False))
+    parts = parts_of(FREE_PARAMETERS[mode], heights=has_prior(config), posteriors=False)
+    compile_kernels(counts.model, parts)
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, event=range(count))
@@ -225,7 +227,10 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     if "mass_kda" not in free:
         start = replace(start, mass_kda=model.material.mass_kda)
     if "z_nm" not in free:
-        start = replace(start, z_nm=config.particle.height_nm)
+        start = replace(start, z_nm=config.particle.mean_height_nm(start.mass_kda))
+    prior = height_prior(config, start.mass_kda)
+    if prior is not None:
+        likelihood = replace(likelihood, prior=prior)
     fit = fit_particle(
         likelihood, start, config.fit.mode, config.fit.z_range_nm, level=counts.level
     )

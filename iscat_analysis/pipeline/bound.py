@@ -26,7 +26,13 @@ from iscat_analysis.fitting.events import Event, posterior_of
 from iscat_analysis.fitting.field import add_signal, fit_field
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import Region, contrast_image, photons_scale
-from iscat_analysis.fitting.results import Compared, DetectionResult, table_of, view_of
+from iscat_analysis.fitting.results import (
+    Compared,
+    DetectionResult,
+    evidence_beside,
+    table_of,
+    view_of,
+)
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.split_frame_estimates import field_repeats
@@ -190,6 +196,7 @@ def _together(
     return DetectionResult(
         scene=scene,
         fits=table_of(scene, events),
+        evidence=evidence_beside(scene, events),
         views=tuple(
             view_of(number, event, posterior=chain)
             for number, (event, chain) in enumerate(zip_longest(events, chains))

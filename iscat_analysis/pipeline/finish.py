@@ -67,7 +67,9 @@ def gather(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    table, achieved, budget = reported_rows(found)
+    learned = bool(ready.summary.get("optics", {}).get("calibrated"))
+    rows = reported_rows(found, learned_optics=learned)
+    table, achieved, budget = rows.table, rows.achieved, rows.budget
     recorded = ready.movie.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
@@ -75,6 +77,16 @@ def gather(
     for flag in ready.flags:
         table = flagged(table, flag)
     scale = scene.model.scale
+    if rows.course:
+        run.tell(rows.course)
+    for name, beside in (
+        ("heights", rows.heights), ("extension", rows.extension),
+        ("fluctuation", rows.fluctuation),
+    ):  # fmt: skip
+        if beside is not None:
+            further[name] = beside.summary
+            if beside.message:
+                run.tell(beside.message)
     for doubt in (
         scale_warning(scale),
         line_warning(config, table),
@@ -86,8 +98,9 @@ def gather(
             run.tell(doubt)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
+        had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
         verdict = spread_verdict(
-            achieved, found.summary,
+            {name: one for name, one in achieved.items() if name not in had}, found.summary,
             scaled=scaled, rejected=bool(rejection(table)), sliding=ready.way == "sliding",
         )  # fmt: skip
         further["repeats"] = verdict

@@ -182,7 +182,7 @@ def inject_and_recover(
     )
     if again.interrupted:
         raise KeyboardInterrupt
-    rows, *_ = reported_rows(again)
+    rows = reported_rows(again).table
     return recovery(
         particles,
         rows[rows["status"] != Status.SIDELOBE],
@@ -224,7 +224,11 @@ def draw_particles(
             spans.append((max(middle - half, 0), min(middle + half + 1, size)))
         grid = PixelGrid.region(spans[0], spans[1], scene.pixel_nm)
         image = scene.wide_at(int(landing)).image(
-            grid, x * scene.pixel_nm, y * scene.pixel_nm, scene.config.particle.height_nm, mass
+            grid,
+            x * scene.pixel_nm,
+            y * scene.pixel_nm,
+            scene.config.particle.nominal_height_nm,
+            mass,
         )
         frame = int(landing)
         leave = min(frame + stay, frames[1])

@@ -8,30 +8,76 @@ beginning.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, make_rows
+from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, flagged, make_rows
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import budget_of
+from iscat_analysis.trust.course import at_a_shared_place, may_rise, rise_said
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
+from iscat_analysis.trust.extension import Extension
+from iscat_analysis.trust.fluctuation import Fluctuation
+from iscat_analysis.trust.heights import Heights
 from iscat_analysis.trust.systematic import contributions, total
 
 
-def reported_rows(
-    found: DetectionResult,
-) -> tuple[pd.DataFrame, dict[str, EmpiricalSpread], list[dict[str, Any]]]:
-    """Make the rows of all events of a movie, and the budget of their masses."""
+@dataclass(frozen=True)
+class ReportedRows:
+    """The rows of all events of a movie, and what they say together."""
+
+    table: pd.DataFrame
+    achieved: Mapping[str, EmpiricalSpread]
+    budget: list[dict[str, Any]]
+    heights: Heights | None = None
+    extension: Extension | None = None
+    fluctuation: Fluctuation | None = None
+    course: str = ""
+
+
+def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
+    """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
+    told, heights, extension = None, None, None
+    if found.evidence is not None and len(found.evidence):
+        told = Evidence(*found.evidence.T)
+        heights = Heights.of(config, fits, told, learned_optics=learned_optics)
+        if heights is None or not heights.are_wrong:  # which would look like widths
+            extension = Extension.of(fits, told, achieved, config.particle.wiggle_nm)
+    shifts = {
+        name: beside.mass_shift_kda
+        for name, beside in (("heights", heights), ("extension", extension))
+        if beside is not None
+    }
+    if extension is not None:
+        fits = flagged(fits, Status.EXTENDED, extension.flagged)
+    course = ""
+    if found.heading == "landing":
+        fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
+        if told is not None:
+            unseen, frames = may_rise(fits, told)
+            fits = flagged(fits, Status.CHANGING, unseen)
+            rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
+            course = rise_said(frames, int(unseen.sum()), rising, len(fits))
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
+    fluctuation = None
+    if not scale:  # which has all that the frames show
+        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved)
+    if fluctuation is not None:
+        sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
+        fits = fits.assign(sigma_mass_kda=sigma)
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    shared = contributions(config, fits, mass_error(found.optics), found.scene.model.scale)
+    shared = contributions(config, fits, mass_error(found.optics), found.scene.model.scale, shifts)
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
@@ -40,4 +86,4 @@ def reported_rows(
         table, shared, achieved,
         calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
-    return table, achieved, budget
+    return ReportedRows(table, achieved, budget, heights, extension, fluctuation, course)

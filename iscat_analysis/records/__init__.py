@@ -28,7 +28,6 @@ from iscat_analysis.records.columns import (
     TRACK_COLUMNS,
     TRACKS,
     Column,
-    flagged,
     free_parameters,
     track_numbers,
 )
@@ -47,7 +46,7 @@ from iscat_analysis.records.frames import (
     StackMetadata,
     Windows,
 )
-from iscat_analysis.records.rows import make_rows
+from iscat_analysis.records.rows import flagged, make_rows
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [

@@ -245,13 +245,6 @@ BUDGET_COLUMNS = ("name", "kind", "common", "sigma_mass_kda", "sigma_rel", "dof"
 """What is said of each source of the error of a mass."""
 
 
-def flagged(table: pd.DataFrame, flag: str) -> pd.DataFrame:
-    """Add a flag to all rows of a table of events or tracks; it is the status of those ok."""
-    before = table["flags"].fillna("").astype(str)
-    flags = before.where(before == "", before + ";") + flag
-    return table.assign(status=table["status"].mask(table["status"] == "ok", flag), flags=flags)
-
-
 def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:
     """Give the track of every row."""
     return fits["track"] if "track" in fits else fits["event"]

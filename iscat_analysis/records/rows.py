@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
+from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
+from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus
 
 
 def make_rows(
@@ -34,3 +37,20 @@ def make_rows(
     if table["frame"].isna().any():  # sums do not say when
         types["frame"] = "Int64"
     return table.astype(types)
+
+
+def flagged(
+    table: pd.DataFrame, flag: Status | TrackStatus, which: BoolArray | None = None
+) -> pd.DataFrame:
+    """Add a flag to rows of events or tracks, to all or to some; the status is the worst one.
+
+    Shapes: `which` (rows,).
+    """
+    order = [*map(str, SEVERITY if isinstance(flag, Status) else TrackStatus)]
+    chosen = np.ones(len(table), dtype=bool) if which is None else which
+    statuses, flags = table["status"].astype(object), table["flags"].astype(object)
+    for row in np.flatnonzero(chosen).tolist():
+        known = {str(flag), *filter(None, str(flags.iat[row] or "").split(";"))}
+        found = sorted(known, key=lambda name: order.index(name) if name in order else len(order))
+        statuses.iat[row], flags.iat[row] = found[0], ";".join(found)
+    return table.assign(status=statuses, flags=flags)

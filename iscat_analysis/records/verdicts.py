@@ -20,6 +20,8 @@ class Status(StrEnum):
     SIDELOBE = "sidelobe"
     NONLINEAR = "nonlinear"
     PROCESSED = "processed"
+    CHANGING = "changing"
+    EXTENDED = "extended"
 
     @property
     def advice(self) -> str:
@@ -48,6 +50,11 @@ _ADVICE = {
     "noise nor their particles are as the camera gave them: analyse the camera's own frames.",
     Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
     "all masses are wrong by the same factor: a line says by how much and why.",
+    Status.CHANGING: "The light of the particle goes on changing beside its step: it settles, "
+    "bleaches or blinks, moves on, or another one shares its place; the mass is that of the mean "
+    "change.",
+    Status.EXTENDED: "The picture is wider than that of a point: the particle wiggles by more than "
+    "particle.wiggle_nm says, or has parts that are apart; its mass is too small.",
 }
 
 
@@ -56,6 +63,8 @@ SEVERITY = (
     Status.NOT_CONVERGED,
     Status.AT_BOUND,
     Status.POOR_FIT,
+    Status.CHANGING,
+    Status.EXTENDED,
     Status.AMBIGUOUS_Z,
     Status.TOO_CLOSE,
     Status.SATURATED,
@@ -64,9 +73,9 @@ SEVERITY = (
     Status.PROCESSED,
 )
 """What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
-a model that does not describe the data; one of several heights; a mass shared with a neighbour;
-pixels left out; a mass on the scale of other optics; counts that are not in proportion to the
-light; frames that are not as the camera gave them."""
+a model that does not describe the data, their course or their width; one of several heights; a mass
+shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that are not
+in proportion to the light; frames that are not as the camera gave them."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:

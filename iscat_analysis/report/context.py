@@ -135,6 +135,16 @@ def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
             "note": f"middle half {number(low)} to {number(high)}" if values.size > 1 else "",
         }
     )
+    heights = analysis.summary.get("heights")
+    if heights is not None and not heights["held"]:
+        tiles.append(
+            {
+                "label": "Heights",
+                "value": f"{fixed(heights['mean_nm'], 1)} ± {fixed(heights['sd_nm'], 1)}",
+                "unit": "nm",
+                "note": f"mean, to ± {fixed(heights['mean_se_nm'], 1)}, and standard deviation",
+            }
+        )
     name = "mass_kda" if "mass_kda" in FREE_PARAMETERS[analysis.mode] else "z_nm"
     if (p := precision_of(analysis, table, name)).events:
         label, unit = LABELS[name], UNITS[name]

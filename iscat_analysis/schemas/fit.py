@@ -270,6 +270,37 @@ class Blocks(Closed):
     )
 
 
+class Heights(Closed):
+    """Heights of the particles in mode mass, beyond the errors of each."""
+
+    mean_nm: Number = key("Mean [nm]; of heights that are held, one step of scoring from there")
+    mean_se_nm: NotNegative = key("Its standard error [nm]")
+    sd_nm: NotNegative = key("Standard deviation of the heights [nm]")
+    sd_ci95_nm: tuple[NotNegative, NotNegative] = key("Its 95 % interval [nm]")
+    events: Count = key("Events that tell them")
+    held: bool = key("Whether one height was held for all, so that no row has its own")
+    mean_is_of_learned_optics: bool = key(
+        "Whether the optics were learned from the same particles: their focus and a common height "
+        "are then one number, and the mean is where the optics put it"
+    )
+
+
+class Extension(Closed):
+    """Width of the particles' pictures beyond that of the model's."""
+
+    variance_nm2: Number = key("Mean variance of places along each axis [nm²]; null of few events")
+    variance_se_nm2: Number = key("Its standard error [nm²]")
+    flagged: Count = key("Rows that are flagged extended for it")
+
+
+class Fluctuation(Closed):
+    """Slow fluctuation of contrasts while particles are there, which sigma_mass_kda has."""
+
+    relative: NotNegative = key("Standard deviation over the contrast")
+    relative_se: NotNegative = key("Its standard error")
+    frames: NotNegative = key("Correlation time [frames]")
+
+
 class Learned(Closed):
     """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
 
@@ -381,6 +412,9 @@ class Summary(Document):
     across_particles: list[Across] = maybe(
         "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
     )
+    heights: Heights = maybe("Mode mass: mean and spread of the heights")
+    extension: Extension = maybe("Mode mass: width of the pictures beyond that of the model's")
+    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, where it is seen")
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
         "Where rows, columns or a smooth part of the light changed, and were corrected"

@@ -151,7 +151,7 @@ def _start(
     """Place a particle in the field, or around it [nm]."""
     pixel = config.camera.pixel_size_nm or 0.0
     rows, columns = config.simulation.shape
-    z = config.particle.height_nm if kind.z_nm is None else kind.z_nm
+    z = config.particle.nominal_height_nm if kind.z_nm is None else kind.z_nm
     if kind.z_nm is None and kind.ceiling_nm is not None:
         z = rng.uniform(0, kind.ceiling_nm)
     if kind.x_px is not None and kind.y_px is not None:

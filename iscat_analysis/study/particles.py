@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, Particle
 from iscat_analysis.optics.materials import material
 
 
@@ -32,7 +32,7 @@ def place_particles(config: Config, rng: np.random.Generator) -> tuple[Simulated
         return tuple(
             SimulatedParticle(
                 e.frame, e.leave, e.x_px, e.y_px,
-                particle.height_nm if e.z_nm is None else e.z_nm,
+                _height_nm(particle, e.mass_kda or nominal, rng) if e.z_nm is None else e.z_nm,
                 nominal if e.mass_kda is None else e.mass_kda,
             )
             for e in sorted(simulation.events, key=lambda e: e.frame)
@@ -55,8 +55,19 @@ def place_particles(config: Config, rng: np.random.Generator) -> tuple[Simulated
         leave = int(rng.integers(landing[i] + 1, latest + 1)) if leaves else None
         particles.append(
             SimulatedParticle(
-                int(landing[i]), leave, float(x[i]), float(y[i]), particle.height_nm,
-                float(mass[i]),
+                int(landing[i]), leave, float(x[i]), float(y[i]),
+                _height_nm(particle, float(mass[i]), rng), float(mass[i]),
             )
         )  # fmt: skip
     return tuple(particles)
+
+
+def _height_nm(particle: Particle, mass_kda: float, rng: np.random.Generator) -> float:
+    """Give a particle's height: as expected, or drawn around that until it is above the glass."""
+    mean, sd = particle.mean_height_nm(mass_kda), particle.height_sd_nm
+    if not sd:
+        return mean
+    height = -1.0
+    while height < 0:
+        height = float(rng.normal(mean, sd))
+    return height

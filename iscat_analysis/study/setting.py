@@ -190,7 +190,7 @@ def make_setting(
     if pixel_nm:
         _check_place(config, side * pixel_nm / 2)
     asked = z_nm if z_nm is not None else config.bounds.z_nm
-    height = config.particle.height_nm if asked is None else asked
+    height = config.particle.nominal_height_nm if asked is None else asked
     counted = config.optics.scheme != "darkfield" and config.bounds.n_before > 0
     level = config.background.method == "sliding" and counted
     config = _changed(config, {"background": _background(config)})

@@ -132,7 +132,7 @@ class Movie:
         if not all(p.still for p in self.movers):
             reach += (4 * self._near_px + 8) * self._pixel_nm  # also from beyond a corner
         self._model = forward_model(
-            config, reach, z_max_nm=max([config.particle.height_nm, *heights])
+            config, reach, z_max_nm=max([config.particle.nominal_height_nm, *heights])
         )
         self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
         self._sample_e = self._background()

@@ -83,7 +83,7 @@ def _alike(here: Config, there: Config) -> bool:
     return (
         here.optics.model_copy(update={"file": None, "calibrate": "auto"})
         == there.optics.model_copy(update={"file": None, "calibrate": "auto"})
-        and here.particle.height_nm == there.particle.height_nm
+        and here.particle.nominal_height_nm == there.particle.nominal_height_nm
         and here.camera.pixel_size_nm == there.camera.pixel_size_nm
         and here.fit.mode == "mass"
     )
@@ -91,7 +91,7 @@ def _alike(here: Config, there: Config) -> bool:
 
 def _value(key: str, config: Config) -> float | None:
     values = {
-        "height_nm": config.particle.height_nm,
+        "height_nm": config.particle.nominal_height_nm,
         "magnification": config.camera.pixel_size_nm,
     }
     return values[key] if key in values else float(getattr(config.optics, key))
@@ -165,11 +165,11 @@ def _moved(key: str, config: Config, step: float) -> Config:
     """Move an input, and leave the stage where it is."""
     update: dict[str, Any] = {"calibration": None}
     if key == "height_nm":
-        height, optics = config.particle.height_nm + step, config.optics
+        height, optics = config.particle.nominal_height_nm + step, config.optics
         # the oil, which the nominal height and the focus set together, stays
         focus = optics.focus_nm + step * (1 - optics.n_immersion / optics.n_sample)
         update |= {
-            "particle": config.particle.model_copy(update={"height_nm": height}),
+            "particle": config.particle.held_at(height),
             "optics": optics.model_copy(update={"focus_nm": focus}),
         }
     else:

@@ -12,7 +12,9 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
 from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status
 from iscat_analysis.search.empty import EmptySpread
 
-_NOISE_SHOWS = frozenset({Status.OK.value, Status.POOR_FIT.value})
+_NOISE_SHOWS = frozenset(
+    {Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value, Status.EXTENDED.value}
+)
 """Verdicts with which the noise can still be read; excess noise itself makes fits poor."""
 
 

@@ -142,14 +142,14 @@ def at_standards(config: Config) -> Config:
     line = config.calibration
     if line is None or line.optics is None:
         return config
-    height = config.particle.height_nm if line.height_nm is None else line.height_nm
+    height = config.particle.nominal_height_nm if line.height_nm is None else line.height_nm
     camera = config.camera
     if line.camera is not None and line.camera.pixel_size_nm is not None:
         camera = camera.model_copy(update={"pixel_size_nm": line.camera.pixel_size_nm})
     return config.model_copy(
         update={
             "optics": line.optics.model_copy(update={"covariance": line.covariance}),
-            "particle": config.particle.model_copy(update={"height_nm": height}),
+            "particle": config.particle.held_at(height),
             "camera": camera,
             "fit": config.fit.model_copy(update={"mode": "mass"}),
         }

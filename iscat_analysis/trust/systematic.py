@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -101,11 +102,15 @@ def contributions(
     table: pd.DataFrame,
     mass_share: float = 0.0,
     scale: MassScale | None = None,
+    held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
 ) -> list[Contribution]:
-    """Give what each source makes of the events of a movie, where it makes anything of them."""
-    found = [
-        (source, source.errors(config, table)) for source in sources_of(config, mass_share, scale)
-    ]
+    """Give what each source makes of the events of a movie, where it makes anything of them.
+
+    Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
+    """
+    sources = [*sources_of(config, mass_share, scale)]
+    sources += [_of_held(name, shift) for name, shift in held_kda.items() if shift.any()]
+    found = [(source, source.errors(config, table)) for source in sources]
     return [(source, errors) for source, errors in found if errors]
 
 
@@ -130,6 +135,17 @@ def systematic(
 ) -> dict[str, FloatArray]:
     """Add up the errors that all events of a movie share."""
     return total(contributions(config, table, mass_share, scale), len(table))
+
+
+def _of_held(name: str, shift_kda: FloatArray) -> Source:
+    """Make a source of heights or extensions that were held although particles differ in them."""
+    remedy = {
+        "heights": 'fit them: particle.height_nm = "auto", or particle.height_sd_nm',
+        "extension": "say how far particles wiggle: particle.wiggle_nm",
+    }[name]
+    return Source(
+        f"{name} of the particles", "measured", lambda *_: {"mass_kda": shift_kda}, remedy
+    )
 
 
 def _of_the_missing_record(

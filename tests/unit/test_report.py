@@ -236,10 +236,10 @@ class TestOverwrite:
 @pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
 @pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
 def test_every_mode_and_scheme_makes_a_page(mode: str, scheme: str) -> None:
-    analysis = make_analysis(21, mode, scheme=scheme, side=16)
+    analysis = make_analysis(60, mode, scheme=scheme, side=16)
     page = render_report(analysis)
     assert f"mode {mode}" in page
-    assert len(payload(page)) == (21 if mode != "track" else 3)
+    assert len(payload(page)) == (60 if mode != "track" else 6)
     assert ">nan" not in page
     for status in set(analysis.table["status"]):
         assert Status(status).value in page

@@ -66,7 +66,7 @@ def standards_of(config: Config) -> Standards:
     return Standards(
         optics=config.optics.model_copy(update=_OF_A_MOVIE),
         covariance=config.optics.covariance,
-        height_nm=config.particle.height_nm,
+        height_nm=config.particle.nominal_height_nm,
         camera=StandardsCamera(
             pixel_size_nm=camera.pixel_size_nm,
             samples_per_pixel=camera.samples_per_pixel,
@@ -102,7 +102,9 @@ def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     """Give the contrast per mass over that of standards, and why the model does not carry it."""
     config = config.model_copy(update={"calibration": None})
     reach_nm = PEAK_REACH * config.optics.wavelength_nm / config.optics.na
-    rises = forward_model(config, reach_nm).peak_contrast(config.particle.height_nm, 1e-3) > 0
+    rises = (
+        forward_model(config, reach_nm).peak_contrast(config.particle.nominal_height_nm, 1e-3) > 0
+    )
     line = Calibration(
         gradient_per_kda=1e-5 if rises else -1e-5,
         optics=standards.optics, height_nm=standards.height_nm,

@@ -129,7 +129,7 @@ class OpticsForecast:
             "events": self.events,
             "at": {
                 "mass_kda": mass,
-                "height_nm": self.config.particle.height_nm,
+                "height_nm": self.config.particle.nominal_height_nm,
                 "focus_nm": optics.focus_nm,
                 "na": optics.na,
                 "photons_per_pixel": at.photons_per_pixel,
@@ -215,7 +215,7 @@ def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
         )
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     reach = grid.diagonal_nm / 2 + pixel
-    return forward_model(config, reach, z_max_nm=config.particle.height_nm), grid
+    return forward_model(config, reach, z_max_nm=config.particle.nominal_height_nm), grid
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ class _Picture:
         at, mass = config.bounds, factor * model.material.mass_kda
         steps = grid.pixel_nm * ((np.arange(_PHASES) + 0.5) / _PHASES - 0.5)
         thetas = tuple(
-            np.array([x, y, config.particle.height_nm, model.scale.amplitude(mass), 0.0])
+            np.array([x, y, config.particle.nominal_height_nm, model.scale.amplitude(mass), 0.0])
             for y in steps
             for x in steps
         )

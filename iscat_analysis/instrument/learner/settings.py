@@ -100,5 +100,5 @@ def build_microscope(
 ) -> ForwardModel:
     """Make the forward model of other optics, with the model's own mass scale."""
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
-    highest = None if heights_free(config) else config.particle.height_nm
+    highest = None if heights_free(config) else config.particle.nominal_height_nm
     return forward_model(changed, reach_nm, z_max_nm=highest, like=like)

@@ -12,10 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis._kernels.stepping import frame_scores, one_change, projector
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding.frames import Patch
+from iscat_analysis.search.sliding.rises import find_rise, line
 
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
@@ -32,20 +34,45 @@ class StepFrame:
     height: float
     per_frame_snr: float
     p_constant: float
+    rise: int = 0
 
     @property
     def gap(self) -> int:
-        """Frames on either side of the step that may belong to the other state.
+        """Frames on either side of the step that may belong to the other state, or to neither.
 
         They stay out of the fit: where the frame was chosen by their noise, that noise would
-        count as signal.
+        count as signal, and while the light rises the contrast is not yet that of the particle.
         """
-        return _gap(self.per_frame_snr)
+        return max(_gap(self.per_frame_snr), _half(self.rise))
+
+    def kept_out(self, window: int) -> int:
+        """Frames on either side that stay out of a fit on windows of so many frames."""
+        doubtful = min(_gap(self.per_frame_snr), window // 5)
+        return max(doubtful, min(_half(self.rise), window // 2))
+
+    @property
+    def first_turn(self) -> int:
+        """First frame in which light of the new state may be there."""
+        return self.frame - self.rise // 2
+
+    @property
+    def last_turn(self) -> int:
+        """Frame from which on all of it is there."""
+        return self.frame + self.rise // 2
+
+    @property
+    def turns(self) -> NDArray[np.int64]:
+        """Frames at each of which an equal part of the light turns up."""
+        return np.arange(self.first_turn, self.last_turn + 1)
 
     @classmethod
     def undated(cls, frame: int, half_width: int) -> StepFrame:
         """Date a step as the search did, before its own frames are looked at."""
         return cls(frame, half_width, height=1.0, per_frame_snr=1.0, p_constant=1.0)
+
+
+def _half(rise: int) -> int:
+    return math.ceil(rise / 2) + 1 if rise else 0
 
 
 def _gap(per_frame_snr: float) -> int:
@@ -84,9 +111,20 @@ def locate_step(
     height = float(jump[best])
     snr = abs(height) * math.sqrt(scale)
     turn, gap = best + 1, _gap(snr)
-    sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
-    p = min(_p_constant(heights[side], weight[side]) for side in sides)
-    return StepFrame(int(frames[best]), half_width, height, snr, 1 - (1 - p) ** 2)
+    rise = find_rise(heights, weight, turn, float(log[best]))
+    if rise is None:
+        sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
+        p = min(_p_constant(heights[side], weight[side]) for side in sides)
+    else:
+        turn, height = rise.centre, rise.height
+        snr = abs(height) * math.sqrt(scale)
+        # two that land one after the other are no line, and then neither are the frames between
+        straight = heights - height * line(np.arange(heights.size), rise.frames, turn)
+        p = min(_p_constant(straight, weight), rise.p_line)
+        half_width = max(half_width, rise.frames // 2)
+    p = 1 - (1 - p) ** 2
+    frames_of_rise = 0 if rise is None else rise.frames
+    return StepFrame(patch.first + turn, half_width, height, snr, p, frames_of_rise)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:

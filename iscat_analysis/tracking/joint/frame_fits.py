@@ -105,6 +105,6 @@ def _climb(
         table, tuple(lens), (x[left:right], y[top:bottom], offsets, weights), POISSON.code, data,
         search.free, np.maximum(search.lower, start - search.reach),
         np.minimum(search.upper, start + search.reach), search.max_step, search.tolerance,
-        search.passes, theta, np.empty((5, 5)), -math.inf,
+        search.passes, theta, np.empty((5, 5)), -math.inf, (0.0, 0.0),
     )  # fmt: skip
     return value, outcome

@@ -1,0 +1,99 @@
+"""Light that goes on changing: at the place of a particle that is there, or as it comes.
+
+The light of a particle that settles, bleaches or breathes changes again and again at its place, and
+each change is found as a step of its own.  A second particle at the very place of a first one is
+rare, and cannot be told from that.
+
+Where particles take their time to settle, the rise of a faint one drowns in the noise of its
+frames: it is fitted as a step, and its mass is too small.  That is known from the bright ones.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+import scipy
+
+from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.records import BoolArray, Status
+
+SAME_NM = 150.0
+"""Distance within which two steps are at one place."""
+
+_MUCH = 3.0  # times a step's own mass that a particle must have, whose light the step may be of
+_ALIKE = 3.0  # ratio of masses up to which two steps close in time may be the halves of one
+_SEEN = 10.0  # log-likelihood by which a rise is expected to be told from a step, to be always seen
+_FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
+_NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
+
+
+def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
+    """Tell which steps of a landing movie may be changes of a particle that is there.
+
+    These are the much smaller ones while it is there, and of two alike in sign, mass and place that
+    follow each other within one window, both.
+
+    Shapes: result (rows,).
+    """
+    flagged = np.zeros(len(table), dtype=bool)
+    real = np.flatnonzero(
+        ~table["status"].isin(_NO_STEP).to_numpy() & table["mass_kda"].notna().to_numpy()
+    )
+    if real.size < 2:
+        return flagged
+    place = table[["x_nm", "y_nm"]].to_numpy(float)[real]
+    mass, frame = table["mass_kda"].to_numpy(float)[real], table["frame"].to_numpy(float)[real]
+    error = table["sigma_mass_kda"].to_numpy(float)[real]
+    window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[real]
+    for i, j in scipy.spatial.cKDTree(place).query_pairs(SAME_NM):
+        if abs(mass[i]) < abs(mass[j]):
+            i, j = j, i  # i is the larger
+        apart = abs(frame[i] - frame[j])
+        near = apart < max(window[i], window[j])
+        there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
+        gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
+        if (there or near) and not gone and abs(mass[i]) > _MUCH * abs(mass[j]):
+            flagged[real[j]] = True
+        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _ALIKE * abs(mass[j]):
+            flagged[real[[i, j]]] = True
+    return flagged
+
+
+def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
+    """Tell which steps may rise as others do, unseen; and over how many frames those rise.
+
+    Where many of those that rise go on rising after their lines, all may.
+
+    A line over r frames and the step nearest to it differ by r/12 times the squared signal-to-noise
+    ratio of one frame, of which the log-likelihood is half.
+
+    Shapes: result (rows,).
+    """
+    nothing = np.zeros(len(table), dtype=bool), 0.0
+    rise = np.nan_to_num(told.rise_frames)
+    rising = rise > 0
+    if rising.sum() < _FEWEST:
+        return nothing
+    frames = float(np.median(rise[rising]))
+    mass, crb = (table[name].to_numpy(float) for name in ("mass_kda", "crb_mass_kda"))
+    before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
+    one2 = (mass / crb) ** 2 * (before + after) / (before * after)
+    seen = np.nan_to_num(one2) * frames / 24 > _SEEN
+    if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
+        return nothing
+    goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
+    alike = rising if (goes_on & rising).sum() > _SHARE * rising.sum() else nothing[0]
+    return (~rising & ~seen) | alike, frames
+
+
+def rise_said(frames: float, unseen: int, rising: int, rows: int) -> str:
+    """Say that particles take their time; empty where none does."""
+    if not frames:
+        return ""
+    also = f"; {unseen} that may rise on unseen are flagged changing" if unseen else ""
+    return (
+        f"the light of {rising} of {rows} steps rises over some {math.ceil(frames)} frames, which "
+        f"stay out of their fits{also}"
+    )

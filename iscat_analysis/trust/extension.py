@@ -1,0 +1,172 @@
+"""Particles whose pictures are wider than a point's: they wiggle, or have parts that are apart.
+
+Three things tell the variance q of a particle's places along each axis.  The width of its pictures,
+which is weak, since a wider picture is nearly a fainter one.  Their length, for particles that lie
+at random: parts that are apart make pictures long, each its own way, and a covariance of places has
+a mean variance q at least as large as what one axis has beyond the other.  And time: particles that
+wiggle from frame to frame have positions that scatter from frame to frame by more than the noise of
+places without a particle, on the side of the step where they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.special import chdtrc, chdtri
+
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread
+from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.records import BoolArray, FloatArray, Status
+
+FEWEST = 6
+"""Events without which nothing is said of a spread that all particles have."""
+
+_SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it,
+_DOUBTFUL = 2.5  # and beyond which systematic errors have it
+_CHANCE = 1e-5  # of one event that is flagged with no spread, and of pictures of all that are long
+_MATTERS = 0.5  # of σ, by which a mass is too small before its row is flagged for that of all
+_OUTLYING = 4.0  # standard errors beyond which an event is not one of many
+_JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What all events say of the width of their pictures.
+
+    Attributes
+    ----------
+    variance_nm2, variance_se_nm2 : float
+        Mean variance of places along each axis beyond what the model has, and its error [nm²].
+    flagged : ndarray of bool
+        Rows whose masses are too small because of it.
+    mass_shift_kda : ndarray
+        What it changes of every mass [kDa].
+    """
+
+    variance_nm2: float
+    variance_se_nm2: float
+    flagged: BoolArray
+    mass_shift_kda: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        table: pd.DataFrame,
+        told: Evidence,
+        in_time: Mapping[str, EmpiricalSpread],
+        wiggle_nm: float = 0.0,
+    ) -> Extension | None:
+        """Judge the evidence of rows, beyond a wiggle that is known; None where none has any."""
+        said = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
+        q, se = told.spread_nm2, told.sigma_spread_nm2
+        known = np.isfinite(q) & np.isfinite(se) & np.isfinite(told.sigma_across_nm2)
+        if not known.any():
+            return None
+        own = known & (q > 0) & (np.nan_to_num(told.chi2_spread) > chdtri(3, _CHANCE))
+        many = good & known
+        mean, error = math.nan, math.nan
+        shift = np.zeros(len(table))
+        if many.sum() >= FEWEST:
+            mean, error = max(
+                (
+                    _mean(q[many], se[many]),
+                    _length(*(part[many] for part in told[7:10])),
+                    _wiggle(table[many], in_time, wiggle_nm),
+                ),
+                key=lambda found: found[0] / found[1],
+            )
+        if mean > _DOUBTFUL * error:
+            shift = np.abs(np.nan_to_num(told.mass_per_spread)) * mean
+        if mean > _SIGNIFICANT * error:
+            own = own | (known & (shift > _MATTERS * table["sigma_mass_kda"].to_numpy(float)))
+        return cls(mean, error, own, shift)
+
+    @property
+    def is_common(self) -> bool:
+        """Whether all particles have it."""
+        return bool(self.variance_nm2 > _SIGNIFICANT * self.variance_se_nm2)
+
+    @property
+    def message(self) -> str:
+        """What the user should know; empty where pictures are as wide as the model's."""
+        if not self.is_common:
+            return ""
+        wide = math.sqrt(self.variance_nm2)
+        error = self.variance_se_nm2 / (2 * wide)
+        return (
+            f"pictures are wider than a point's, as of particles that wiggle by {wide:.1f} ± "
+            f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
+            "apart: masses are too small, flagged extended where by more than half of σ; set "
+            "particle.wiggle_nm to it (adding squares), if all particles may move alike"
+        )
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """What ``summary.json`` says."""
+        return {
+            "variance_nm2": None if math.isnan(self.variance_nm2) else self.variance_nm2,
+            "variance_se_nm2": None if math.isnan(self.variance_se_nm2) else self.variance_se_nm2,
+            "flagged": int(self.flagged.sum()),
+        }
+
+
+def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
+    """Weighted mean and its error, without those far from the median.
+
+    Shapes: `q, se` (n,).
+    """
+    away = np.abs(q - np.median(q))
+    wide = np.sqrt((1.48 * np.median(away)) ** 2 + se**2)
+    kept = away <= _OUTLYING * wide
+    weight = se[kept] ** -2.0
+    mean = float(np.average(q[kept], weights=weight))
+    chi2_reduced = float(np.sum(weight * (q[kept] - mean) ** 2)) / max(int(kept.sum()) - 1, 1)
+    return mean, math.sqrt(max(chi2_reduced, 1.0) / float(weight.sum()))
+
+
+def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[float, float]:
+    """Least mean variance that pictures which are long, each its own way, tell of; and its error.
+
+    What all have in common is of the optics.
+
+    Shapes: `across, along, sigma` (n,).
+    """
+    parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
+    squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
+    squares = squares[squares < np.median(squares) * _OUTLYING**2]
+    n = squares.size
+    if n < FEWEST or chdtrc(2 * n - 2, squares.sum()) > _CHANCE:
+        return 0.0, 1.0
+    beyond = squares.sum() / n - 2
+    error = squares.std() / math.sqrt(n)
+    wide2 = beyond * float(np.median(sigma)) ** 2
+    # of the root of the mean square, from that of the square
+    return math.sqrt(wide2), math.sqrt(wide2) * error / (2 * beyond)
+
+
+def _wiggle(
+    table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread], known_nm: float
+) -> tuple[float, float]:
+    """Variance by which positions scatter from frame to frame beyond the noise, and its error.
+
+    Half of the frames that are compared have no particle, whose wiggle then is twice the mean.
+    """
+    before, after = table["n_before"].to_numpy(float), table["n_after"].to_numpy(float)
+    frames = before * after / np.maximum(before + after, 1.0)
+    found = []
+    for name in ("x_nm", "y_nm"):
+        spread = in_time.get(name)
+        if spread is None or spread.single or not spread.by_frames or not spread.empty:
+            return 0.0, 1.0
+        one = float(np.median(table[f"crb_{name}"].to_numpy(float) ** 2 * frames))
+        excess = spread.by_frames[0] ** 2 - spread.empty[0] ** 2
+        error = 2 * spread.by_frames[0] * spread.by_frames_se[0]
+        found.append((2 * excess * one, 2 * error * one))
+    (x, x_se), (y, y_se) = found
+    return (x + y) / 2 - known_nm**2, math.hypot(x_se, y_se) / 2

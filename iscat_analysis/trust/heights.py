@@ -1,0 +1,78 @@
+"""What a movie says of the heights of its particles, and what holding them does to masses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.config import Config
+from iscat_analysis.inference.height_spread import HeightSpread, spread_of_heights
+from iscat_analysis.inference.heights import has_prior
+from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.records import FloatArray, Status
+
+_DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
+"""Verdicts with which a height can still be read; a height that is held makes fits poor itself."""
+
+
+@dataclass(frozen=True)
+class Heights:
+    """What all events say of their heights, and what follows from it."""
+
+    spread: HeightSpread
+    held: bool
+    mass_shift_kda: FloatArray  # of every row, where heights are held and are not equal
+    learned_optics: bool
+
+    @classmethod
+    def of(
+        cls, config: Config, table: pd.DataFrame, told: Evidence, *, learned_optics: bool
+    ) -> Heights | None:
+        """Judge the evidence of every row; None where there is too little."""
+        held = not has_prior(config)
+        kinds = _DESCRIBED if held else {Status.OK.value}
+        said = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in said])
+        spread = spread_of_heights(told.z_nm[good], told.sigma_z_nm[good])
+        if spread is None:
+            return None
+        shift = np.zeros(len(table))
+        if held and spread.is_spread:
+            off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
+            shift = np.abs(np.nan_to_num(told.mass_per_z)) * off
+        return cls(spread, held, shift, learned_optics)
+
+    @property
+    def are_wrong(self) -> bool:
+        """Whether one height is held for particles that are not equally high."""
+        return self.held and self.spread.is_spread
+
+    @property
+    def message(self) -> str:
+        """What the user should know; empty where heights and errors agree."""
+        if not self.are_wrong:
+            return ""
+        return (
+            f"the particles are not equally high: {self.spread} where one height is held; their "
+            "masses are wrong by what systematic_mass_kda says, and the fits of many are poor; "
+            'particle.height_nm = "auto" learns mean and spread and fits every height'
+        )
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """What ``summary.json`` says."""
+        spread = self.spread
+        return {
+            "mean_nm": spread.mean_nm,
+            "mean_se_nm": spread.mean_se_nm,
+            "sd_nm": spread.sd_nm,
+            "sd_ci95_nm": [spread.sd_low_nm, spread.sd_high_nm],
+            "events": spread.events,
+            "held": self.held,
+            "mean_is_of_learned_optics": self.learned_optics,
+        }

@@ -1,0 +1,273 @@
+"""Heights, widths and fluctuations that a fit takes for known are seen beside it, and judged."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from iscat_analysis.config import load_config
+from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.height_spread import spread_of_heights
+from iscat_analysis.inference.noise import conditional
+from iscat_analysis.inference.nuisances import Evidence, evidence_of
+from iscat_analysis.inference.split_frames import Series, repeats_of
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.records import Candidate
+from iscat_analysis.search.sliding import Patch, locate_step
+from iscat_analysis.trust.course import at_a_shared_place, may_rise
+from iscat_analysis.trust.extension import Extension
+from iscat_analysis.trust.fluctuation import Fluctuation
+
+MASS_KDA, LIGHT_E, TRIALS, SIGMAS = 205.0, 8e6, 40, 4.0
+GRID = PixelGrid.centred(33, 84.0)
+SETTINGS = (
+    "camera.pixel_size_nm=84", "optics.na=1.42", "optics.focus_nm=-300", "optics.attenuation=1",
+    "calibration.gradient_per_kda=-3.1e-5", "particle.height_nm=5",
+)  # fmt: skip
+
+
+@cache
+def model(*settings: str) -> ForwardModel:
+    return forward_model(load_config(None, [*SETTINGS, *settings]), 4000.0)
+
+
+def seen(*, z_nm: float = 5.0, wiggle_nm: float = 0.0, apart_nm: float = 0.0) -> tuple:
+    """Fit points at 5 nm to particles that are something else; their masses and the evidence."""
+    rng, told, masses = np.random.default_rng(3), [], []
+    shown = model(f"particle.wiggle_nm={wiggle_nm}") if wiggle_nm else model()
+    for _ in range(TRIALS):
+        x, y, angle = *rng.uniform(-40, 40, 2), rng.uniform(0, math.pi)
+        dx, dy = apart_nm / 2 * math.cos(angle), apart_nm / 2 * math.sin(angle)
+        signal = sum(
+            shown.image(GRID, x + side * dx, y + side * dy, z_nm, MASS_KDA / 2) for side in (-1, 1)
+        )
+        before, after = rng.poisson(LIGHT_E, GRID.shape), rng.poisson(LIGHT_E * (1 + signal))
+        likelihood = conditional(
+            model(), GRID, before.astype(float), after.astype(float), np.ones(GRID.shape)
+        )
+        start = Candidate(0.0, 0.0, 5.0, MASS_KDA, 50.0)
+        fit = fit_particle(likelihood, start, "mass", (0.0, 1000.0), level=True)
+        masses.append(fit.mass_kda)
+        told.append(evidence_of(likelihood, fit))
+    return np.array(masses), Evidence(*np.array(told).T)
+
+
+def rows(number: int, *, sigma_kda: float = 3.0) -> pd.DataFrame:
+    return pd.DataFrame({
+        "status": "ok", "flags": "", "n_before": 80, "n_after": 80, "mass_kda": MASS_KDA,
+        "sigma_mass_kda": sigma_kda, "crb_mass_kda": sigma_kda, "crb_x_nm": 2.0, "crb_y_nm": 2.0,
+    }, index=range(number))  # fmt: skip
+
+
+# ---- evidence of one event -------------------------------------------------------------------
+
+
+def test_points_at_their_height_show_nothing() -> None:
+    _, told = seen()
+    for pull in (
+        (told.z_nm - 5) / told.sigma_z_nm,
+        told.spread_nm2 / told.sigma_spread_nm2,
+        told.across_nm2 / told.sigma_across_nm2,
+        told.along_nm2 / told.sigma_across_nm2,
+    ):
+        assert abs(pull.mean()) < SIGMAS / TRIALS**0.5
+        assert abs(pull.std() - 1) < SIGMAS / (2 * TRIALS) ** 0.5
+    assert abs(told.chi2_spread.mean() - 3) < SIGMAS * (6 / TRIALS) ** 0.5
+    assert not Extension.of(rows(TRIALS), told, {}).flagged.any()
+    heights = spread_of_heights(told.z_nm, told.sigma_z_nm)
+    assert heights is not None
+    assert not heights.is_spread
+
+
+def test_a_height_that_is_not_held_is_told_and_what_the_mass_loses() -> None:
+    masses, told = seen(z_nm=7.0)
+    assert abs(told.z_nm.mean() - 7) < SIGMAS * told.sigma_z_nm.mean() / TRIALS**0.5 + 0.3
+    # the fit of the height makes up for what the wrong one took; second order is a tenth of it
+    shift = told.mass_per_z.mean() * 2
+    assert abs(shift) < 3 * (MASS_KDA - masses.mean())
+
+
+def test_a_wiggle_is_as_wide_as_the_model_has_it() -> None:
+    masses, told = seen(wiggle_nm=35.0)
+    error = told.sigma_spread_nm2.mean() / TRIALS**0.5
+    assert abs(told.spread_nm2.mean() - 35.0**2) < SIGMAS * error
+    assert masses.mean() < 0.93 * MASS_KDA
+    mended = masses + told.mass_per_spread * 35.0**2
+    assert abs(mended.mean() / MASS_KDA - 1) < 0.03
+
+
+@pytest.mark.parametrize("apart_nm", [100.0, 200.0])
+def test_particles_in_two_halves_are_flagged(apart_nm: float) -> None:
+    masses, told = seen(apart_nm=apart_nm)
+    assert masses.mean() < 0.95 * MASS_KDA
+    judged = Extension.of(rows(TRIALS), told, {})
+    assert judged.flagged.all()
+    assert "wider than a point's" in judged.message
+
+
+# ---- heights of many -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("mean", "sd"), [(11.0, 6.0), (5.0, 1.0), (30.0, 15.0)])
+def test_mean_and_spread_of_heights_are_found_behind_the_errors(mean: float, sd: float) -> None:
+    rng = np.random.default_rng(8)
+    inside = 0
+    for _ in range(40):
+        sigma = rng.uniform(0.5, 4.0, 60)
+        z = rng.normal(mean, sd, 60) + sigma * rng.normal(size=60)
+        found = spread_of_heights(z, sigma)
+        assert abs(found.mean_nm - mean) < 4.5 * found.mean_se_nm
+        inside += found.sd_low_nm <= sd <= found.sd_high_nm
+    assert inside >= 33  # 95 % of 40 are 38; fewer than 33 come once in 2000
+
+
+def test_equal_heights_are_not_spread() -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(50):
+        sigma = rng.uniform(0.5, 4.0, 60)
+        assert not spread_of_heights(5 + sigma * rng.normal(size=60), sigma).is_spread
+
+
+# ---- places that wiggle from frame to frame ----------------------------------------------------
+
+
+def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
+    told = Evidence(
+        *np.tile([5.0, 0.5, 1.0, 0.0, 1000.0, 0.015, 3.0, 0.0, 0.0, 400.0, 0.0], (40, 1)).T
+    )
+    one = 4.0 * 40  # variance of a single frame [nm²]
+
+    def spread(excess: float) -> EmpiricalSpread:
+        return EmpiricalSpread(
+            1.0, (0.9, 1.1), 40, True, 0.0, (1.0, 2.0),
+            (math.sqrt(1 + excess), 1.0), (0.03, 0.03), (1.0, 1.0, 1.0),
+        )  # fmt: skip
+
+    moved = dict.fromkeys(("x_nm", "y_nm"), spread(15.0**2 / (2 * one)))
+    found = Extension.of(rows(40), told, moved)
+    assert found.variance_nm2 == pytest.approx(15.0**2, rel=1e-6)
+    assert found.flagged.all()
+    assert not Extension.of(rows(40), told, moved, 15.0).flagged.any()  # the model has it
+    still = Extension.of(rows(40), told, dict.fromkeys(moved, spread(0.0)))
+    assert not still.flagged.any()
+    assert not still.mass_shift_kda.any()
+
+
+# ---- light that fluctuates -------------------------------------------------------------------
+
+
+def breathing(relative: float, tau: float, number: int = 60) -> tuple:
+    """Blocks of frames of many events, and the errors of their means over those frames."""
+    rng, frames, one = np.random.default_rng(4), 80, 3.0 * math.sqrt(40)
+    repeats, errors = [], []
+    for _ in range(number):
+        noise = rng.normal(size=(2, frames)) * one
+        slow = np.empty(frames)
+        slow[0] = rng.normal()
+        for k in range(1, frames):
+            keep = math.exp(-1 / tau)
+            slow[k] = keep * slow[k - 1] + math.sqrt(1 - keep**2) * rng.normal()
+        noise[1] += MASS_KDA * relative * slow
+        errors.append(noise[1].mean() - noise[0].mean())
+        sides = (
+            Series(np.tile(side, (3, 1)), np.ones(frames), np.full(3, one**2), np.zeros(3))
+            for side in noise
+        )
+        repeats.append(repeats_of(tuple(sides)))
+    own = np.stack(repeats)[:, :, [2, -1]]
+    tiles = np.full((5, 40), 400.0)
+    achieved = {"mass_kda": pooled(own, tiles.copy(), tiles)}
+    return Fluctuation.of("mass", rows(number), repeats, achieved), np.array(errors)
+
+
+@pytest.mark.parametrize(("relative", "tau"), [(0.05, 20.0), (0.1, 5.0)])
+def test_the_error_of_a_mass_has_what_breathing_leaves_in_the_mean(
+    relative: float, tau: float
+) -> None:
+    found, errors = breathing(relative, tau)
+    assert abs(found.relative - relative) < 5 * found.relative_se
+    pull = errors / np.sqrt(9.0 + found.variance_kda2)
+    assert abs(pull.std() - 1) < 0.3
+    assert (errors / 3.0).std() > 1.4  # the control: without it, σ is too small
+
+
+def test_steady_light_does_not_fluctuate() -> None:
+    assert breathing(0.0, 20.0)[0] is None
+
+
+# ---- steps that take their time --------------------------------------------------------------
+
+
+def dated(course: np.ndarray, seed: int = 6) -> object:
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:13, :13]
+    image = -0.05 * np.exp(-((x - 6) ** 2 + (y - 6) ** 2) / 8)
+    background = 1e4 * rng.uniform(0.8, 1.2, image.shape)
+    counts = rng.poisson(background * (1 + course[:, None, None] * image)).astype("u2")
+    every = np.ones(course.size)
+    patch = Patch(
+        0, counts, every > 0, every, 1.0, 0.0, 0.0, background, np.ones(image.shape, dtype=bool)
+    )
+    return locate_step(patch, image, (50, 110))
+
+
+@pytest.mark.parametrize("rise", [12, 40])
+def test_a_rise_is_found_and_its_frames_stay_out(rise: int) -> None:
+    frames = np.arange(160)
+    found = dated(np.clip((frames - 80) / rise + 0.5, 0, 1))
+    assert abs(found.frame - 80) <= rise / 6
+    assert abs(found.rise - rise) <= rise / 3
+    assert found.kept_out(80) >= found.rise / 2
+    assert found.height == pytest.approx(1.0, abs=0.06)
+    assert found.p_constant > 1e-3
+
+
+def test_a_step_does_not_rise_and_two_steps_are_no_line() -> None:
+    frames = np.arange(160)
+    step = (frames >= 80).astype(float)
+    assert sum(dated(step, seed).rise > 0 for seed in range(40)) == 0
+    assert dated(step + 0.5 * (frames >= 104)).p_constant < 1e-3
+
+
+def test_light_that_settles_exponentially_goes_on_rising() -> None:
+    frames = np.arange(160)
+    settling = -np.expm1(-np.maximum(frames + 0.5 - 70, 0) / 15.0)
+    found = [dated(settling, seed) for seed in range(20)]
+    assert sum(one.rise > 0 for one in found) == 20
+    assert sum(one.p_constant < 1e-3 for one in found) >= 15
+    straight = [dated(np.clip((frames - 80) / 40 + 0.5, 0, 1), seed) for seed in range(20)]
+    assert sum(one.p_constant < 1e-3 for one in straight) <= 1  # the control
+
+
+# ---- places that are shared ------------------------------------------------------------------
+
+
+def test_steps_of_a_particle_that_is_there_are_told_from_others() -> None:
+    table = pd.DataFrame({
+        "x_nm": [0.0, 40.0, 900.0, 1800.0, 1820.0, 3000.0, 3010.0],
+        "y_nm": 0.0,
+        "frame": [100, 300, 310, 400, 430, 500, 700],
+        "mass_kda": [205.0, -12.0, 12.0, 100.0, 90.0, 60.0, -61.0],
+        "sigma_mass_kda": 3.0, "n_before": 80, "n_after": 80, "status": "ok",
+    })  # fmt: skip
+    assert at_a_shared_place(table).tolist() == [False, True, False, True, True, False, False]
+    table.loc[1, "frame"] = 10  # before the particle came: another one
+    assert not at_a_shared_place(table)[1]
+
+
+def test_faint_steps_may_rise_as_the_bright_ones_do() -> None:
+    table = rows(30)
+    table.loc[20:, "mass_kda"] = 40.0
+    rise = np.where(np.arange(30) < 15, 40.0, 0.0)
+    told = Evidence(*np.zeros((10, 30)), rise)
+    table["flags"] = ""
+    unseen, frames = may_rise(table, told)
+    assert frames == 40
+    assert unseen.tolist() == [False] * 20 + [True] * 10
+    few = Evidence(*np.zeros((10, 30)), np.where(np.arange(30) < 2, 40.0, 0.0))
+    assert not may_rise(table, few)[0].any()
