@@ -149,8 +149,8 @@ def _with_standards(config: Config, run: Run) -> Config:
         run.notify(
             "[calibration] does not say with what optics its standards were measured: the gradient "
             f"is taken at those of the configuration (focus {optics.focus_nm:g} nm, NA "
-            f"{optics.na:g}, height {found.particle.nominal_height_nm:g} nm); `iscat calibrate mass` "
-            "writes a line with its optics"
+            f"{optics.na:g}, height {found.particle.nominal_height_nm:g} nm); "
+            "`iscat calibrate mass` writes a line with its optics"
         )
     return found
 
