@@ -18,7 +18,7 @@ from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import budget_of
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
-from iscat_analysis.trust.systematic import contributions, total
+from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 
 def reported_rows(
@@ -28,7 +28,10 @@ def reported_rows(
     fits, config, mode = found.fits, found.scene.config, found.scene.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
-    shared = contributions(config, fits, mass_error(found.optics), found.scene.model.scale)
+    unfit = (
+        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.scene.roi_px**2)
+    )
+    shared = contributions(config, fits, unfit, found.scene.model.scale)
     columns: dict[str, pd.Series | FloatArray] = {}
     for name in fits:
         columns[name] = fits[name] * scale[name] if name in scale else fits[name]
