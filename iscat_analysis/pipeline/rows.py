@@ -26,7 +26,7 @@ from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.heights import Heights
-from iscat_analysis.trust.systematic import contributions, total
+from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,10 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    shared = contributions(config, fits, mass_error(found.optics), found.scene.model.scale, shifts)
+    unfit = (
+        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.scene.roi_px**2)
+    )
+    shared = contributions(config, fits, unfit, found.scene.model.scale, shifts)
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

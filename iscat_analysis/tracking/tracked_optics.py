@@ -39,19 +39,12 @@ from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block
 from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
 from iscat_analysis.units import count
-
-REJECTED_SHARE = 0.04
-"""Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
-that leave over less are wrong by less than masses are."""
 
 REJECTED_CHI2 = 2.0
 """Times the noise of single frames, what it leaves over too: less is seen in good movies whose
 particles meet often."""
-
-MASS_SHARE = 0.4
-"""Error of masses over what optics that are wrong leave over of the pictures: root mean square of
-eleven such microscopes, 0 to 0.97."""
 
 ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from

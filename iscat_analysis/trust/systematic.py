@@ -36,6 +36,18 @@ from iscat_analysis.trust.response import (
     standards_share,
 )
 
+REJECTED_SHARE = 0.04
+"""Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
+that leave over less are wrong by less than masses are."""
+
+MASS_SHARE = 0.4
+"""Error of masses over what optics that are wrong leave over of the pictures: root mean square of
+eleven such microscopes, 0 to 0.97."""
+
+_FEWEST_PICTURES = 8  # that tell what is left over of them
+_SPREAD = 2.0  # ratio of squared SNR, over which noise and misfit can be told apart
+_MISFIT_SIGMAS = 5.0  # by which something is left over
+_MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
 _BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _BENT_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _TOLD = 0.5  # of σ, beyond which it is told of every row
@@ -160,6 +172,32 @@ def _of_the_missing_record(
 
 def _fits_masses(config: Config) -> bool:
     return "mass_kda" in FREE_PARAMETERS[config.fit.mode]
+
+
+def misfit_error(table: pd.DataFrame, pixels: int) -> float:
+    """Say how wrong masses may be, as a share, where the model leaves something over of pictures.
+
+    What is left over beyond the noise grows as the square of the SNR; noise that is not what the
+    camera's numbers predict is the same in faint and bright pictures.  Medians of both halves tell
+    them apart.
+    """
+    judged = table["status"].isin([Status.OK.value, Status.POOR_FIT.value])
+    rows = table[judged & np.isfinite(table["chi2_reduced"]) & np.isfinite(table["snr"])]
+    if len(rows) < _FEWEST_PICTURES:
+        return 0.0
+    rows = rows.sort_values("snr")
+    power, excess = (rows["snr"] ** 2 / pixels).to_numpy(), rows["chi2_reduced"].to_numpy() - 1
+    half = len(rows) // 2
+    rise, over = float(np.median(power[half:])), float(np.median(excess[half:]))
+    error = _MEDIAN_SE * math.sqrt(2 / pixels / half)
+    faint = float(np.median(power[:half]))
+    if rise > _SPREAD * faint:
+        rise, over = rise - faint, over - float(np.median(excess[:half]))
+        error *= math.sqrt(2)
+    if over < _MISFIT_SIGMAS * error:
+        return 0.0
+    share = math.sqrt(over / rise)
+    return MASS_SHARE * share if share > REJECTED_SHARE else 0.0
 
 
 def _of_what_is_left_over(

@@ -25,7 +25,7 @@ from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.trust.budget import budget_of, explained_kda, width_warning
-from iscat_analysis.trust.systematic import contributions, systematic, total
+from iscat_analysis.trust.systematic import contributions, misfit_error, systematic, total
 
 GRADIENT, MASS, LIGHT, FRAMES = -3.1e-5, 205.0, 3e6, 100
 PIXEL_NM = 84.4
@@ -274,3 +274,21 @@ def test_a_width_that_nothing_explains_is_said() -> None:
     )
     assert width_warning([one | {"explained_kda": 4.5}], calibrated=True) == ""
     assert width_warning([one | {"width_low": 0.5}], calibrated=True) == ""
+
+
+def _pictures(share: float, noise: float, *, seed: int) -> pd.DataFrame:
+    """Invent rows of three brightnesses whose pictures the model describes but for a share."""
+    rng = np.random.default_rng(seed)
+    snr = np.repeat([19.0, 43.0, 90.0], 12)
+    expected = noise + (share * snr) ** 2 / 1024
+    chi2 = expected + np.sqrt(2 / 1024) * rng.standard_normal(snr.size)
+    return pd.DataFrame({"status": "ok", "chi2_reduced": chi2, "snr": snr})
+
+
+def test_what_is_left_over_of_pictures_is_an_error_of_masses() -> None:
+    """A focus 30 nm away left over a quarter of the pictures; masses were 4 % off."""
+    assert misfit_error(_pictures(0.26, 1.0, seed=1), 1024) == pytest.approx(0.104, rel=0.1)
+    for seed in range(200):
+        assert misfit_error(_pictures(0.0, 1.0, seed=seed), 1024) == 0.0
+        # noise that is ten per cent more than the camera's numbers say is no misfit
+        assert misfit_error(_pictures(0.0, 1.1, seed=seed), 1024) == 0.0
