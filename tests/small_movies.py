@@ -12,6 +12,9 @@ SETUP = {
     "optics.focus_nm": -300.0,
     "optics.calibrate": "never",
     "camera.pixel_size_nm": 84.4,
+    "camera.gain_e_per_adu": 1.0,  # given, so that a result's configuration is that of its movie
+    "camera.offset_adu": 0.0,
+    "camera.read_noise_e": 0.0,
     "particle.mass_kda": 900.0,
     "background.frames": (0, 30),
     "fit.frames": (30, 60),
