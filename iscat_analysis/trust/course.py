@@ -26,6 +26,7 @@ _MUCH = 3.0  # times a step's own mass that a particle must have, whose light th
 _ALIKE = 3.0  # ratio of masses up to which two steps close in time may be the halves of one
 _SEEN = 10.0  # log-likelihood by which a rise is expected to be told from a step, to be always seen
 _FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
+_SEEN_TO_GO_ON = 0.1  # share of rising steps that go on, beyond which all may; 0.002 by chance
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
@@ -84,7 +85,8 @@ def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
-    alike = rising if (goes_on & rising).sum() > _SHARE * rising.sum() else nothing[0]
+    many = (goes_on & rising).sum() >= max(_FEWEST, _SEEN_TO_GO_ON * rising.sum())
+    alike = rising if many else nothing[0]
     return (~rising & ~seen) | alike, frames
 
 

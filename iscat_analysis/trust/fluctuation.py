@@ -91,7 +91,8 @@ class Fluctuation:
         error2 = np.maximum(np.sum(left**2, axis=0) / total**2, chi2)
         expected = (strength @ counts) / total * lengths
         best = (0.0, 0.0, 1.0, 1.0)  # gain, s², its error, τ
-        for tau in _CORRELATIONS.tolist():
+        # what is slower than a window is a course, and not a fluctuation
+        for tau in _CORRELATIONS[np.median(there) >= _CORRELATIONS].tolist():
             shape = expected * np.array([_difference(int(n), tau) for n in lengths])
             known = float(np.sum(shape**2 / error2))
             s2 = float(np.sum(shape * excess / error2)) / known
