@@ -85,9 +85,14 @@ def unrecorded() -> dict[str, Any]:
 def movie(
     seen: Instrument, seed: int, *, standards: Instrument = NOMINAL, pixel_nm: float = PIXEL_NM
 ) -> tuple[np.ndarray[Any, Any], Landings]:
-    """Make a landing movie whose particles scatter as in the microscope of the standards."""
+    """Make a landing movie whose particles scatter as in the microscope of the standards.
+
+    The field of a dipole over that of the reference goes as the wavelength to the power of -3,
+    which pictures of a given peak do not have.
+    """
     truth = draw_landings(SHAPE, COUNT, seed=seed, apart_px=14.0)
     strength = Pictures(standards).per_kda / Pictures(seen).per_kda
+    strength *= (standards.wavelength_nm / seen.wavelength_nm) ** 3
     scattered = replace(truth, mass_kda=truth.mass_kda * strength)
     made = InstrumentMovie(
         seen, SHAPE, scattered, seed=seed + 1, pixel_nm=pixel_nm, gain_e_per_adu=GAIN
@@ -111,7 +116,7 @@ def other_wavelength(strength: float, seed: int) -> Case:
     """Record at a wavelength that is so many nm above what is configured."""
     seen = replace(NOMINAL, wavelength_nm=NOMINAL.wavelength_nm + strength)
     settings = unrecorded() | {"uncertainty.wavelength_nm": strength}
-    return Case(*movie(seen, seed, standards=seen), settings)
+    return Case(*movie(seen, seed), settings)
 
 
 def other_magnification(strength: float, seed: int) -> Case:

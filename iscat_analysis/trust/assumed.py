@@ -7,8 +7,9 @@ its scale is from:
 * standards that were recorded, with the same value of the input: their amplitudes shifted too, and
   D_here − D_there remains, which is nothing where all is equal;
 * standards that were recorded with another value: both shifts, independent of each other;
-* a gradient from elsewhere: a contrast per kDa that is true, where the model turns amplitudes into
-  contrasts with the wrong input: D − ∂ ln L/∂input, L the model's contrast per amplitude.
+* a gradient from elsewhere: if it is of a set-up where the input was right, D; if it is the true
+  contrast per kDa of this one, which the model turns amplitudes into with the wrong input,
+  D − ∂ ln L/∂input, L the model's contrast per amplitude.  Nobody knows which: the larger counts.
 
 Where optics were learned from pictures, with the wrong input, they are wrong as well: their shift
 is part of D, and of L where the gradient is taken at learned optics.
@@ -70,7 +71,7 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
     typical = float(np.median(np.abs(good))) if good.size else None
     here = _shift(key, config, table, sigma, typical)
     if not recorded:
-        share = abs(here - _peak_shift(key, there, table, sigma))
+        share = max(abs(here), abs(here - _peak_shift(key, there, table, sigma)))
     elif _value(key, config) == _value(key, there):
         share = abs(here - _shift(key, there, table, sigma))
     else:
