@@ -51,15 +51,10 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
             extension = Extension.of(fits, told, achieved, config.particle.wiggle_nm)
     shifts = [beside.mass_shift_kda for beside in (heights, extension) if beside is not None]
     if extension is not None:
-        fits = flagged(fits, extension.flagged, Status.EXTENDED)
+        fits = _flagged(fits, extension.flagged, Status.EXTENDED)
     course = ""
     if found.heading == "landing":
-        fits = flagged(fits, at_a_shared_place(fits), Status.CHANGING)
-        if told is not None:
-            unseen, frames = may_rise(fits, told)
-            fits = flagged(fits, unseen, Status.CHANGING)
-            rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
-            course = rise_said(frames, int(unseen.sum()), rising, len(fits))
+        fits, course = _with_courses(fits, told)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -81,7 +76,18 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     return ReportedRows(table, achieved, heights, extension, fluctuation, course)
 
 
-def flagged(fits: pd.DataFrame, which: BoolArray, flag: Status) -> pd.DataFrame:
+def _with_courses(fits: pd.DataFrame, told: Evidence | None) -> tuple[pd.DataFrame, str]:
+    """Flag steps whose light may go on changing, and say what there is of that."""
+    fits = _flagged(fits, at_a_shared_place(fits), Status.CHANGING)
+    if told is None:
+        return fits, ""
+    unseen, frames = may_rise(fits, told)
+    rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
+    said = rise_said(frames, int(unseen.sum()), rising, len(fits))
+    return _flagged(fits, unseen, Status.CHANGING), said
+
+
+def _flagged(fits: pd.DataFrame, which: BoolArray, flag: Status) -> pd.DataFrame:
     """Add a flag to rows.
 
     Shapes: `which` (rows,).
