@@ -101,6 +101,12 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
         )
         return config
     run.notify(f"{ready.movie.name}: {told}, learned from {told.events} particles")
+    if ready.summary.get("optics", {}).get("calibrated"):
+        run.tell(
+            "a common height and the focus are one number, and the focus was learned from the same "
+            f"particles: only their spread, {told.sd_nm:.1f} nm, is known, and the mean of "
+            f"{told.mean_nm:.1f} nm is where the learned optics put it"
+        )
     learned = {
         "learned_height_nm": max(round(told.mean_nm, 2), 0.0),
         "height_sd_nm": min(max(round(told.sd_nm, 2), LEAST_SD_NM), LARGEST_SD_NM),

@@ -61,12 +61,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
     course = ""
     if found.heading == "landing":
-        fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
-        if told is not None:
-            unseen, frames = may_rise(fits, told)
-            fits = flagged(fits, Status.CHANGING, unseen)
-            rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
-            course = rise_said(frames, int(unseen.sum()), rising, len(fits))
+        fits, course = _with_courses(fits, told)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -90,3 +85,14 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
         calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, course)
+
+
+def _with_courses(fits: pd.DataFrame, told: Evidence | None) -> tuple[pd.DataFrame, str]:
+    """Flag steps whose light may go on changing, and say what there is of that."""
+    fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
+    if told is None:
+        return fits, ""
+    unseen, frames = may_rise(fits, told)
+    rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
+    text = rise_said(frames, int(unseen.sum()), rising, len(fits))
+    return flagged(fits, Status.CHANGING, unseen), text
