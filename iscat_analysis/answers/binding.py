@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -26,7 +26,8 @@ from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
-from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.mass_action import Model, landing_logits
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
@@ -67,8 +68,6 @@ class Binding:
         equilibrium, their distance in standard errors, and the share of background.
     curve : pandas.DataFrame
         Of monomers and dimers: concentration_nm, complexes; empty for two partners.
-    landing_power : float
-        p of landings ∝ concentration·mass^p.
     notes : tuple of str
         What the user should know, one sentence each.
     """
@@ -77,7 +76,6 @@ class Binding:
     fit: EquilibriumFit
     samples: pd.DataFrame
     curve: pd.DataFrame
-    landing_power: float
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -99,7 +97,10 @@ class Binding:
             "inactive_p": fit.inactive_p,
             "masses_kda": fit.masses_kda,
             "width_kda": fit.width_kda,
-            "landing_power": self.landing_power,
+            "tail_kda": fit.tail_kda,
+            "limit_kda": fit.limit_kda,
+            "landing_power": fit.landing_power,
+            "landing_power_se": fit.landing_power_se,
             "chi2": fit.chi2,
             "dof": fit.dof,
             "p_value": fit.p_value,
@@ -115,7 +116,7 @@ def fit_kd(
     *,
     model: Model,
     masses_kda: Sequence[float] | None = None,
-    landing_power: float = LANDING_POWER,
+    landing_power: float | None = None,
     inactive: bool = False,
     sigma_kda: float | None = None,
     limit_kda: float | None = None,
@@ -142,10 +143,10 @@ def fit_kd(
         About the mass of the monomer, or of A and B [kDa]; fitted.  A monomer that is not given is
         taken from two peaks that the tables have at one mass and at twice that mass; a note says
         which, and there is an error where there are none.
-    landing_power : float
-        Landings are as concentration·mass^p: −1/6, the default, for diffusion out of a drop at rest
-        onto an absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that
-        takes all alike.
+    landing_power : float, optional
+        Landings are as concentration·mass^p: −1/6 for diffusion out of a drop at rest onto an
+        absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that takes all
+        alike.  Without it p is −1/6 ± 1/6, and fitted.
     inactive : bool
         Fit the part of monomers, or of A, that does not bind.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
@@ -186,7 +187,7 @@ def fit_kd(
     True
     """
     check_reaction(model, masses_kda)
-    if not -1 <= number_in("`landing_power`", landing_power) <= 1:
+    if landing_power is not None and not -1 <= number_in("`landing_power`", landing_power) <= 1:
         raise ConfigError(
             f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
         )
@@ -244,15 +245,14 @@ def fit_kd(
         complex_kda = 2 * masses[0] if model == "dimer" else sum(masses)
         refuse_far(found, [*masses, complex_kda], "`masses_kda`")
     fit = fit_equilibrium(
-        [table.events for table in found], totals, model=model, masses_kda=masses,
+        [_to_fit(table) for table in found], totals, model=model, masses_kda=masses,
         power=landing_power, inactive=inactive,
     )  # fmt: skip
     result = Binding(
         model,
         fit,
         _laid_out(rows, found, fit),
-        _curve(totals, fit, model, landing_power),
-        landing_power,
+        _curve(totals, fit, model),
         (*notes, *_notes(found, fit, totals, inactive=inactive)),
     )
     if notify is not None:
@@ -433,6 +433,11 @@ def _monomer(tables: Sequence[EventTable]) -> tuple[float, str]:
     )
 
 
+def _to_fit(table: EventTable) -> Events:
+    """Give a table's events; where only their edge tells what was missed, that is learned."""
+    return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
+
+
 def _laid_out(
     rows: pd.DataFrame, tables: Sequence[EventTable], fit: EquilibriumFit
 ) -> pd.DataFrame:
@@ -448,13 +453,14 @@ def _laid_out(
     )
 
 
-def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model, power: float) -> pd.DataFrame:
+def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model) -> pd.DataFrame:
     """Fraction of dimers among landings against the concentration."""
     if model != "dimer":
         return pd.DataFrame(columns=["concentration_nm", "complexes"])
     low, high = float(totals.min()) / 3, float(totals.max()) * 3
     grid = np.geomspace(low, high, _POINTS)[:, None]
-    logits = landing_logits(model, grid, fit.kd_nm, fit.inactive, fit.masses_kda, power)[:, 1]
+    power, masses = fit.landing_power, fit.masses_kda
+    logits = landing_logits(model, grid, fit.kd_nm, fit.inactive, masses, power)[:, 1]
     return pd.DataFrame({"concentration_nm": grid[:, 0], "complexes": 1 / (1 + np.exp(-logits))})
 
 
