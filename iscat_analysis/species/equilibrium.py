@@ -28,10 +28,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from iminuit import Minuit
-from numpy.typing import ArrayLike
 from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
@@ -103,33 +103,28 @@ def fit_equilibrium(
     free, free_value = np.array(free_fit.values), -float(free_fit.fval)
     series = _Equilibrium(tables, totals_nm, model, masses, power, inactive)
     found = series.fit(free)
-    low, high, points = _interval(found)
     best, best_value = np.array(found.values), -float(found.fval)
     chi2 = max(2 * (free_value - best_value), 0.0)
     dof = len(tables) * (series.kinds - 1) - 1 - int(inactive)
     logits, errors, complexes = _observed(free_series, free)
-    inactive_se = power_se = math.nan
     other = _Equilibrium(tables, totals_nm, model, masses, power, not inactive)
     other_value = -float(other.fit(best).fval)
     gain = max(2 * (best_value - other_value) * (1 if inactive else -1), 0.0)
-    if inactive or power is None:
-        found.hesse()
-        inactive_se = float(found.errors["inactive"]) if inactive else math.nan
-        power_se = float(found.errors["power"]) if power is None else 0.0
-    else:
-        power_se = 0.0
+    found.hesse()
+    constants = found.values.to_dict(), found.errors.to_dict()
+    low, high, points = _interval(found)
     shared, landed = series.shared(best), series.logits(best)
     predicted = _share(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
     reach = _SIGMAS * errors
     return EquilibriumFit(
-        kd_nm=math.exp(found.values["ln_kd"]),
+        kd_nm=math.exp(constants[0]["ln_kd"]),
         kd_low=low,
         kd_high=high,
-        inactive=float(found.values["inactive"]) if inactive else 0.0,
-        inactive_se=inactive_se,
+        inactive=constants[0].get("inactive", 0.0),
+        inactive_se=constants[1].get("inactive", math.nan),
         inactive_p=float(chdtrc(1, gain)) / 2,
-        landing_power=float(found.values["power"]) if power is None else power,
-        landing_power_se=power_se,
+        landing_power=constants[0].get("power", power),
+        landing_power_se=constants[1].get("power", 0.0),
         masses_kda=shared.mean,
         width_kda=math.sqrt(float(shared.variance[0])),
         tail_kda=shared.tail,
@@ -236,18 +231,22 @@ def _interval(found: Minuit) -> tuple[float, float, FloatArray]:
     """Give the interval of K_D, and points of the profile of ln K_D between its ends."""
     best, (least, most) = float(found.values["ln_kd"]), found.limits["ln_kd"]
 
-    def deviance(grid: ArrayLike) -> FloatArray:
-        heights = found.mnprofile("ln_kd", grid=np.atleast_1d(grid))[1]
-        return np.asarray(2 * np.maximum(heights - float(found.fval), 0.0))
+    top = float(found.fval)
 
-    low, high = interval(
-        lambda ln_kd: float(deviance(ln_kd)[0]), best, least, most, step=_FIRST_STEP
-    )
+    @cache
+    def deviance(ln_kd: float) -> float:
+        found.values["ln_kd"] = ln_kd
+        found.migrad()  # from where the last one ended
+        return 2 * max(float(found.fval) - top, 0.0)
+
+    found.fixed["ln_kd"] = True
+    low, high = interval(deviance, best, least, most, step=_FIRST_STEP)
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
+    points = np.column_stack([grid, [deviance(float(value)) for value in grid]])
     return (
         math.exp(low) if low > least else 0.0,
         math.exp(high) if high < most else math.inf,
-        np.column_stack([grid, deviance(grid)]),
+        points,
     )
 
 
