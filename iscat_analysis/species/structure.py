@@ -152,12 +152,13 @@ def _lightest(events: Events) -> float:
     """Give the least mass that a species may have [kDa].
 
     Below, all that is seen is a tail of noise above the threshold: lighter particles in ever
-    greater numbers explain it as well.
+    greater numbers explain it as well.  An event that was measured lower still keeps its place.
     """
+    seen = float(events.x.min())
     if events.efficiency is None:
-        return float(events.x.min())
+        return seen
     spread = math.sqrt(float(np.median(events.filter_variance)))
-    return max(events.efficiency.threshold_kda + _HARDLY_SEEN * spread, 0.0)
+    return max(min(events.efficiency.threshold_kda + _HARDLY_SEEN * spread, seen), 0.0)
 
 
 def polish(
