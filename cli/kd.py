@@ -59,7 +59,8 @@ def kd(
         typer.Option(
             "--masses",
             metavar="M | A,B",
-            help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
+            help="About the mass of the monomer, or of A and B [kDa]; fitted. Without it the monomer is "
+            "taken from peaks at one mass and its double.",
         ),
     ] = None,
     landing: Annotated[
@@ -67,8 +68,9 @@ def kd(
         typer.Option(
             "--landing",
             metavar="P",
-            help="Landings are as concentration times mass^P; default -1/6, out of a drop at rest "
-            "onto an absorbing surface; -0.333 where liquid flows, 0 where all land alike.",
+            help="Landings are as concentration times mass^P: -0.167 out of a drop at rest onto an "
+            "absorbing surface, -0.333 where liquid flows, 0 where all land alike; fitted, from "
+            "-1/6 ± 1/6, unless given.",
         ),
     ] = None,
     inactive: Annotated[
@@ -96,13 +98,12 @@ def kd(
         given = None if masses is None else numbers("--masses", masses)
 
         from iscat_analysis.answers.binding import fit_kd
-        from iscat_analysis.species.mass_action import LANDING_POWER
 
         found = fit_kd(
             samples,
             model=model.value,
             masses_kda=given,
-            landing_power=LANDING_POWER if landing is None else landing,
+            landing_power=landing,
             inactive=inactive,
             sigma_kda=sigma,
             limit_kda=middle,

@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
+from scipy.ndimage import gaussian_filter1d
+from scipy.signal import find_peaks, peak_prominences
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
@@ -23,10 +25,9 @@ from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS
-from iscat_analysis.species.choices import Ladder
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mass_action import LANDING_POWER, Model, landing_logits
+from iscat_analysis.species.mass_action import Model, landing_logits
 from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
@@ -43,7 +44,12 @@ CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
 _WRONG = 0.01  # p-value below which the model is doubted
 _FAR = 3.0  # standard errors of a table that is named
 _POINTS = 200  # of the curve
-_MOST_POOLED = 20_000
+_POSSIBLE_PEAKS_KDA = (1.0, 1e5)
+_PEAK_POINTS = 2000
+_SMOOTHING = 0.07  # of ln m: a third of what keeps peaks at m and 2 m apart
+_LEAST_PEAK = 0.05  # prominence of a peak, over the height of the highest
+_CLEAR_PEAK = 4.0  # the same in standard errors
+_NEAR_TWICE = 0.16  # of ln m: the lighter peak is shifted where much of it is missed
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +68,6 @@ class Binding:
         equilibrium, their distance in standard errors, and the share of background.
     curve : pandas.DataFrame
         Of monomers and dimers: concentration_nm, complexes; empty for two partners.
-    landing_power : float
-        p of landings ∝ concentration·mass^p.
     notes : tuple of str
         What the user should know, one sentence each.
     """
@@ -72,7 +76,6 @@ class Binding:
     fit: EquilibriumFit
     samples: pd.DataFrame
     curve: pd.DataFrame
-    landing_power: float
     notes: tuple[str, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -94,7 +97,10 @@ class Binding:
             "inactive_p": fit.inactive_p,
             "masses_kda": fit.masses_kda,
             "width_kda": fit.width_kda,
-            "landing_power": self.landing_power,
+            "tail_kda": fit.tail_kda,
+            "limit_kda": fit.limit_kda,
+            "landing_power": fit.landing_power,
+            "landing_power_se": fit.landing_power_se,
             "chi2": fit.chi2,
             "dof": fit.dof,
             "p_value": fit.p_value,
@@ -110,7 +116,7 @@ def fit_kd(
     *,
     model: Model,
     masses_kda: Sequence[float] | None = None,
-    landing_power: float = LANDING_POWER,
+    landing_power: float | None = None,
     inactive: bool = False,
     sigma_kda: float | None = None,
     limit_kda: float | None = None,
@@ -134,11 +140,13 @@ def fit_kd(
     model : {"dimer", "ab"}
         2 M ⇌ D, K_D = [M]²/[D]; or A + B ⇌ AB, K_D = [A][B]/[AB].
     masses_kda : sequence of float, optional
-        About the mass of the monomer, which is found otherwise, or of A and B [kDa]; fitted.
-    landing_power : float
-        Landings are as concentration·mass^p: −1/6, the default, for diffusion out of a drop at rest
-        onto an absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that
-        takes all alike.
+        About the mass of the monomer, or of A and B [kDa]; fitted.  A monomer that is not given is
+        taken from two peaks that the tables have at one mass and at twice that mass; a note says
+        which, and there is an error where there are none.
+    landing_power : float, optional
+        Landings are as concentration·mass^p: −1/6 for diffusion out of a drop at rest onto an
+        absorbing surface, −1/3 through a layer of liquid that flows, 0 for a surface that takes all
+        alike.  Without it p is −1/6 ± 1/6, and fitted.
     inactive : bool
         Fit the part of monomers, or of A, that does not bind.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
@@ -179,7 +187,7 @@ def fit_kd(
     True
     """
     check_reaction(model, masses_kda)
-    if not -1 <= number_in("`landing_power`", landing_power) <= 1:
+    if landing_power is not None and not -1 <= number_in("`landing_power`", landing_power) <= 1:
         raise ConfigError(
             f"`landing_power` = {landing_power:g}: must lie between -1 and 1, as in -0.167"
         )
@@ -228,20 +236,23 @@ def fit_kd(
                 f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
                 f"{LEAST_EVENTS} are needed, or leave it out of {name}"
             )
-    masses = _monomer(found) if masses_kda is None else tuple(map(float, masses_kda))
-    if masses_kda is not None:
+    if masses_kda is None:
+        monomer, taken = _monomer(found)
+        masses = (monomer,)
+        notes.append(taken)
+    else:
+        masses = tuple(map(float, masses_kda))
         complex_kda = 2 * masses[0] if model == "dimer" else sum(masses)
         refuse_far(found, [*masses, complex_kda], "`masses_kda`")
     fit = fit_equilibrium(
-        [table.events for table in found], totals, model=model, masses_kda=masses,
+        [_to_fit(table) for table in found], totals, model=model, masses_kda=masses,
         power=landing_power, inactive=inactive,
     )  # fmt: skip
     result = Binding(
         model,
         fit,
         _laid_out(rows, found, fit),
-        _curve(totals, fit, model, landing_power),
-        landing_power,
+        _curve(totals, fit, model),
         (*notes, *_notes(found, fit, totals, inactive=inactive)),
     )
     if notify is not None:
@@ -382,18 +393,49 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
 _MOVIES = (".tif", ".tiff", ".mp")
 
 
-def _monomer(tables: Sequence[EventTable]) -> tuple[float]:
-    """Find the monomer in the events of all tables."""
-    most = max(_MOST_POOLED // len(tables), LEAST_EVENTS)
-    thinned = [
-        (np.abs(table.mass_kda[::step]), table.sigma_kda[::step])
-        for table in tables
-        for step in [-(-table.mass_kda.size // most)]
+def _monomer(tables: Sequence[EventTable]) -> tuple[float, str]:
+    """Find the monomer in the events of all tables, and say what was taken.
+
+    Every table counts alike.  Two peaks of the density of ln m, one at about twice the other, are
+    monomers and dimers; of several such pairs the one with most events is taken.
+    """
+    points = np.linspace(*np.log(_POSSIBLE_PEAKS_KDA), _PEAK_POINTS)
+    step = points[1] - points[0]
+    edges = np.append(points - step / 2, points[-1] + step / 2)
+    logs = [np.log(np.abs(table.mass_kda)) for table in tables]
+    shares = [np.histogram(one, edges)[0] / one.size for one in logs]
+    density = gaussian_filter1d(np.mean(shares, axis=0), _SMOOTHING / step)
+    events = sum(one.size for one in logs)
+    # A peak of few events is noise: those under its kernel have the error of counts.
+    noise = np.sqrt(density * step / (2 * math.sqrt(math.pi) * _SMOOTHING) / events)
+    found = find_peaks(density)[0]
+    prominent = peak_prominences(density, found)[0]
+    clear = (prominent > _LEAST_PEAK * density.max()) & (prominent > _CLEAR_PEAK * noise[found])
+    masses, heights = np.exp(points[found[clear]]), density[found[clear]]
+    pairs = [
+        (heights[one] + heights[two], one, two)
+        for one in range(masses.size)
+        for two in range(one + 1, masses.size)
+        if abs(math.log(masses[two] / (2 * masses[one]))) < _NEAR_TWICE
     ]
-    mass, sigma = (np.concatenate(parts) for parts in zip(*thinned, strict=True))
-    ladder = Ladder(None)
-    found = ladder.choose(Events(mass, sigma, tables[0].efficiency))
-    return (ladder.values(found)[0],)
+    if not pairs:
+        seen = ", ".join(f"{mass:.3g}" for mass in masses) or "none"
+        raise DataError(
+            f"{tables[0].name}: which peak of the series is the monomer cannot be told: none lies "
+            f"at twice the mass of another (peaks at {seen} kDa); give `masses_kda`"
+        )
+    _, one, two = max(pairs)
+    # The dimer's peak is whole where that of the monomer may be cut by what is missed.
+    monomer = float(masses[two]) / 2
+    return monomer, (
+        f"the monomer was taken for the peak at {masses[one]:.3g} kDa, its dimer for that at "
+        f"{masses[two]:.3g} kDa; `masses_kda` names another"
+    )
+
+
+def _to_fit(table: EventTable) -> Events:
+    """Give a table's events; where only their edge tells what was missed, that is learned."""
+    return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
 
 
 def _laid_out(
@@ -411,13 +453,14 @@ def _laid_out(
     )
 
 
-def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model, power: float) -> pd.DataFrame:
+def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model) -> pd.DataFrame:
     """Fraction of dimers among landings against the concentration."""
     if model != "dimer":
         return pd.DataFrame(columns=["concentration_nm", "complexes"])
     low, high = float(totals.min()) / 3, float(totals.max()) * 3
     grid = np.geomspace(low, high, _POINTS)[:, None]
-    logits = landing_logits(model, grid, fit.kd_nm, fit.inactive, fit.masses_kda, power)[:, 1]
+    power, masses = fit.landing_power, fit.masses_kda
+    logits = landing_logits(model, grid, fit.kd_nm, fit.inactive, masses, power)[:, 1]
     return pd.DataFrame({"concentration_nm": grid[:, 0], "complexes": 1 / (1 + np.exp(-logits))})
 
 

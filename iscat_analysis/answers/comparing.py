@@ -279,7 +279,7 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
 
 def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[str]:
     """Say what the tests do not hold."""
-    notes = list(dict.fromkeys(note for table in tables for note in table.notes))
+    notes = list(dict.fromkeys(note for table in tables for note in table.remarks))
     if any(table.scale_error is not None for table in tables):
         notes.append(
             "shifts hold no error of the mass scale: samples of different calibrations may differ "

@@ -171,7 +171,7 @@ def find_species(
             f"{table.name}: holds {count(found.events, kind)}, too few for species; "
             f"{LEAST_EVENTS} are needed"
         )
-    notes = (*table.notes, *found.notes, *(() if kinetics is None else kinetics.notes))
+    notes = (*table.remarks, *found.notes, *(() if kinetics is None else kinetics.notes))
     if notify is not None:
         for note in notes:
             notify(note)

@@ -142,7 +142,7 @@ def _shares(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
 
     The errors are those of the counts, as the bootstrap has them, on the scale of log odds.
     """
-    real = [s for s in species if not s["outlier"]]
+    real = [s for s in species if not s["outlier"] and s["count_corrected"] is not None]
     came = {id(s): float(s["count_corrected"]) for s in real}
     relative = {
         id(s): ((s["count_high"] or math.nan) - (s["count_low"] or 0.0)) / (2 * _Z95 * s["count"])

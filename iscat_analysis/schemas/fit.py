@@ -335,7 +335,8 @@ class Distribution(Document):
         "which the mass's interval holds; efficiency is of particles that stay as long as the "
         "window, and every other one that stays stay_frames is found; count is of the events "
         "seen, count_corrected and fraction are of the particles that came; an outlier holds "
-        "fewer than three events, and has no fraction"
+        "fewer than three events, and has no fraction; one that is detected less than once in 20 "
+        "times is not determined, and count_corrected, fraction and interval are null"
     )
     selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
     support: Number = key("Share of simulated repetitions in which BIC chose the same number")

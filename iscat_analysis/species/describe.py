@@ -30,6 +30,10 @@ Branch = Literal["magnitude", "landing", "leaving"]
 LEAST_SPECIES = 3
 """Fewer events apart from all others are outliers and no species."""
 
+LEAST_EFFICIENCY = 0.05
+"""Of a species that is detected less often it is not determined how many particles came, nor, where
+it is free, what they weigh."""
+
 LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
@@ -46,7 +50,9 @@ the error of the mass scale, 0 where none is known, and the interval of the mass
 other one is found (NaN where the window is not known, or where it is too short for that).
 Intervals are 95 %, `fraction` and `count_corrected` are of the
 particles that came, the other counts of those that were seen; `outlier` where these are fewer than
-`LEAST_SPECIES`."""
+`LEAST_SPECIES`.  A species of less `efficiency` than `LEAST_EFFICIENCY` is not determined: the mass
+is where its events lie at the lowest, without error or interval, and what came of it is NaN, as is
+its fraction; those of the others are among the others."""
 
 _TWO_SIDED_95 = 1.959964
 _ENDS = (0.025, 0.975)
@@ -224,8 +230,12 @@ def _table(
     share = best.shares(events)
     seen = share.sum(axis=0)
     outlier = seen < LEAST_SPECIES - 0.5
+    efficiency = best.chance(events).mean(axis=0)
+    hidden = efficiency < LEAST_EFFICIENCY
+    hidden[known:] = False
     some = np.arange(best.weight.size) < known
-    some &= ~outlier | outlier[:known].all()
+    some &= ~hidden
+    some &= ~outlier | outlier[some].all()
 
     def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         if not values:
@@ -258,7 +268,7 @@ def _table(
             "count_high": count_high,
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
-            "efficiency": best.chance(events).mean(axis=0),
+            "efficiency": efficiency,
             "stay_frames": _stay(events, best, window_frames),
             "count_corrected": best.weight * best.arrived(events),
             "corrected_low": came_low,
@@ -267,6 +277,9 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
+    table.loc[hidden, ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]] = math.nan
+    if found.structure is None:
+        table.loc[hidden, ["mass_se", "mass_low", "mass_high"]] = math.nan
     if found.structure is not None:
         table["background"] = np.arange(best.weight.size) >= known
     if found.steps:
@@ -275,8 +288,8 @@ def _table(
 
 
 def _fractions(weight: FloatArray, some: BoolArray) -> FloatArray:
-    """Shares among the species; a background and outliers have none."""
-    return np.where(some, weight / weight[some].sum(), math.nan)
+    """Shares among the species; a background, outliers and what is hardly seen have none."""
+    return np.where(some, weight / max(float(weight[some].sum()), 1e-300), math.nan)
 
 
 def _ladder(
@@ -333,9 +346,15 @@ def _remarks(species: pd.DataFrame) -> list[str]:
     """Say of which species not to believe everything."""
     if "background" in species:
         species = species[~species["background"]]
+    hidden = species["efficiency"] < LEAST_EFFICIENCY
     cases = (
         (
-            species["efficiency"] < 0.5,
+            hidden,
+            f"of what lies at {{}} kDa or below fewer than {100 * LEAST_EFFICIENCY:g} % are "
+            "detected: its mass and number are not determined, and fractions are of the others",
+        ),
+        (
+            (species["efficiency"] < 0.5) & ~hidden,
             "fewer than half of the particles of {} kDa are detected: their mass and number rest "
             "on the detection model",
         ),

@@ -30,6 +30,9 @@ Model = Literal["dimer", "ab"]
 LANDING_POWER = -1 / 6
 """p of landings ∝ concentration · mass^p: diffusion from a drop at rest to an absorbing surface."""
 
+LANDING_POWER_SIGMA = 1 / 6
+"""What it may be off by: liquid that flows makes it −1/3, a surface that takes all alike 0."""
+
 COMPOSITION: dict[Model, FloatArray] = {
     "dimer": np.array([[1.0], [2.0]]),
     "ab": np.array([[1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]),

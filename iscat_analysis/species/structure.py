@@ -137,14 +137,28 @@ def maximise(
 
 
 def free_structure(events: Events, k: int) -> tuple[Structure, Limits]:
-    """Let every weight, mean and variance be free."""
+    """Let every weight and variance be free, and every mean where the detector tells of it."""
     unit = max(float(np.median(events.sigma)), 1e-9)
     top = float(events.x.max())
     full = np.eye(3 * k)[:, 1:].reshape(3, k, 3 * k - 1)
-    low = np.concatenate([np.full(k - 1, -LOGIT_REACH), np.zeros(2 * k)])
+    lightest = np.full(k, min(_lightest(events), 0.9 * top))
+    low = np.concatenate([np.full(k - 1, -LOGIT_REACH), lightest, np.zeros(k)])
     high = np.concatenate([np.full(k - 1, LOGIT_REACH), np.full(k, 1.05 * top), np.full(k, top**2)])
     scale = np.concatenate([np.ones(k - 1), np.full(k, unit), np.full(k, unit**2)])
     return Structure(full, np.zeros((3, k))), Limits(low, high, scale)
+
+
+def _lightest(events: Events) -> float:
+    """Give the least mass that a species may have [kDa].
+
+    Below, all that is seen is a tail of noise above the threshold: lighter particles in ever
+    greater numbers explain it as well.  An event that was measured lower still keeps its place.
+    """
+    seen = float(events.x.min())
+    if events.efficiency is None:
+        return seen
+    spread = math.sqrt(float(np.median(events.filter_variance)))
+    return max(min(events.efficiency.threshold_kda + _HARDLY_SEEN * spread, seen), 0.0)
 
 
 def polish(
@@ -198,5 +212,6 @@ def information(
     return np.asarray((found + found.T) / 2)
 
 
+_HARDLY_SEEN = -1.88  # standard deviations above the threshold, where 3 % are seen
 _SIZE_FLOOR = 1e-3  # of a component's share of the events
 _STEP = 0.1  # of the scale over √n, about a tenth of a standard error

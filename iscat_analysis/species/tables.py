@@ -79,11 +79,25 @@ class EventTable:
     window_frames: int | None = None
     scale_error: Callable[[FloatArray], FloatArray] | None = None
     notes: tuple[str, ...] = ()
+    edge_kda: float | None = None
+    """The lightest event, where nothing but it tells what was missed."""
 
     @property
     def events(self) -> Events:
         """Magnitudes of the masses, as fits take them."""
         return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the user should know where the edge is taken for the limit of detection."""
+        if self.edge_kda is None:
+            return self.notes
+        return (
+            *self.notes,
+            f"{self.name}: what was missed is taken to lie below the lightest event, "
+            f"{self.edge_kda:.3g} kDa; `above_kda` cuts where all are still detected, `limit_kda` "
+            "says where half are",
+        )
 
 
 def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
@@ -141,7 +155,7 @@ def event_table(
         called = name or str(events)
     table = _checked(table, called)
     found = _usable(table, called, sigma_kda)
-    efficiency, said = found.efficiency, list(found.notes)
+    efficiency = found.efficiency
     if above_kda is not None:
         found = _cut(found, above_kda)
         efficiency = _sharp(above_kda)
@@ -150,14 +164,11 @@ def event_table(
         efficiency = Efficiency(limit_kda / spread, spread)
     elif "snr" in table:
         efficiency = _from_snr(table, path)
+    edge = None
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
         efficiency = _sharp(edge * (1 - 10 * _SHARP))
-        said.append(
-            f"{called}: what was missed is taken to lie below the lightest event, {edge:.3g} kDa; "
-            "`above_kda` cuts where all are still detected, `limit_kda` says where half are"
-        )
-    return replace(found, efficiency=efficiency, notes=tuple(said))
+    return replace(found, efficiency=efficiency, edge_kda=edge)
 
 
 def filter_efficiency(good: pd.DataFrame, threshold_snr: float) -> Efficiency | None:

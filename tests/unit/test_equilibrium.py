@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from event_tables import draw_series
-from scipy.optimize import approx_fprime, brentq
+from scipy.optimize import brentq
+from scipy.stats import exponnorm
 
 import iscat_analysis as ia
 from iscat_analysis._kernels.mixture import mixture_score
+from iscat_analysis._kernels.tailed_mixture import _peak
 from iscat_analysis.day.table import read_table
 from iscat_analysis.species import Efficiency
-from iscat_analysis.species.equilibrium import _Series
+from iscat_analysis.species.equilibrium import _Equilibrium
 from iscat_analysis.species.mass_action import (
     COMPOSITION,
     LANDING_POWER,
@@ -23,6 +26,8 @@ from iscat_analysis.species.mass_action import (
     at_equilibrium,
     landing_logits,
 )
+from iscat_analysis.species.events import Events
+from iscat_analysis.species.series import Free, Series
 from iscat_analysis.species.tables import event_table
 
 EFFICIENCY = Efficiency(5.0, 13.0)
@@ -61,19 +66,36 @@ def test_landings_follow_the_power() -> None:
 
 
 @pytest.mark.parametrize("model", ["dimer", "ab"])
-@pytest.mark.parametrize("inactive", [False, True])
-def test_the_likelihood_has_the_slope_that_differences_give(model: Model, inactive: bool) -> None:
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("weights", ["free", "equilibrium"])
+def test_the_likelihood_has_the_slope_that_differences_give(
+    model: Model, known: bool, weights: str
+) -> None:
     random = np.random.default_rng(5)
     samples, masses = (DIMER, [66.0]) if model == "dimer" else (PARTNERS[:3], [80.0, 150.0])
     totals = samples.to_numpy(float)
     tables = draw_series(random, model, totals, 10.0, masses, number=150, efficiency=EFFICIENCY)
     events = [event_table(table).events for table in tables]
-    series = _Series(events, totals, model, np.array(masses), -0.2, inactive)
-    theta = np.concatenate([series.first, [2.0], [0.1]])[: series.linear + series.constants]
-    value, slope = series.value(theta)
-    numerical = approx_fprime(theta, lambda t: series.value(t)[0], 1e-6)
+    if not known:  # neither the errors nor what was missed
+        events = [Events(one.x, np.ones(one.x.size), None) for one in events]
+    series: Series = (
+        Free(events, COMPOSITION[model], np.array(masses))
+        if weights == "free"
+        else _Equilibrium(events, totals, model, np.array(masses), None, True)
+    )
+    theta = series.first + 0.02 * series.scale * random.normal(size=series.first.size)
+    value, slope = series.height(theta)
+    steps = np.diag(1e-4 * series.scale)
+    numerical = [(series.height(theta + h)[0] - series.height(theta - h)[0]) / 2e-4 for h in steps]
     assert np.isfinite(value)
-    assert np.allclose(slope, numerical, rtol=2e-3, atol=0.05)
+    assert slope * series.scale == pytest.approx(np.array(numerical), rel=1e-5, abs=1e-4)
+
+
+@pytest.mark.parametrize("tail", [0.01, 0.3, 2.0, 12.0, -12.0])
+def test_a_peak_with_a_tail_is_the_exponentially_modified_normal(tail: float) -> None:
+    d, width = np.linspace(-25.0, 60.0, 30), 9.0
+    own = [_peak(math.copysign(1, tail) * one, width**2, tail)[0] for one in d]
+    assert own == pytest.approx(exponnorm.pdf(d, abs(tail) / width, 0, width), rel=1e-6, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +141,9 @@ def test_parameters_that_are_no_numbers_have_no_likelihood() -> None:
 
 
 def test_landings_that_are_taken_alike_change_kd(dimers) -> None:
-    right = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0]).fit
+    right = ia.fit_kd(
+        DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=LANDING_POWER
+    ).fit
     alike = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=0.0).fit
     assert alike.kd_nm > 1.1 * right.kd_nm
 
