@@ -75,7 +75,7 @@ class SidelobeFilter:
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
-        share = _RESIDUE if on_top else _RINGS
+        share = _RESIDUE if on_top else 0.0 if step.is_measured else _RINGS
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:

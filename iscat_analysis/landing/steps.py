@@ -27,6 +27,7 @@ from iscat_analysis.inference.fit import (
     search_box,
     start_theta,
 )
+from iscat_analysis.landing.measured_images import with_measured_images
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
@@ -134,7 +135,10 @@ class ChunkFitter:
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
-            steps = credible
+            steps = with_measured_images(
+                credible, self._neighbours.of(credible)[0], self._chunk, self._neighbours,
+                self._window, self._scene.templates.threshold, self._roi_px,
+            ) if credible else []  # fmt: skip
         del maps  # fits need their memory
         if not steps:
             return []
