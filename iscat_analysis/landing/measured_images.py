@@ -1,7 +1,8 @@
 """The picture of a bright step as the movie shows it, where the model does not describe it.
 
 A vesicle or an aggregate is no point, and what the model leaves over of it hides what lands in the
-same frames all over the field.  Such a step is taken off with a picture of its own: the contrast
+same frames, all over the field: each peak of it may be a particle with lobes of its own, for which
+fainter ones wait.  Such a step is taken off with a picture of its own: the contrast
 between the frames with and without it, averaged along rings around its centre of symmetry,
 
     C(r, φ) = Σ_k h_k(φ) c_k(r),    h = 1, cos φ, sin φ, cos 2φ, sin 2φ,
@@ -17,16 +18,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import scipy.sparse.linalg
 from scipy import fft, sparse
+from scipy.sparse.linalg import spsolve
 
 from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.regions import Region
-from iscat_analysis.landing.neighbours import Neighbours, Step
+from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.peaks import summits
-from iscat_analysis.search.residue import chi2_excess
-from iscat_analysis.search.sliding import Chunk
+from iscat_analysis.search.residue import RINGS, chi2_excess
+from iscat_analysis.search.sliding import STRIDES, Chunk
 from iscat_analysis.search.templates import FAR_LOBE
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
@@ -45,16 +46,35 @@ def with_measured_images(
     threshold: float,
     roi_px: int,
 ) -> list[Step]:
-    """Give those steps their measured pictures whose misfit hides others all over the field."""
+    """Give those steps their measured pictures of which what is left over could hide others.
+
+    Two lobes of one picture that the model does not describe may both have been taken for steps:
+    the weaker one is left out.
+    """
+    least = threshold / RINGS, (threshold / FAR_LOBE) ** 2
+    chosen: list[int] = []
+    lobes: set[int] = set()
+    for i in sorted(range(len(steps)), key=lambda i: -steps[i].start.snr):
+        step = steps[i]
+        if not (step.is_measured or step.start.snr > least[0] or step.excess > least[1]):
+            continue
+        middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], window, roi_px)), None)
+        if middle is None:
+            chosen.append(i)
+        elif not middle.is_measured:
+            lobes.add(i)
     told = list(steps)
-    least = (threshold / FAR_LOBE) ** 2
-    chosen = [i for i, step in enumerate(steps) if step.is_measured or step.excess > least]
-    chosen.sort(key=lambda i: -steps[i].start.snr)
     for _ in range(_PASSES):
         for i in chosen:
-            others = [told[k] for k in near[i]]
+            others = [told[k] for k in near[i] if k not in lobes]
             told[i] = _measured(told[i], others, chunk, neighbours, window, roi_px)
-    return told
+    return [step for i, step in enumerate(told) if i not in lobes]
+
+
+def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
+    """Whether a step lies in the middle of the picture of a brighter one, and at its time."""
+    near = distance_px(step, brighter) < 2 * _WANDER * roi_px
+    return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
 
 
 def _measured(
@@ -98,7 +118,9 @@ def _measured(
     return replace(step, image=image, slopes=slopes, excess=excess, is_measured=True)
 
 
-def _centre(signal: FloatArray, place: tuple[float, float], wander_px: float) -> tuple[float, float]:
+def _centre(
+    signal: FloatArray, place: tuple[float, float], wander_px: float
+) -> tuple[float, float]:
     """Find the point about which a picture is symmetric, near a place.
 
     Rings of even order look the same from the other side: the picture convolved with itself is
@@ -150,7 +172,7 @@ def ring_average(
     image = np.zeros(value.size)
     for _ in range(_FITS):
         normal = design.T @ sparse.diags(kept) @ design + ridge
-        image = design @ sparse.linalg.spsolve(normal.tocsc(), design.T @ (kept * value))
+        image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
         off = np.abs(value - image) * accuracy
         scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
         kept = accuracy**2 * np.minimum(1.0, _OUTLIER * scale / np.maximum(off, 1e-9)) ** 2

@@ -10,6 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.drift import Trajectory, measure_drift
+from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
 from iscat_analysis.search.empty import EmptySpread
 
@@ -41,6 +42,7 @@ class Done:
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
     cause: str = ""  # what the model probably has wrong
     empty: EmptySpread | None = None  # noise where nothing lands or leaves
+    searched: Searched | None = None  # share of the field at each boundary
 
 
 class Merged:
@@ -114,6 +116,10 @@ class Merged:
                 views.append(view if number < CLIPS else replace(view, clip=None))
         rows = make_rows(table.iloc[order], event=range(len(order)))
         return rows, tuple(views), tuple(repeats)
+
+    def searched(self) -> Searched:
+        """Which part of field and time was searched."""
+        return Searched.joined([d.searched for d in self._done if d.searched is not None])
 
     def light(self) -> FloatArray:
         """Light of the frames that are done; NaN where one was left out."""

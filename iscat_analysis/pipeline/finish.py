@@ -137,7 +137,8 @@ def gather(
         tracks=tracks,
         films=films,
     )
-    return replace(analysis, summary=summary | species_of(scene, table))
+    searched = found.summary.get("searched_share") if found.summary else None
+    return replace(analysis, summary=summary | species_of(scene, table, searched))
 
 
 def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

@@ -240,6 +240,7 @@ def _table(
     count_low, count_high = interval([r.count for r in repeats])
     came_low, came_high = interval([r.corrected for r in repeats])
     means = np.array([r.mixture.mean for r in repeats])
+    searched = events.efficiency.searched if events.efficiency else 1.0
     table = pd.DataFrame(
         {
             "mass_kda": best.mean,
@@ -258,11 +259,11 @@ def _table(
             "count_high": count_high,
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
-            "efficiency": best.chance(events).mean(axis=0),
+            "efficiency": searched * best.chance(events).mean(axis=0),
             "stay_frames": _stay(events, best, window_frames),
-            "count_corrected": best.weight * best.arrived(events),
-            "corrected_low": came_low,
-            "corrected_high": came_high,
+            "count_corrected": best.weight * best.arrived(events) / searched,
+            "corrected_low": came_low / searched,
+            "corrected_high": came_high / searched,
             "outlier": outlier,
         },
         columns=list(SPECIES_COLUMNS),
