@@ -28,7 +28,7 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.search.peaks import summits
 from iscat_analysis.search.residue import RINGS, chi2_excess
 from iscat_analysis.search.sliding import STRIDES, Chunk
-from iscat_analysis.search.templates import FAR_LOBE
+from iscat_analysis.search.templates import SIDELOBE
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
 _OUTLIER = 3.0  # standard deviations from which a pixel counts less
@@ -51,12 +51,11 @@ def with_measured_images(
     Two lobes of one picture that the model does not describe may both have been taken for steps:
     the weaker one is left out.
     """
-    least = threshold / RINGS, (threshold / FAR_LOBE) ** 2
     chosen: list[int] = []
     lobes: set[int] = set()
     for i in sorted(range(len(steps)), key=lambda i: -steps[i].start.snr):
         step = steps[i]
-        if not (step.is_measured or step.start.snr > least[0] or step.excess > least[1]):
+        if not (step.is_measured or _hides_others(step, threshold)):
             continue
         middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], window, roi_px)), None)
         if middle is None:
@@ -69,6 +68,13 @@ def with_measured_images(
             others = [told[k] for k in near[i] if k not in lobes]
             told[i] = _measured(told[i], others, chunk, neighbours, window, roi_px)
     return [step for i, step in enumerate(told) if i not in lobes]
+
+
+def _hides_others(step: Step, threshold: float) -> bool:
+    """Whether a small error of the model, or all of a picture that it does not describe, does."""
+    if RINGS * step.start.snr > threshold:
+        return True
+    return step.excess > max(step.snr**2, (threshold / SIDELOBE) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:

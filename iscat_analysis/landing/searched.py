@@ -86,15 +86,13 @@ def searched_shares(
     snr, effective = maps
     stride = int(chunk.edges[1] - chunk.edges[0])
     frames = chunk.first + chunk.edges[1:-1]
-    own = np.flatnonzero((frames >= core[0]) & (frames < core[1]))
+    lit = effective > 0  # frames that were left out are told by themselves
+    own = np.flatnonzero((frames >= core[0]) & (frames < core[1]) & lit)
     high = [peak for peak in peaks if SIDELOBE * abs(peak.snr) > threshold]
     bright = [step for step in steps if step.is_measured]
     shares = np.ones((own.size, LEVELS.size))
     masked = 1 - float(chunk.usable.mean())
     for row, j in enumerate(own.tolist()):
-        if not effective[j] > 0:
-            shares[row] = 0.0
-            continue
         reach = (STRIDES + 1) * stride
         now = int(frames[j])
         near = [step for step in bright if abs(step.at.frame - now) <= reach]

@@ -48,7 +48,7 @@ from iscat_analysis.search.sliding import (
 )
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
-ROUNDS = 6
+ROUNDS = 10
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
