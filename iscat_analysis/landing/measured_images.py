@@ -28,12 +28,12 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.search.peaks import summits
 from iscat_analysis.search.residue import RINGS, chi2_excess
 from iscat_analysis.search.sliding import STRIDES, Chunk
-from iscat_analysis.search.templates import SIDELOBE
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
 _OUTLIER = 3.0  # standard deviations from which a pixel counts less
 _FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
+_LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
 _WANDER = 0.35  # of a region, that the centre may lie from where the model's fit found it
 
 
@@ -53,7 +53,9 @@ def with_measured_images(
     """
     chosen: list[int] = []
     lobes: set[int] = set()
-    for i in sorted(range(len(steps)), key=lambda i: -steps[i].start.snr):
+    # those that are measured come first, then those of which the model leaves over most
+    order = [(not s.is_measured, -s.excess, -s.start.snr, i) for i, s in enumerate(steps)]
+    for *_, i in sorted(order):
         step = steps[i]
         if not (step.is_measured or _hides_others(step, threshold)):
             continue
@@ -74,7 +76,7 @@ def _hides_others(step: Step, threshold: float) -> bool:
     """Whether a small error of the model, or all of a picture that it does not describe, does."""
     if RINGS * step.start.snr > threshold:
         return True
-    return step.excess > max(step.snr**2, (threshold / SIDELOBE) ** 2)
+    return step.excess > max(step.snr**2, (threshold / _LEFT) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:

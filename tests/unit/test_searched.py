@@ -44,7 +44,10 @@ def _vesicle(frame: int, x_px: float, y_px: float, mass_kda: float) -> list[dict
     x, y = (RADIUS_NM / PIXEL_NM * np.sin(polar) * f(angle) for f in (np.cos, np.sin))
     z = RADIUS_NM * (1 + np.cos(polar)) + 5.0
     return [
-        {"frame": frame, "x_px": x_px + dx, "y_px": y_px + dy, "z_nm": h, "mass_kda": mass_kda / POINTS}
+        {
+            "frame": frame, "x_px": x_px + dx, "y_px": y_px + dy, "z_nm": h,
+            "mass_kda": mass_kda / POINTS,
+        }
         for dx, dy, h in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)
     ]  # fmt: skip
 
@@ -107,7 +110,7 @@ def _recovered(table: pd.DataFrame) -> int:
 
 def _false(table: pd.DataFrame) -> int:
     """Count rows far from the vesicle that are no protein."""
-    frame, x, y, _ = VESICLE
+    x, y = VESICLE[1:3]
     far = np.hypot(table["x_px"] - x, table["y_px"] - y) > AWAY_PX
     return int(far.sum()) - _recovered(table)
 
