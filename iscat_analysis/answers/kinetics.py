@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ RADIUS_PX = 1.5
 """Farthest that landing and leaving of one particle may lie apart [px]."""
 
 _CHANCE = 0.1  # part of the pairs
+_SEARCHED = 0.95  # share of field and time below which it is said
 
 
 @dataclass(frozen=True)
@@ -101,7 +102,8 @@ def fit_kinetics(
     Notes
     -----
     A leaving is seen as often as a landing of its mass (the table's efficiency), and stays shorter
-    than the window of the search are left out of both counts.
+    than the window of the search are left out of both counts.  The rate of landing is that over the
+    share of field and time that was searched (``landing.searched_share`` of the summary).
 
     Examples
     --------
@@ -134,8 +136,21 @@ def fit_kinetics(
     landing = landing_rate(
         (frame[lands] - start + 0.5) / frame_rate_hz, (stop - start) / frame_rate_hz
     )
-    unbinding = _unbinding(table, inside, stop, frame_rate_hz, radius_px)
     notes = []
+    searched = table.efficiency.searched if table.efficiency else 1.0
+    if searched < 1:
+        landing = replace(
+            landing,
+            per_second=landing.per_second / searched,
+            per_second_low=landing.per_second_low / searched,
+            per_second_high=landing.per_second_high / searched,
+        )
+    if searched < _SEARCHED:
+        notes.append(
+            f"{searched:.0%} of field and time were searched, and the rate of landing is for all "
+            "of it"
+        )
+    unbinding = _unbinding(table, inside, stop, frame_rate_hz, radius_px)
     if landing.p_value < 0.01:
         notes.append(
             f"landings are not as an exponential depletion has them (p = {landing.p_value:.1g}): "

@@ -21,6 +21,7 @@ from iscat_analysis.instrument.learner import (
     Settings,
     first_step,
     maximise,
+    prior_range,
 )
 from iscat_analysis.instrument.learner.starts import with_masses
 from iscat_analysis.instrument.microscope import calibrate_sights, microscopes
@@ -53,6 +54,12 @@ class FocusDrift(NamedTuple):
         return abs(self.nm) > MOVES * self.sigma_nm and abs(self._rise_nm) > LEAST_RISE_NM
 
     @property
+    def is_plausible(self) -> bool:
+        """Whether a focus can move so far; pictures that no focus describes ask for anything."""
+        farthest = prior_range("focus_nm")
+        return abs(self.nm) < prior_range(FOCUS_DRIFT) and abs(self._rise_nm) < farthest
+
+    @property
     def said(self) -> str:
         """Say so, to first order."""
         return f"the focus moves by about {self._rise_nm:+.0f} nm over the movie"
@@ -80,7 +87,8 @@ def focus_drift(
     build = microscopes(config, max(map(reach_nm, sights)))
     names = ("focus_nm", FOCUS_DRIFT)
     step, covariance = first_step(seen, build, {**settings, FOCUS_DRIFT: 0.0}, names, mapper)
-    return FocusDrift(float(step[1]), math.sqrt(covariance[1, 1]), frames)
+    drift = FocusDrift(float(step[1]), math.sqrt(covariance[1, 1]), frames)
+    return drift if drift.is_plausible else STEADY
 
 
 def learned_with_drift(

@@ -63,6 +63,9 @@ TESTED = 24
 """Particles on which optics are tested, the brightest."""
 
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
+_STANDS_OUT = 5.0
+"""Times the median signal-to-noise ratio of the bright particles from which one is no standard."""
+
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
@@ -137,7 +140,7 @@ def landing_sights(
         if len(bright) >= enough and not whole:
             break
     bright.sort(key=lambda step: -step.snr)
-    unique = _without_repeats(bright)
+    unique = _standards(_without_repeats(bright))
     others = _without_repeats(rest)
     model = build_microscope(config, 1000.0, settings_of(config))
     sights = [
@@ -166,6 +169,15 @@ def _neighbours(
         if shares[1] > shares[0]:
             found.append((number, shares[1] - shares[0]))
     return tuple(found)
+
+
+def _standards(bright: Sequence[BrightStep]) -> list[BrightStep]:
+    """Leave out what is far brighter than the others: a vesicle or an aggregate is no point.
+
+    A few of these would outweigh all particles, as the square of the brightness.
+    """
+    middle = float(np.median([step.snr for step in bright])) if bright else 0.0
+    return [step for step in bright if step.snr <= _STANDS_OUT * middle]
 
 
 def _without_repeats(steps: Iterable[BrightStep]) -> list[BrightStep]:

@@ -7,6 +7,7 @@ import numpy as np
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.landing.merging import Done
+from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.empty import EmptySpread
 
@@ -36,6 +37,7 @@ class Store(Checkpoint):
                 ends_e=data["ends_e"],
                 trajectory=_trajectory(data["trajectory"]),
                 cause=str(data["cause"]),
+                searched=Searched(data["searched_frames"], data["searched_shares"]),
                 empty=_empty(data["squares"], data["number"], data["shared"]),
             )
         except (ValueError, KeyError):
@@ -43,7 +45,10 @@ class Store(Checkpoint):
 
     def save(self, number: int, done: Done) -> None:
         """Keep a finished chunk."""
+        searched = done.searched or Searched.joined(())
         arrays = {
+            "searched_frames": searched.frames,
+            "searched_shares": searched.shares,
             "core": np.array(done.core),
             "repeats": done.repeats,
             "evidence": done.evidence,

@@ -95,7 +95,7 @@ def analyse_chunk(
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
     fitter = ChunkFitter(scene, still, window, pool, pattern, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
-    steps = fitter.run((core[0] - seam, core[1] + seam))
+    steps = fitter.run((core[0] - seam, core[1] + seam), core)
     events = [step.event for step in steps]
     chains: dict[int, PosteriorResult] = {}
     stopped = False
@@ -132,6 +132,7 @@ def analyse_chunk(
         trajectory=pattern.trajectory if pattern else None,
         cause=misfit_warning(scene.config, events),
         empty=fitter.empty,
+        searched=fitter.searched,
     )
 
 

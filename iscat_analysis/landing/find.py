@@ -34,6 +34,7 @@ from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
 from iscat_analysis.landing.merging import Done, Merged
 from iscat_analysis.landing.odd_frames import frame_warnings
+from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
@@ -202,6 +203,9 @@ def analyse_landings(
     wanted = config.background.follows_pattern
     for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
         tell(text)
+    searched = merged.searched().summary(_median_snr(fits), scene.templates.threshold, stride)
+    if text := searched_warning(movie.name, searched):
+        tell(text)
     if merged.cause:
         tell(f"{movie.name}: {merged.cause}")
     if not config.background.power_normalization:
@@ -218,6 +222,7 @@ def analyse_landings(
         "noise_frames": list(opening.curve.frames),
         "noise_variance_over_shot": list(opening.curve.variance_over_shot),
         "noise_spectrum": noise.summary,
+        **searched,
         "frames_left_out": merged.left_out(),
         "drift_px": drift,
         **_way(merged.trajectory()),
@@ -272,6 +277,12 @@ def _finished(
             merged.add(waiting.pop(ready))
             ready += 1
         yield frames, done.stopped
+
+
+def _median_snr(table: pd.DataFrame) -> float:
+    """Give the signal-to-noise ratio of the particle in the middle; 0 where there is none."""
+    good = table["snr"][table["status"] == Status.OK] if len(table) else []
+    return float(np.median(good)) if len(good) else 0.0
 
 
 def _counted(table: pd.DataFrame) -> dict[str, int]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.drift import Trajectory, measure_drift
 from iscat_analysis.inference.nuisances import NOTHING
+from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
 from iscat_analysis.search.empty import EmptySpread
 
@@ -45,6 +46,7 @@ class Done:
     evidence: FloatArray = field(
         default_factory=lambda: np.empty((0, len(NOTHING)))
     )  # of every row
+    searched: Searched | None = None  # share of the field at each boundary
 
 
 class Merged:
@@ -121,6 +123,10 @@ class Merged:
         self.evidence = np.array(told).reshape(-1, len(NOTHING))
         rows = make_rows(table.iloc[order], event=range(len(order)))
         return rows, tuple(views), tuple(repeats)
+
+    def searched(self) -> Searched:
+        """Which part of field and time was searched."""
+        return Searched.joined([d.searched for d in self._done if d.searched is not None])
 
     def light(self) -> FloatArray:
         """Light of the frames that are done; NaN where one was left out."""

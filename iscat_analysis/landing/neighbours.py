@@ -48,6 +48,7 @@ class Step:
     theta: FloatArray | None = None
     snr: float = math.inf
     excess: float = 0.0
+    is_measured: bool = False  # its image is the movie's, and not the model's
 
 
 class Neighbours:
@@ -178,7 +179,7 @@ class Neighbours:
         A weak one has the same image, its own, at all times.
         """
         strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
-        if strong or self._pattern is not None:
+        if strong or step.is_measured or self._pattern is not None:
             return self.factor(step, before, after) - 1, 1.0
         return step.image, self.presence(step, after) - self.presence(step, before)
 

@@ -14,12 +14,11 @@ import numpy as np
 
 from iscat_analysis._kernels.sliding import in_shadow
 from iscat_analysis.landing.neighbours import Step
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden, size_on_ring
+from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, RINGS, is_hidden, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
 
 _RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
-_RINGS = 0.04  # the same for the rest of its region
 
 
 @dataclass(frozen=True)
@@ -75,7 +74,7 @@ class SidelobeFilter:
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
-        share = _RESIDUE if on_top else _RINGS
+        share = _RESIDUE if on_top else 0.0 if step.is_measured else RINGS
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:

@@ -27,7 +27,9 @@ from iscat_analysis.inference.fit import (
     search_box,
     start_theta,
 )
+from iscat_analysis.landing.measured_images import with_measured_images
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
+from iscat_analysis.landing.searched import Searched, searched_shares
 from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
 from iscat_analysis.landing.step_maps import StepMaps
@@ -38,6 +40,7 @@ from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.residue import chi2_excess
 from iscat_analysis.search.sliding import (
     Chunk,
+    MapArray,
     Peak,
     StepFrame,
     find_steps,
@@ -45,7 +48,7 @@ from iscat_analysis.search.sliding import (
 )
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
-ROUNDS = 6
+ROUNDS = 10
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
@@ -98,11 +101,13 @@ class ChunkFitter:
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._sieve = SidelobeFilter(chunk.first, self._stride, window, scene.roi_px)
         self._doubtful: list[Peak] = []
+        self._last: tuple[list[Peak], tuple[MapArray, FloatArray]] | None = None
         self.strongest = np.zeros((2, *chunk.shape))
         self.rounds = 0
+        self.searched: Searched | None = None
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
-    def run(self, keep: tuple[int, int]) -> list[StepEvent]:
+    def run(self, keep: tuple[int, int], core: tuple[int, int] | None = None) -> list[StepEvent]:
         """Find and fit every step."""
         templates = self._scene.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
@@ -135,7 +140,16 @@ class ChunkFitter:
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
-            steps = credible
+            steps = with_measured_images(
+                credible, self._neighbours.of(credible)[0], self._chunk, self._neighbours,
+                self._window, self._scene.templates.threshold, self._roi_px,
+            ) if credible else []  # fmt: skip
+        if core is not None and self._last is not None:
+            self.searched = searched_shares(
+                self._chunk, core, steps, *self._last,
+                window=self._window, roi_px=self._roi_px, threshold=self._scene.templates.threshold,
+            )  # fmt: skip
+        self._last = None
         del maps  # fits need their memory
         if not steps:
             return []
@@ -194,6 +208,7 @@ class ChunkFitter:
             len(peaks), scene.templates, self._excess_noise,
             images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
         )  # fmt: skip
+        self._last = peaks, (snr, effective)
         fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
         return [self._begin(peak) for peak in fresh]
 
@@ -278,7 +293,12 @@ class ChunkFitter:
             mass_kda=float(likelihood.model.scale.mass(theta[3])),
         )
         excess = chi2_excess(likelihood.residuals(theta))
-        return self._neighbours.draw(step.sign, task.at, start, theta=theta, snr=snr, excess=excess)
+        moved = self._neighbours.draw(
+            step.sign, task.at, start, theta=theta, snr=snr, excess=excess
+        )
+        if not step.is_measured:
+            return moved
+        return replace(step, at=moved.at, start=moved.start, theta=theta, snr=snr)
 
     @property
     def _quick_mode(self) -> str:

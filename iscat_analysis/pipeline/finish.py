@@ -171,7 +171,8 @@ def gather(
         films=films,
         response=ready.response.table if ready.response is not None else None,
     )
-    described = species_of(scene, table)
+    searched = found.summary.get("searched_share") if found.summary else None
+    described = species_of(scene, table, searched)
     explained = {"explained_kda": explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
     wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)

@@ -191,6 +191,7 @@ def inject_and_recover(
         window,
         sign=reported_steps(result.scene),
         threshold=result.scene.templates.threshold,
+        searched=again.summary["searched_share"],
     )
 
 
@@ -245,6 +246,7 @@ def recovery(
     *,
     sign: int = 0,
     threshold: float | None = None,
+    searched: float | None = None,
 ) -> dict[str, Any]:
     """Compare what was found with what was added."""
     steps = [(p.frame, 1, p) for p in particles]
@@ -286,7 +288,7 @@ def recovery(
     if threshold is not None and rows and np.isfinite(bounds).any():
         sigma = float(np.nanmedian(bounds))
         powers = [power_searched(p.mass_kda / sigma, threshold) for *_, p in rows]
-        result["predicted"] = float(np.mean(powers))
+        result["predicted"] = (searched or 1.0) * float(np.mean(powers))
     if len(chosen) < 2:
         return result
     index = [best for best, _, _ in chosen]

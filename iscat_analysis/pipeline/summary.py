@@ -92,9 +92,10 @@ def _carried(scene: Scene) -> dict[str, Any]:
     }
 
 
-def species_of(scene: Scene, table: pd.DataFrame) -> dict[str, Any]:
-    """Describe the species of all events."""
-    distribution = _distribution(scene, table[table["status"] == Status.OK])
+def species_of(scene: Scene, table: pd.DataFrame, searched: float | None = None) -> dict[str, Any]:
+    """Describe the species of all events, of which so large a share could be seen."""
+    good = table[table["status"] == Status.OK]
+    distribution = _distribution(scene, good, searched or 1.0)
     across = _across(scene, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
@@ -125,7 +126,7 @@ def _holevo_over_quantum(scene: Scene, z_nm: FloatArray) -> dict[str, FloatArray
     return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
 
 
-def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
+def _distribution(scene: Scene, good: pd.DataFrame, searched: float) -> dict[str, Any] | None:
     """Describe the species where masses were fitted, each event once.
 
     The matched filter's standard deviation is what its snr makes of each mass.
@@ -135,7 +136,7 @@ def _distribution(scene: Scene, good: pd.DataFrame) -> dict[str, Any] | None:
     mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
     efficiency = None
     if len(good) >= LEAST_EVENTS:  # fewer have no species whose numbers it would correct
-        efficiency = filter_efficiency(good, scene.templates.threshold)
+        efficiency = filter_efficiency(good, scene.templates.threshold, searched)
     found = describe(
         mass,
         sigma,

@@ -315,6 +315,11 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
             f"Windows of {count(landing['window_frames'], 'frame')}; "
             f"{count(landing['frames_left_out'], 'frame')} left out."
         )
+        if landing.get("searched_share") is not None:
+            yield (
+                f"{percent(landing['searched_share'])} of field and time were searched for "
+                f"particles with a signal-to-noise ratio of {number(landing['searched_snr'])}."
+            )
         if landing["drift_px"] is not None:
             y, x = landing["drift_px"]
             yield f"Drift of the fixed pattern: {fixed(x, 3)} px in x, {fixed(y, 3)} px in y."

@@ -180,14 +180,21 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
     """Draw what the analysis is about against the frame."""
     values, _, label = _main_values(analysis, table)
-    figure = new_figure(6.2, 2.8)
-    axes = figure.add_subplot()
+    spans = analysis.summary.get("landing", {}).get("partly_searched", ())
+    figure = new_figure(6.2, 3.3 if spans else 2.8)
+    if not spans:
+        axes = figure.add_subplot()
+    else:
+        axes, below = figure.subplots(2, 1, sharex=True, height_ratios=(5, 1))
+        for start, stop, share in spans:
+            below.fill_between((start, stop), 100 * (1 - share), color=VERMILLION, lw=0)
+        below.set(ylim=(0, 100), ylabel="hidden [%]", xlabel="frame")
     frames, good = table["frame"].to_numpy(float), _is_ok(table)
     _points(axes, frames, values, good, "o", color=BLUE, ms=3.5, alpha=0.8, mew=0, label="ok")
     if not good.all():
         _points(axes, frames, values, ~good, "x", color=PURPLE, ms=4, label="flagged")
         figure.legend(loc="outside upper right", ncols=2)
-    axes.set(xlabel="frame", ylabel=label)
+    axes.set(xlabel="" if spans else "frame", ylabel=label)
     axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
     return figure
 

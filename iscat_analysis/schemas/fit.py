@@ -149,6 +149,14 @@ class Landing(Document):
     noise_spectrum: Spectrum | None = maybe("Between neighbouring frames; null where as expected")
     stride_frames: Natural = maybe("From one searched boundary to the next")
     boundaries_searched: Count = maybe("Boundaries that share the expected false alarms")
+    searched_share: Share | None = maybe(
+        "Share of field and time in which a particle of searched_snr is found; what bright or "
+        "ill-described particles left over hides the rest"
+    )
+    searched_snr: NotNegative = maybe("Median signal-to-noise ratio of the events that are ok")
+    partly_searched: list[tuple[Count, Count, Share]] = maybe(
+        "Frames [start, stop) in which a part of the field was hidden, and the share that was not"
+    )
     frames_left_out: Count = maybe("Frames that the camera dropped or repeated")
     drift_px: list[float] | None = maybe("Drift over the movie along y and x [px]")
     drift_corrected: bool = maybe("Whether the motion of the fixed pattern was divided out")
@@ -168,7 +176,9 @@ class Injection(Closed):
     added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
     recovered: Count = key("Steps found again")
     recall: Share = key("Their share")
-    predicted: Share = maybe("Recall that the Fisher information makes of the masses added")
+    predicted: Share = maybe(
+        "Recall that the Fisher information makes of the masses added, in the share searched"
+    )
     isolated: Count = key("Steps with no other one near in place and time")
     recall_isolated: Share = key("Share of these that was found")
     bias_rel: float = maybe(

@@ -33,6 +33,10 @@ DWARFS = 3.0
 LISTED = 0.7
 """Share of what a particle must have from which a candidate is listed, as a side lobe."""
 
+RINGS = 0.04
+"""Share of a particle's signal-to-noise ratio that the model may leave over around it, where that
+is not measured."""
+
 _EXCESS_SIGMAS = 3.0  # of χ²'s own scatter, below which an excess may be noise
 _RING_PX = 2.0  # on either side of the candidate's distance
 _SECTOR_PX = 4.0  # of the ring, along it

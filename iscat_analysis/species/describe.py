@@ -250,6 +250,7 @@ def _table(
     count_low, count_high = interval([r.count for r in repeats])
     came_low, came_high = interval([r.corrected for r in repeats])
     means = np.array([r.mixture.mean for r in repeats])
+    searched = events.efficiency.searched if events.efficiency else 1.0
     table = pd.DataFrame(
         {
             "mass_kda": best.mean,
@@ -268,16 +269,18 @@ def _table(
             "count_high": count_high,
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
-            "efficiency": efficiency,
+            "efficiency": searched * efficiency,
             "stay_frames": _stay(events, best, window_frames),
-            "count_corrected": best.weight * best.arrived(events),
-            "corrected_low": came_low,
-            "corrected_high": came_high,
+            "count_corrected": best.weight * best.arrived(events) / searched,
+            "corrected_low": came_low / searched,
+            "corrected_high": came_high / searched,
             "outlier": outlier,
         },
         columns=list(SPECIES_COLUMNS),
     )
-    table.loc[hidden, ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]] = math.nan
+    table.loc[hidden, ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]] = (
+        math.nan
+    )
     if found.structure is None:
         table.loc[hidden, ["mass_se", "mass_low", "mass_high"]] = math.nan
     if found.structure is not None:

@@ -33,6 +33,7 @@ class Efficiency:
 
     threshold_snr: float
     sigma_kda: float
+    searched: float = 1.0  # share of field and time, where bright particles hid the rest
 
     def __post_init__(self) -> None:
         if not (self.sigma_kda > 0 and math.isfinite(self.sigma_kda + self.threshold_snr)):
@@ -49,7 +50,7 @@ class Efficiency:
     def __call__(self, mass_kda: ArrayLike) -> FloatArray:
         """Probability of detection."""
         mass = np.asarray(mass_kda, dtype=np.float64)
-        return np.asarray(ndtr(mass / self.sigma_kda - self.threshold_snr))
+        return np.asarray(self.searched * ndtr(mass / self.sigma_kda - self.threshold_snr))
 
     def extra_sigma(self, sigma: FloatArray) -> FloatArray:
         """Noise of the filter's estimate beyond that of the fit."""

@@ -171,8 +171,10 @@ def event_table(
     return replace(found, efficiency=efficiency, edge_kda=edge)
 
 
-def filter_efficiency(good: pd.DataFrame, threshold_snr: float) -> Efficiency | None:
-    """Read the matched filter's efficiency off the events that it found."""
+def filter_efficiency(
+    good: pd.DataFrame, threshold_snr: float, searched: float = 1.0
+) -> Efficiency | None:
+    """Read the matched filter's efficiency, in the share that was searched, off its events."""
     mass, snr = (good[name].to_numpy(dtype=float) for name in ("mass_kda", "snr"))
     known = np.isfinite(mass) & (mass != 0) & (snr > 0) & np.isfinite(snr)
     mass, snr = np.abs(mass[known]), snr[known]
@@ -185,8 +187,8 @@ def filter_efficiency(good: pd.DataFrame, threshold_snr: float) -> Efficiency | 
         each = each[clear]
     elif "sigma_mass_kda" in good:
         sigma = good["sigma_mass_kda"].to_numpy(dtype=float)[known]
-        return Efficiency(threshold_snr, _truncated(mass, snr, sigma, threshold_snr))
-    return Efficiency(threshold_snr, float(np.median(each)))
+        return Efficiency(threshold_snr, _truncated(mass, snr, sigma, threshold_snr), searched)
+    return Efficiency(threshold_snr, float(np.median(each)), searched)
 
 
 def _truncated(mass: FloatArray, snr: FloatArray, sigma: FloatArray, threshold_snr: float) -> float:
@@ -393,12 +395,14 @@ def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     snr = snr[np.isfinite(snr) & (snr > 0)]
     if not snr.size:
         return None
-    threshold = _edge(snr)
+    threshold, searched = _edge(snr), 1.0
     if path is not None:
         try:
             summary = read_json(path.parent / "summary.json")
             stored = float(summary["detection_threshold_snr"] or threshold)
             threshold = stored if 0 < stored < _RATIOS[1] else threshold
+            share = float(summary["landing"]["searched_share"])
+            searched = share if 0 < share <= 1 else 1.0
         except (OSError, ValueError, KeyError, TypeError):
             pass  # no summary, or not ours: the table alone must do
-    return filter_efficiency(good, threshold)
+    return filter_efficiency(good, threshold, searched)

@@ -19,6 +19,7 @@ from iscat_analysis._kernels.tailed_mixture import _peak
 from iscat_analysis.day.table import read_table
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.equilibrium import _Equilibrium
+from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import (
     COMPOSITION,
     LANDING_POWER,
@@ -26,7 +27,6 @@ from iscat_analysis.species.mass_action import (
     at_equilibrium,
     landing_logits,
 )
-from iscat_analysis.species.events import Events
 from iscat_analysis.species.series import Free, Series
 from iscat_analysis.species.tables import event_table
 

@@ -8,7 +8,13 @@ before a movie is recorded what it would tell.
 
 from __future__ import annotations
 
-from iscat_analysis.instrument.learner.estimate import Estimate, first_step, maximise, optics_limits
+from iscat_analysis.instrument.learner.estimate import (
+    Estimate,
+    first_step,
+    maximise,
+    optics_limits,
+    prior_range,
+)
 from iscat_analysis.instrument.learner.forecast import OpticsForecast, forecast_optics
 from iscat_analysis.instrument.learner.measure import (
     FAINTEST,
@@ -74,6 +80,7 @@ __all__ = [
     "maximise",
     "measure_microscope",
     "optics_limits",
+    "prior_range",
     "settings_of",
     "with_settings",
 ]

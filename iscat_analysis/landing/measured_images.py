@@ -1,0 +1,187 @@
+"""The picture of a bright step as the movie shows it, where the model does not describe it.
+
+A vesicle or an aggregate is no point, and what the model leaves over of it hides what lands in the
+same frames, all over the field: each peak of it may be a particle with lobes of its own, for which
+fainter ones wait.  Such a step is taken off with a picture of its own: the contrast
+between the frames with and without it, averaged along rings around its centre of symmetry,
+
+    C(r, φ) = Σ_k h_k(φ) c_k(r),    h = 1, cos φ, sin φ, cos 2φ, sin 2φ,
+
+with c_k linear between knots.  The rings are those of a scatterer of any size in any polarisation;
+a particle beside it is much narrower than a ring, counts as an outlier of it, and stays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import fft, sparse
+from scipy.sparse.linalg import spsolve
+
+from iscat_analysis.camera.drift import derivatives
+from iscat_analysis.fitting.regions import Region
+from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
+from iscat_analysis.records import FloatArray
+from iscat_analysis.search.peaks import summits
+from iscat_analysis.search.residue import RINGS, chi2_excess
+from iscat_analysis.search.sliding import STRIDES, Chunk
+
+_KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
+_OUTLIER = 3.0  # standard deviations from which a pixel counts less
+_FITS = 4  # of the rings, with the outliers of the one before
+_PASSES = 2  # over steps whose pictures overlap
+_LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
+_WANDER = 0.35  # of a region, that the centre may lie from where the model's fit found it
+
+
+def with_measured_images(
+    steps: Sequence[Step],
+    near: Sequence[Sequence[int]],
+    chunk: Chunk,
+    neighbours: Neighbours,
+    window: int,
+    threshold: float,
+    roi_px: int,
+) -> list[Step]:
+    """Give those steps their measured pictures of which what is left over could hide others.
+
+    Two lobes of one picture that the model does not describe may both have been taken for steps:
+    the weaker one is left out.
+    """
+    chosen: list[int] = []
+    lobes: set[int] = set()
+    # those that are measured come first, then those of which the model leaves over most
+    order = [(not s.is_measured, -s.excess, -s.start.snr, i) for i, s in enumerate(steps)]
+    for *_, i in sorted(order):
+        step = steps[i]
+        if not (step.is_measured or _hides_others(step, threshold)):
+            continue
+        middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], window, roi_px)), None)
+        if middle is None:
+            chosen.append(i)
+        elif not middle.is_measured:
+            lobes.add(i)
+    told = list(steps)
+    for _ in range(_PASSES):
+        for i in chosen:
+            others = [told[k] for k in near[i] if k not in lobes]
+            told[i] = _measured(told[i], others, chunk, neighbours, window, roi_px)
+    return [step for i, step in enumerate(told) if i not in lobes]
+
+
+def _hides_others(step: Step, threshold: float) -> bool:
+    """Whether a small error of the model, or all of a picture that it does not describe, does."""
+    if RINGS * step.start.snr > threshold:
+        return True
+    return step.excess > max(step.snr**2, (threshold / _LEFT) ** 2)
+
+
+def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
+    """Whether a step lies in the middle of the picture of a brighter one, and at its time."""
+    near = distance_px(step, brighter) < 2 * _WANDER * roi_px
+    return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
+
+
+def _measured(
+    step: Step,
+    others: Sequence[Step],
+    chunk: Chunk,
+    neighbours: Neighbours,
+    window: int,
+    roi_px: int,
+) -> Step:
+    """Replace a step's picture by the measured one; it stays where there are no frames for it."""
+    rows, columns = ((part.start, part.stop) for part in neighbours.box(step))
+    frame, gap = step.at.frame, min(step.at.gap, window // 5)
+    begin, end = max(frame - window, chunk.first), min(frame + window, chunk.stop)
+    spans = (begin, max(frame - gap, begin)), (min(frame + gap, end), end)
+    patch = chunk.patch(begin, end, rows, columns)
+    (before, n_before, power_before), (after, n_after, power_after) = (
+        patch.window(*span) for span in spans
+    )
+    if not n_before or not n_after:
+        return step
+    ratio = np.full(before.shape, power_after / power_before)
+    cuts = chunk.cut(*spans[0]), chunk.cut(*spans[1])
+    for other in others:
+        neighbours.apply(ratio, other, *cuts, Region(rows, columns))
+    used = patch.usable & (before > 0) & (after > 0)
+    before, after = (np.where(used, part, 1.0) for part in (before * ratio, after))
+    if step.sign < 0:
+        before, after = after, before
+    contrast = np.where(used, after / before - 1, 0.0)
+    sigma = np.sqrt((1 / before + 1 / after) * (1 + contrast) ** 2)
+    weight = np.where(used, 1 / sigma, 0.0)
+    place = step.start.y_px - rows[0], step.start.x_px - columns[0]
+    centre = _centre(contrast * weight, place, _WANDER * roi_px)
+    image = ring_average(contrast, weight, centre)
+    half = roi_px // 2
+    y, x = (max(round(c) - half, 0) for c in place)
+    core = slice(y, y + 2 * half + 1), slice(x, x + 2 * half + 1)
+    slopes = None if step.slopes is None else derivatives(image)
+    excess = chi2_excess(((contrast - image) * weight)[core])
+    return replace(step, image=image, slopes=slopes, excess=excess, is_measured=True)
+
+
+def _centre(
+    signal: FloatArray, place: tuple[float, float], wander_px: float
+) -> tuple[float, float]:
+    """Find the point about which a picture is symmetric, near a place.
+
+    Rings of even order look the same from the other side: the picture convolved with itself is
+    highest at twice their centre.
+
+    Shapes: `signal` (ny, nx).
+    """
+    size = [fft.next_fast_len(2 * n, real=True) for n in signal.shape]
+    twice = fft.irfft2(fft.rfft2(signal, size) ** 2, size)
+    low = [max(math.ceil(2 * (c - wander_px)), 1) for c in place]
+    high = [math.floor(2 * (c + wander_px)) + 1 for c in place]
+    near = twice[low[0] : high[0], low[1] : high[1]]
+    i, j = np.unravel_index(int(np.argmax(near)), near.shape)
+    at = np.array([[0, i + low[0], j + low[1]]], dtype=np.int64)
+    dy, dx, _ = summits(twice[None], at)
+    return float(at[0, 1] + dy[0]) / 2, float(at[0, 2] + dx[0]) / 2
+
+
+def ring_average(
+    contrast: FloatArray, weight: FloatArray, centre: tuple[float, float]
+) -> FloatArray:
+    """Average a picture along rings, with their first two harmonics; outliers count less.
+
+    Shapes: `contrast, weight` (ny, nx), result (ny, nx).
+    """
+    y, x = (np.arange(n) - c for n, c in zip(contrast.shape, centre, strict=True))
+    radius = np.hypot(y[:, None], x[None, :]).ravel() / _KNOT_PX
+    angle = np.arctan2(y[:, None], x[None, :] + 0 * y[:, None]).ravel()
+    waves = [np.ones(angle.size)]
+    for order in (1, 2):
+        waves += [np.cos(order * angle), np.sin(order * angle)]
+    knot = np.floor(radius).astype(np.int64)
+    part = radius - knot
+    pixel = np.arange(radius.size)
+    number, knots = len(waves), int(knot.max()) + 2
+    design = sparse.csr_matrix(
+        (
+            np.concatenate([wave * share for wave in waves for share in (1 - part, part)]),
+            (
+                np.tile(pixel, 2 * number),
+                np.concatenate([number * (knot + s) + k for k in range(number) for s in (0, 1)]),
+            ),
+        ),
+        shape=(pixel.size, number * knots),
+    )
+    value, accuracy = contrast.ravel(), weight.ravel()
+    ridge = sparse.identity(number * knots) * (1e-6 * float(np.mean(accuracy**2)))
+    kept = accuracy**2
+    image = np.zeros(value.size)
+    for _ in range(_FITS):
+        normal = design.T @ sparse.diags(kept) @ design + ridge
+        image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
+        off = np.abs(value - image) * accuracy
+        scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
+        kept = accuracy**2 * np.minimum(1.0, _OUTLIER * scale / np.maximum(off, 1e-9)) ** 2
+    return np.asarray(image.reshape(contrast.shape))
