@@ -28,6 +28,10 @@ HOSTILE = "/data/<script>alert(1)<img src=x onerror=alert(2)> & 'run' \"7\".tif"
 PIXEL_NM = 84.4
 
 
+OF_A_MOVIE = {Status.UNCALIBRATED_OPTICS, Status.NONLINEAR, Status.PROCESSED}
+"""What all rows of a movie are flagged with."""
+
+
 def spot(side: int, x: float, y: float, width: float) -> np.ndarray:
     rows, columns = np.mgrid[:side, :side]
     r = np.hypot(rows - y, columns - x)
@@ -107,7 +111,8 @@ def make_analysis(
         table[f"qcrb_{name}"] = crb * rng.normal(0.52, 0.03, n) if known else np.nan
     status = np.array([Status.OK.value] * n, dtype=object)
     flags = np.array([""] * n, dtype=object)
-    for k, verdict in enumerate([s for s in Status if s is not Status.OK]):
+    of_a_row = set(Status) - {Status.OK} - OF_A_MOVIE
+    for k, verdict in enumerate([s for s in Status if s in of_a_row]):
         first = (5 + 6 * k) % 37
         status[first::41] = verdict.value
         flags[first::41] = f"{verdict.value};masked_pixels"

@@ -355,7 +355,7 @@ def test_without_calibration_the_headline_is_a_contrast() -> None:
 
 @pytest.mark.usefixtures("sketched")
 def test_optional_columns_stand_beside_sigma() -> None:
-    analysis = make_analysis(12)
+    analysis = make_analysis(40)
     table = analysis.table.assign(systematic_mass_kda=7.0, repeat_mass_kda=np.nan, track=1)
     page = render_report(replace(analysis, table=table))
     heads = re.findall(r'<th scope="col"[^>]*>([^<]*)</th>', page[page.index('id="table"') :])
