@@ -113,9 +113,9 @@ def make_analysis(
     flags = np.array([""] * n, dtype=object)
     of_a_row = set(Status) - {Status.OK} - OF_A_MOVIE
     for k, verdict in enumerate([s for s in Status if s in of_a_row]):
-        first = (5 + 6 * k) % 37
-        status[first::41] = verdict.value
-        flags[first::41] = f"{verdict.value};masked_pixels"
+        rows = slice((5 + 6 * k) % 37, None, 41) if k < 7 else slice(1 + 6 * k, None, 211)
+        status[rows] = verdict.value
+        flags[rows] = f"{verdict.value};masked_pixels"
     frame = pd.DataFrame({**table, "status": status, "flags": flags}, columns=list(EVENT_COLUMNS))
     if n > 6:
         frame.loc[frame.index[5], [c for c in frame if c.startswith("sigma_")]] = np.nan
