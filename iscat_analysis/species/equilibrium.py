@@ -171,9 +171,7 @@ class _Equilibrium(Series):
         self.names += names
         self.low, self.high, self.first, self.scale = (
             np.append(old, new)
-            for old, new in zip(
-                (self.low, self.high, self.first, self.scale), numbers, strict=True
-            )
+            for old, new in zip((self.low, self.high, self.first, self.scale), numbers, strict=True)
         )
 
     def logits(self, theta: FloatArray) -> FloatArray:

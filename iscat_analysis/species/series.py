@@ -26,6 +26,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from iminuit import Minuit
@@ -158,11 +159,11 @@ class Series(ABC):
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
 
     def _middles(self) -> FloatArray:
-        """Ends of the window, and the middles of gaps between species that are peaks apart."""
+        """Give the ends of the window, and the middles of gaps between species that are peaks apart."""
         order = np.sort(self.masses)
         gaps = [
             (below + above) / 2
-            for below, above in zip(order[:-1], order[1:], strict=True)
+            for below, above in pairwise(order)
             if above - below > 3 * self.width
         ]
         return np.array([self.ends[0], *gaps, self.ends[1]])
