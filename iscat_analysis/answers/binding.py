@@ -236,6 +236,7 @@ def fit_kd(
                 f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
                 f"{LEAST_EVENTS} are needed, or leave it out of {name}"
             )
+    masses: tuple[float, ...]
     if masses_kda is None:
         monomer, taken = _monomer(found)
         masses = (monomer,)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -162,7 +163,7 @@ def test_the_monomer_is_taken_from_two_peaks() -> None:
     assert found.fit.masses_kda == pytest.approx([80, 160], abs=2)
     assert found.fit.kd_low < 10 < found.fit.kd_high
     (note,) = [note for note in found.notes if "the monomer was taken" in note]
-    peaks = [float(word) for word in note.replace(";", " ").split() if word.isdigit()]
+    peaks = [float(number) for number in re.findall(r"([0-9.]+) kDa", note)]
     assert peaks == pytest.approx([80, 160], abs=6)
 
 
