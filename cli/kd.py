@@ -59,8 +59,8 @@ def kd(
         typer.Option(
             "--masses",
             metavar="M | A,B",
-            help="About the mass of the monomer, or of A and B [kDa]; fitted. Without it the monomer is "
-            "taken from peaks at one mass and its double.",
+            help="About the mass of the monomer, or of A and B [kDa]; fitted. Without it the "
+            "monomer is taken from peaks at one mass and its double.",
         ),
     ] = None,
     landing: Annotated[

@@ -61,12 +61,8 @@ def _peak(d: float, v: float, t: float) -> tuple[float, float, float, float]:
             power *= e
             before, here, after = here, after, u * after - (n + 2) * here
         scaled = normal / w
-        return (
-            max(f, 0.0) * normal,
-            sign * scaled * f_mu,
-            0.5 * scaled / w * f_v,
-            sign * scaled * f_s,
-        )
+        by_mean, by_tail = sign * scaled * f_mu, sign * scaled * f_s
+        return max(f, 0.0) * normal, by_mean, 0.5 * scaled / w * f_v, by_tail
     z = d - v / s
     a = z / w
     if a > 0:

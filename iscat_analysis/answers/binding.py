@@ -44,7 +44,7 @@ CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
 _WRONG = 0.01  # p-value below which the model is doubted
 _FAR = 3.0  # standard errors of a table that is named
 _POINTS = 200  # of the curve
-_POSSIBLE_PEAKS_KDA = (1.0, 1e5)
+_POSSIBLE_PEAKS = (0.0, 11.5)  # ln of masses in kDa
 _PEAK_POINTS = 2000
 _SMOOTHING = 0.07  # of ln m: a third of what keeps peaks at m and 2 m apart
 _LEAST_PEAK = 0.05  # prominence of a peak, over the height of the highest
@@ -236,6 +236,7 @@ def fit_kd(
                 f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few; "
                 f"{LEAST_EVENTS} are needed, or leave it out of {name}"
             )
+    masses: tuple[float, ...]
     if masses_kda is None:
         monomer, taken = _monomer(found)
         masses = (monomer,)
@@ -399,7 +400,7 @@ def _monomer(tables: Sequence[EventTable]) -> tuple[float, str]:
     Every table counts alike.  Two peaks of the density of ln m, one at about twice the other, are
     monomers and dimers; of several such pairs the one with most events is taken.
     """
-    points = np.linspace(*np.log(_POSSIBLE_PEAKS_KDA), _PEAK_POINTS)
+    points = np.linspace(*_POSSIBLE_PEAKS, _PEAK_POINTS)
     step = points[1] - points[0]
     edges = np.append(points - step / 2, points[-1] + step / 2)
     logs = [np.log(np.abs(table.mass_kda)) for table in tables]

@@ -278,11 +278,10 @@ def _table(
         },
         columns=list(SPECIES_COLUMNS),
     )
-    table.loc[hidden, ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]] = (
-        math.nan
-    )
+    unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
     if found.structure is None:
-        table.loc[hidden, ["mass_se", "mass_low", "mass_high"]] = math.nan
+        unknown += ["mass_se", "mass_low", "mass_high"]
+    table.loc[hidden, unknown] = math.nan
     if found.structure is not None:
         table["background"] = np.arange(best.weight.size) >= known
     if found.steps:

@@ -179,7 +179,7 @@ class _Equilibrium(Series):
         values = dict(zip(self.names[self.own :], theta[self.own :], strict=True))
         return landing_logits(
             self.model, self.totals, math.exp(values["ln_kd"]), values.get("inactive", 0.0),
-            self.masses, values.get("power", self.power),
+            self.masses, values["power"] if self.power is None else self.power,
         )  # fmt: skip
 
     def height(self, theta: FloatArray) -> tuple[float, FloatArray]:

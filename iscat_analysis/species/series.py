@@ -26,6 +26,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from iminuit import Minuit
@@ -41,6 +42,7 @@ _OFFSET = 0.05  # of the lightest mass
 _WIDEST = 0.35  # of the lightest: standard deviation of a species
 _LONGEST = 0.4  # of the lightest: a tail
 _UNEQUAL = 0.5  # of the squared width: how the widths of species differ
+_SKEW = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
 _BEND = 1.5  # of the logarithm of the background's density from one middle to another
 _FIRST_BACKGROUND, _BACKGROUND = -5.0, 2.0  # its logit
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
@@ -158,11 +160,11 @@ class Series(ABC):
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
 
     def _middles(self) -> FloatArray:
-        """Ends of the window, and the middles of gaps between species that are peaks apart."""
+        """Give the ends of the window, and the middles of gaps between peaks that are apart."""
         order = np.sort(self.masses)
         gaps = [
             (below + above) / 2
-            for below, above in zip(order[:-1], order[1:], strict=True)
+            for below, above in pairwise(order)
             if above - below > 3 * self.width
         ]
         return np.array([self.ends[0], *gaps, self.ends[1]])
@@ -206,7 +208,7 @@ class Series(ABC):
         place = self.parts
         rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
         rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _UNEQUAL * self.width**2))
-        rows.append(({place + 3: 1.0}, 0.0, 1.5 * self.width))
+        rows.append(({place + 3: 1.0}, 0.0, _SKEW * self.width))
         bends = self.knots.size - 1
         rows += [({place + 4 + bend: 1.0}, 0.0, _BEND) for bend in range(bends)]
         if self.learned:

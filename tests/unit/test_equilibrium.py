@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -107,9 +108,10 @@ def dimers() -> list[pd.DataFrame]:
 
 def test_kd_is_found_and_its_ends_are_where_the_profile_says(dimers) -> None:
     found = ia.fit_kd(DIMER, tables=dimers, model="dimer")
+    assert any("the monomer was taken for the peak at" in note for note in found.notes)
     fit = found.fit
     assert fit.kd_low < 10 < fit.kd_high
-    assert fit.kd_high / fit.kd_low < 1.6
+    assert fit.kd_high / fit.kd_low < 2.3  # and 1.6 where the landing exponent is known
     assert fit.masses_kda == pytest.approx([66.0, 132.0], abs=1.0)
     assert fit.p_value > 0.01
     assert fit.dof == 3
@@ -151,6 +153,36 @@ def test_landings_that_are_taken_alike_change_kd(dimers) -> None:
 def test_a_mass_in_another_unit_is_refused(dimers) -> None:
     with pytest.raises(ia.DataError, match="no event is near the masses"):
         ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66e3])
+
+
+def test_the_monomer_is_taken_from_two_peaks() -> None:
+    """40 kDa explained peaks at 80 and 160 kDa as well, and were taken."""
+    totals = DIMER.to_numpy(float)
+    tables = draw_series(np.random.default_rng(10), "dimer", totals, 10.0, [80.0], number=600)
+    found = ia.fit_kd(DIMER, tables=tables, model="dimer")
+    assert found.fit.masses_kda == pytest.approx([80, 160], abs=2)
+    assert found.fit.kd_low < 10 < found.fit.kd_high
+    (note,) = [note for note in found.notes if "the monomer was taken" in note]
+    peaks = [float(number) for number in re.findall(r"([0-9.]+) kDa", note)]
+    assert peaks == pytest.approx([80, 160], abs=6)
+
+
+def test_peaks_that_are_no_ladder_need_the_mass() -> None:
+    totals = DIMER.to_numpy(float)
+    tables = draw_series(np.random.default_rng(11), "dimer", totals, 1e-5, [80.0], number=300)
+    with pytest.raises(ia.DataError, match=r"which peak .* is the monomer cannot be told.*160 kDa"):
+        ia.fit_kd(DIMER, tables=tables, model="dimer")
+
+
+def test_an_exponent_that_is_held_makes_the_interval_narrower(dimers) -> None:
+    free = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0]).fit
+    held = ia.fit_kd(
+        DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=LANDING_POWER
+    ).fit
+    assert held.landing_power == LANDING_POWER
+    assert held.landing_power_se == 0
+    assert 0.05 < free.landing_power_se < 0.17
+    assert held.kd_high / held.kd_low < 0.85 * free.kd_high / free.kd_low
 
 
 def test_two_partners() -> None:
