@@ -33,6 +33,7 @@ _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pix
 _OUTLIER = 3.0  # standard deviations from which a pixel counts less
 _FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
+_LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
 _LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
 _WANDER = 0.35  # of a region, that the centre may lie from where the model's fit found it
 
@@ -73,10 +74,14 @@ def with_measured_images(
 
 
 def _hides_others(step: Step, threshold: float) -> bool:
-    """Whether a small error of the model, or all of a picture that it does not describe, does."""
-    if RINGS * step.start.snr > threshold:
+    """Whether what is left over hides others: a little of much, or nearly all of a picture.
+
+    What is between these may be two particles that land at once.
+    """
+    described = step.excess < _LITTLE * step.snr**2
+    if described and RINGS * step.start.snr > threshold:
         return True
-    return step.excess > max(step.snr**2, (threshold / _LEFT) ** 2)
+    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEFT) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:

@@ -86,19 +86,17 @@ def searched_shares(
     snr, effective = maps
     stride = int(chunk.edges[1] - chunk.edges[0])
     frames = chunk.first + chunk.edges[1:-1]
-    lit = effective > 0  # frames that were left out are told by themselves
+    lit = effective > 0  # frames, and pixels, that were left out are told by themselves
     own = np.flatnonzero((frames >= core[0]) & (frames < core[1]) & lit)
     high = [peak for peak in peaks if SIDELOBE * abs(peak.snr) > threshold]
     bright = [step for step in steps if step.is_measured]
     shares = np.ones((own.size, LEVELS.size))
-    masked = 1 - float(chunk.usable.mean())
     for row, j in enumerate(own.tolist()):
         reach = (STRIDES + 1) * stride
         now = int(frames[j])
         near = [step for step in bright if abs(step.at.frame - now) <= reach]
         waits = [peak for peak in high if abs(peak.frame - now) <= reach]
         if not near and not waits:
-            shares[row] -= masked
             continue
         asked = np.full(chunk.shape, threshold)
         for peak in waits:
@@ -108,7 +106,7 @@ def searched_shares(
             inside = part * math.sqrt(EXPLAINS * step.excess)
             _raise_around(asked, step, snr[j], inside, roi_px)
         sizes = np.sort(asked[chunk.usable]) / threshold
-        shares[row] = np.searchsorted(sizes, LEVELS * (1 + 1e-9)) / asked.size
+        shares[row] = np.searchsorted(sizes, LEVELS * (1 + 1e-9)) / sizes.size
     return Searched(frames[own].astype(np.int64), shares)
 
 
