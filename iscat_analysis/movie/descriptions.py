@@ -58,7 +58,7 @@ Resolution = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Hints:
-    """What one kind of metadata says: pixel size along x and y [nm], exposure [ms], frame rate [Hz], …
+    """What one kind of metadata says: lengths in nm, exposure in ms, frame rate in Hz.
 
     None where it is silent; `ticks` and `source` are as in `StackMetadata`.
     """
