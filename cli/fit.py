@@ -134,7 +134,6 @@ def fit(
         changes = _changes(settings, mode, frames, background, posterior, workers)
 
         from iscat_analysis.movie.addresses import MARK, beside, setup_beside
-
         from iscat_analysis.reading import is_file
 
         found_beside = setup_beside(stack)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = """Example: no questions; what the file does not say is given here, or a default.
 
-    iscat init movie.tif --yes --pixel-size-nm 84.4 --wavelength-nm 525 --na 1.42
+    iscat init movie.tif --yes --pixel-size-nm 84.4 --na 1.42
 
 Then `iscat-fit movie.tif` finds iscat.toml beside the movie.
 """

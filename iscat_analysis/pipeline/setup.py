@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.learned import ASSUMPTION, LearnedCamera
+from iscat_analysis.camera.learned import ASSUMPTION, METADATA, LearnedCamera
+from iscat_analysis.camera.learned import MEASURED as BY_NOISE
 from iscat_analysis.config import AUTO, Config, configure, toml_value
 from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
@@ -58,6 +59,7 @@ _QUESTIONS = (
 )
 _STANDING = ("optics.n_immersion", "optics.n_sample")  # shown, since they may have to be changed
 _EACH_MOVIE = ("camera.exposure_ms", "camera.frame_rate_hz")  # left to the metadata of each
+_ORIGINS = {ASSUMPTION: DEFAULT, METADATA: "the file's metadata", BY_NOISE: MEASURED}
 _CAMERA = ("camera.gain_e_per_adu", "camera.offset_adu", "camera.read_noise_e")
 
 
@@ -218,8 +220,7 @@ def _camera_values(camera: LearnedCamera) -> list[Value]:
     values = []
     for key in _CAMERA:
         number = camera.numbers[key.partition(".")[2]]
-        origin = DEFAULT if number.source == ASSUMPTION else f"{MEASURED} ({number.source})"
-        origin = "the file's metadata" if number.source == "metadata" else origin
+        origin = _ORIGINS.get(number.source, f"{MEASURED} ({number.source})")
         values.append(Value(key, number.value, origin, number.se or None, written=False))
     return values
 

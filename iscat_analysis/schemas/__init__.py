@@ -63,9 +63,9 @@ def schema(name: str) -> dict[str, Any]:
     ----------
     name : str
         ``"fit"``, ``"init"``, ``"batch"``, ``"simulate"`` or ``"bounds"`` for what the command
-        prints with ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and
-        ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several tables;
-        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
+        prints with ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds
+        --preset`` and ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several
+        tables; ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
         ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and what is printed
         beside it.
 

@@ -14,10 +14,12 @@ import tifffile
 from numpy.typing import NDArray
 from tiff_files import ASCII, pages_of, write_tiff
 
-from iscat_analysis.config import load_config
+from iscat_analysis.config import Particle, load_config
 from iscat_analysis.movie import open_stack
+from iscat_analysis.pipeline.setup import SAMPLES
 from iscat_analysis.schemas import schema
 from iscat_cli import main, main_fit
+from iscat_cli.init import Sample
 
 GAIN = 4.0
 FRAMES, SIDE = 300, 64
@@ -114,7 +116,8 @@ def test_every_value_has_its_origin(
 def test_the_movie_tells_gain_light_and_what_is_there(ome: Path, capsys) -> None:
     found = _found(capsys, str(ome))
     gain = found["values"]["camera.gain_e_per_adu"]
-    assert gain["from"] == "measured here (measured)"
+    assert gain["from"] == "measured here"
+    assert found["values"]["fit.mode"] == {"value": "mass", "se": None, "from": "default"}
     assert abs(gain["value"] - GAIN) < 4 * gain["se"] < 0.1
     seen = found["preview"]
     assert seen["light_e"] == pytest.approx(1e5, rel=0.05)
@@ -148,6 +151,31 @@ def test_a_file_that_is_there_is_kept(plain: Path, capsys) -> None:
     assert setup.read_text(encoding="utf-8") == "# mine\n"
     assert main(["init", *options, "--overwrite"]) == 0
     assert load_config(setup).camera.pixel_size_nm == 84
+
+
+def test_particles_that_move_are_told_from_those_that_land(
+    sample_configs, tmp_path: Path, capsys
+) -> None:
+    """The same setting with four proteins on a membrane."""
+    movie = tmp_path / "moving.tif"
+    changes = [
+        *LANDING[:3], "simulation.count=0", "fit.mode=track", "camera.frame_rate_hz=331",
+        "simulation.movers=[{count=4, mass_kda=900.0, d_um2_s=0.15}]", "simulation.shape=[96, 96]",
+    ]  # fmt: skip
+    options = [f"--set={change}" for change in changes]
+    assert main(["simulate", "--config", str(sample_configs["landing"]), "--out", str(movie),
+                 "--quiet", *options]) == 0  # fmt: skip
+    found = _found(capsys, str(movie))
+    mode = found["values"]["fit.mode"]
+    assert (mode["value"], mode["from"]) == ("track", "measured here")
+    assert all(found["preview"]["candidates"])
+    assert load_config(found["out"]).background.method == "tracks"
+
+
+def test_the_kinds_of_samples_are_kinds_of_particles() -> None:
+    assert tuple(Sample) == SAMPLES
+    for kind in SAMPLES:
+        assert Particle(kind=kind).kind == kind
 
 
 class _Terminal(io.StringIO):
