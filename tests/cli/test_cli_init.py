@@ -136,6 +136,19 @@ def test_a_field_in_which_nothing_happens_has_no_candidate(counts, tmp_path, cap
     assert found["preview"]["strongest_snr"] is None
 
 
+def test_what_the_file_says_is_said(ome: Path, plain: Path, capsys) -> None:
+    assert main(["init", str(ome), "--yes"]) == 0
+    shown = capsys.readouterr()
+    assert (
+        "its ome metadata say pixels of 84 nm, wavelength 520 nm, NA 1.4, 60×, "
+        "200 frames per second" in shown.err
+    )
+    assert "not known: kind of sample" in shown.err
+    assert shown.out.count("the file's metadata (ome)") == 4
+    assert main(["init", str(plain), "--yes", "--pixel-size-nm=84", "--overwrite"]) == 0
+    assert "the file has no metadata that help" in capsys.readouterr().err
+
+
 def test_what_nobody_can_guess_has_to_be_given(plain: Path, capsys) -> None:
     assert main(["init", str(plain), "--yes"]) == 1
     assert "give --pixel-size-nm" in capsys.readouterr().err
