@@ -153,6 +153,7 @@ def write_setup(
             preview=_look_around(preview),
             out=target,
         )
+    target.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(target) as partial:
         partial.write_text(_toml(found), encoding="utf-8")
     return found
