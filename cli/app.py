@@ -36,6 +36,8 @@ from iscat_cli.export import EXAMPLE as EXPORT_EXAMPLE
 from iscat_cli.export import export
 from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
 from iscat_cli.fit import fit
+from iscat_cli.init import EXAMPLE as INIT_EXAMPLE
+from iscat_cli.init import init
 from iscat_cli.kd import EXAMPLE as KD_EXAMPLE
 from iscat_cli.kd import kd
 from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
@@ -49,6 +51,7 @@ from iscat_cli.watch import watch
 
 # To add a command: its own file with a function and an EXAMPLE, and one line here.
 COMMANDS = (
+    (init, INIT_EXAMPLE),
     (fit, FIT_EXAMPLE),
     (batch, BATCH_EXAMPLE),
     (watch, WATCH_EXAMPLE),

@@ -225,6 +225,7 @@ _OPTIONS = {
     "kd_masses_kda": "kd-masses",
     "masses_kda": "masses",
     "offset_adu": "offset",
+    "pixel_size_nm": "pixel-size-nm",
     "scheduler_file": "scheduler-file",
     "sigma_kda": "sigma",
     "standards_kda": "standards",

@@ -12,7 +12,6 @@ import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result
 from iscat_cli.options import (
-    ConfigOption,
     DebugOption,
     JsonOption,
     Mode,
@@ -57,7 +56,13 @@ def fit(
     ],
     *,
     mode: ModeOption = None,
-    config: ConfigOption = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="C.toml",
+            help="Configuration; default iscat.toml beside STACK, which `iscat init` writes.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Output folder; default the movie's name with .iscat."),
@@ -127,10 +132,17 @@ def fit(
         from iscat_analysis.config import load_config
 
         changes = _changes(settings, mode, frames, background, posterior, workers)
+
+        from iscat_analysis.movie.addresses import MARK, beside, setup_beside
+        from iscat_analysis.reading import is_file
+
+        found_beside = setup_beside(stack)
+        if config is None and is_file(found_beside):
+            config = found_beside
+            messages.notify(f"the configuration is {config}, which lies beside the movie")
         resolved = load_config(config, changes)
 
         from iscat_analysis.executors import open_place
-        from iscat_analysis.movie.addresses import MARK, beside
 
         movie, many = stack, resolved.compute.workers
         if raw is not None:

@@ -20,12 +20,13 @@ from iscat_analysis.camera.pattern_jitter import (
     PatternJitter,
     measure_pattern_jitter,
 )
-from iscat_analysis.config import Config, plausible_pixel
-from iscat_analysis.errors import DataError
+from iscat_analysis.config import Config, Optics, plausible_pixel
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
 from iscat_analysis.units import count
 
 _DISAGREEMENT = 0.01  # relative, between configuration and metadata
+_OPTICS_DISAGREEMENT = 0.05  # the aperture that was measured is some percent below the engraved one
 _GAIN_TOLERANCE = 0.10  # of the noise variance, before the user is told
 _GAIN_SIGMAS = 3.0  # and the excess over the tolerance that chance must not explain
 _OUTLIER_SIGMAS = 8.0  # a blinking pixel, in standard deviations of one pixel's variance
@@ -68,9 +69,41 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
             "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
     camera = config.camera.model_copy(update=found)
-    config = config.model_copy(update={"camera": camera})
+    optics, said = _with_optics(config.optics, metadata)
+    notes += said
+    config = config.model_copy(update={"camera": camera, "optics": optics})
     source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
     return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
+
+
+def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
+    """Put what the movie says of its optics in the place of defaults, which nobody gave."""
+    found: dict[str, float] = {}
+    notes = []
+    for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
+        given: float = getattr(optics, key)
+        read: float | None = getattr(metadata, key)
+        if read is None:
+            continue
+        where = f"in the movie's {metadata.source} metadata"
+        if key not in optics.model_fields_set:
+            found[key] = read
+            notes.append(
+                f"the {words} is {read:g}{unit}, as {where}; optics.{key} would win over it"
+            )
+        elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
+            notes.append(
+                f"the {words} is {given:g}{unit} in the configuration (optics.{key}) but "
+                f"{read:g}{unit} {where}; the configuration is used"
+            )
+    if not found:
+        return optics, notes
+    try:
+        return Optics(**{**optics.model_dump(exclude_unset=True), **found}), notes
+    except ConfigError as error:
+        raise DataError(
+            f"the movie's {metadata.source} metadata do not suit the configuration: {error}"
+        ) from None
 
 
 def _coarse_pixels(config: Config, where: str) -> Iterator[str]:

@@ -13,6 +13,9 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.reading import is_file, is_folder
 
 MARK = "::"
+SETUP = "iscat.toml"
+"""Name of the configuration of the movies in a folder."""
+
 _SHAPE = re.compile(r"(?:(\d{1,12})x)?(\d{1,9})x(\d{1,9}),\s*(\S+)", flags=re.ASCII)
 
 
@@ -31,6 +34,11 @@ def layout(part: str) -> tuple[int | None, int, int, str] | None:
         return None
     frames = int(match[1]) if match[1] else None
     return frames, int(match[2]), int(match[3]), match[4]
+
+
+def setup_beside(address: Path) -> Path:
+    """Name the configuration that goes for the movies of a folder."""
+    return split_address(address)[0].parent / SETUP
 
 
 def beside(address: Path, suffix: str) -> Path:

@@ -44,6 +44,9 @@ _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
 _DCAM_CONVERSION = ("CONVERSION FACTOR COEFF", "CONVERSION FACTOR OFFSET")  # Hamamatsu's driver
+_STRAIGHT_LINE = "0"  # number of ImageJ's calibration function c0 + c1·stored
+_ELECTRONS = {"e", "e-", "electron", "electrons", "photoelectron", "photoelectrons"}
+_COUNTS = {"", "gray value", "gray values", "count", "counts", "adu", "dn"}
 _MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
 _RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
 _PLAUSIBLE_PIXEL_NM = (5.0, 5000.0)  # outside: a printer's 72 or 300 dpi, not a microscope
@@ -55,7 +58,7 @@ Resolution = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Hints:
-    """Pixel size along x and y [nm], exposure [ms], frame rate [Hz] and camera, of one kind.
+    """What one kind of metadata says: lengths in nm, exposure in ms, frame rate in Hz.
 
     None where it is silent; `ticks` and `source` are as in `StackMetadata`.
     """
@@ -68,6 +71,9 @@ class Hints:
     ticks: tuple[int, ...] | None = None
     gain_e_per_adu: float | None = None
     offset_adu: float | None = None
+    wavelength_nm: float | None = None
+    na: float | None = None
+    magnification: float | None = None
 
 
 @dataclass(frozen=True)
@@ -140,7 +146,7 @@ def described_frames(text: str, shape: tuple[int, ...], path: Path) -> Described
 
 
 def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
-    """Read ImageJ's pixel size and frame interval."""
+    """Read ImageJ's pixel size, frame interval and what a stored count is worth."""
     fields = _imagej_fields(text)
     x_nm = y_nm = None
     unit = LENGTH_NM.get(fields.get("unit", "").lower())
@@ -152,7 +158,27 @@ def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
     seconds = TIME_S.get(fields.get("tunit", "s").lower())
     interval = positive(fields.get("finterval"), seconds) if seconds else None
     rate = inverse(interval) or positive(fields.get("fps"))
-    return Hints("imagej", x_nm, y_nm, frame_rate_hz=rate)
+    gain, offset = _imagej_counts(fields)
+    return Hints("imagej", x_nm, y_nm, frame_rate_hz=rate, gain_e_per_adu=gain, offset_adu=offset)
+
+
+def _imagej_counts(fields: Mapping[str, str]) -> tuple[float | None, float | None]:
+    """Read gain and offset of ImageJ's straight line, value = c0 + c1·stored.
+
+    Where the value is in electrons, c1 is the gain.  Where it is in counts, the line tells only
+    which stored count stands for none: ImageJ keeps signed numbers as unsigned ones plus 32768.
+    Lines to other quantities, such as optical densities, tell nothing of the camera.
+    """
+    unit, slope = fields.get("vunit", "").lower(), positive(fields.get("c1"))
+    if fields.get("cf") != _STRAIGHT_LINE or slope is None or unit not in _ELECTRONS | _COUNTS:
+        return None, None
+    try:
+        zero = -float(fields.get("c0", "")) / slope
+    except ValueError:
+        return None, None
+    if not math.isfinite(zero):
+        return None, None
+    return slope if unit in _ELECTRONS else None, zero + 0.0  # no -0
 
 
 def micro_manager_axes(summary: Mapping[str, Any]) -> dict[str, int]:
@@ -182,11 +208,17 @@ def micro_manager_hints(
     interval = find("Interval_ms")
     if interval is not None and (exposure is None or interval >= exposure) and ticks is None:
         rate = positive(1e3 / interval)
-    gain, offset = (_driver_number(begin, name) for name in _DCAM_CONVERSION)
+    gain, offset = conversion_of(begin)
     return Hints(
         "micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate, ticks=ticks,
-        gain_e_per_adu=gain, offset_adu=offset if gain is not None else None,
+        gain_e_per_adu=gain, offset_adu=offset,
     )  # fmt: skip
+
+
+def conversion_of(properties: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """Read gain and offset that Hamamatsu's driver gives among its properties."""
+    gain, offset = (_driver_number(properties, name) for name in _DCAM_CONVERSION)
+    return gain, offset if gain is not None else None
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
@@ -226,6 +258,9 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
             "frame_rate_hz": hint.frame_rate_hz,
             "gain_e_per_adu": hint.gain_e_per_adu,
             "offset_adu": hint.offset_adu,
+            "wavelength_nm": hint.wavelength_nm,
+            "na": hint.na,
+            "magnification": hint.magnification,
         }
         fresh = {key: n for key, n in given.items() if n is not None and key not in found}
         if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:

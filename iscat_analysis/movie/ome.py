@@ -1,6 +1,7 @@
-"""OME-XML: which image of the file is which frame, the pixel size and the timing.
+"""OME-XML: which image of the file is which frame, the pixel size, the timing and the objective.
 
-Schema: https://www.openmicroscopy.org/Schemas/OME/2016-06
+Gain and Offset of a Detector are not read: the schema gives them no unit, and programs write there
+what their slider shows.  Schema: https://www.openmicroscopy.org/Schemas/OME/2016-06
 """
 
 from __future__ import annotations
@@ -15,12 +16,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.config.values import WAVELENGTH_NM
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.movie.descriptions import (
     LENGTH_NM,
     TIME_S,
     Hints,
+    conversion_of,
     inverse,
     positive,
     time_axis,
@@ -32,6 +35,7 @@ _AXES = ("T", "Z", "C")
 _LEAST_IMAGE_BYTES = 50  # of the list of tags of an image: four of twelve bytes, and what ends it
 _MOST_DIGITS = 20  # a number of more is beyond every file, and stays so when cut
 _LONGEST = 64_000_000  # characters, some hundred for each frame
+_LARGEST_NA = 2.0  # of any objective, solid immersion aside
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,8 @@ def is_ome(text: str) -> bool:
 
 def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
     """Read the OME-XML of a file."""
-    images = _images(text, path)
+    root = _parse(text, path)
+    images = _images(root, path)
     first = images[0]
     if len(images) == 1:
         order, axis = _order(first, n_images, path)
@@ -69,12 +74,13 @@ def read_ome(text: str, n_images: int, path: Path) -> OmeMovie:
             f"{path}: its OME-XML assigns {len(np.unique(order))} of the file's {n_images} images "
             f"to {len(order)} frames; export it again so that both agree"
         )
-    return OmeMovie(order, _hints(first, axis))
+    return OmeMovie(order, _hints(root, first, axis))
 
 
 def read_ome_set(text: str, path: Path) -> OmeSet | None:
     """Read the OME-XML of a movie that lies in several files."""
-    images = _images(text, path)
+    root = _parse(text, path)
+    images = _images(root, path)
     files = _files(images)
     if len(files) < 2:
         return None
@@ -110,7 +116,7 @@ def read_ome_set(text: str, path: Path) -> OmeSet | None:
             f"{path}: its OME-XML does not say where {missing} of {len(where)} frames lie; "
             "the recording or the copy was interrupted: export it again"
         )
-    return OmeSet(tuple(files), where, _hints(pixels, axis))
+    return OmeSet(tuple(files), where, _hints(root, pixels, axis))
 
 
 def _refuse_too_many(frames: int, files: list[str], path: Path) -> None:
@@ -132,15 +138,14 @@ def _refuse_too_many(frames: int, files: list[str], path: Path) -> None:
 
 def files_of_set(text: str, path: Path) -> tuple[str, ...]:
     """Name the files that OME-XML describes."""
-    files = _files(_images(text, path))
+    files = _files(_images(_parse(text, path), path))
     if any(Path(name).name != name for name in files):
         raise _damaged(path, "it names files in other folders")
     return tuple(files)
 
 
-def _images(text: str, path: Path) -> list[ElementTree.Element]:
+def _images(root: ElementTree.Element, path: Path) -> list[ElementTree.Element]:
     """Give the pixels of every image that is described."""
-    root = _parse(text, path)
     elsewhere = next(_children(root, "BinaryOnly"), None)
     if elsewhere is not None:
         name = elsewhere.get("MetadataFile") or "the first file of the set"
@@ -250,7 +255,7 @@ def _order_of_series(
     return order, "I"
 
 
-def _hints(pixels: ElementTree.Element, axis: str) -> Hints:
+def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) -> Hints:
     planes = list(_children(pixels, "Plane"))
     exposures = (
         positive(plane.get("ExposureTime"), 1e3 * factor)
@@ -262,6 +267,9 @@ def _hints(pixels: ElementTree.Element, axis: str) -> Hints:
     rate, ticks = measure_clock(_times_s(planes, f"The{axis}"))
     if ticks is None:
         rate = inverse(increment) or rate
+    gain, offset = conversion_of(_annotations(root))
+    objective = _objective(root, pixels)
+    na = None if objective is None else positive(objective.get("LensNA"))
     return Hints(
         "ome",
         pixel_x_nm=_length(pixels, "PhysicalSizeX"),
@@ -269,7 +277,56 @@ def _hints(pixels: ElementTree.Element, axis: str) -> Hints:
         exposure_ms=next((value for value in exposures if value is not None), None),
         frame_rate_hz=rate,
         ticks=ticks,
+        gain_e_per_adu=gain,
+        offset_adu=offset,
+        wavelength_nm=_wavelength_nm(pixels),
+        na=na if na is not None and na < _LARGEST_NA else None,
+        magnification=None
+        if objective is None
+        else positive(objective.get("NominalMagnification")),
     )
+
+
+def _objective(
+    root: ElementTree.Element, pixels: ElementTree.Element
+) -> ElementTree.Element | None:
+    """Give the objective of an image: the one that its settings name, or the only one there is."""
+    found = [
+        objective
+        for instrument in _children(root, "Instrument")
+        for objective in _children(instrument, "Objective")
+    ]
+    image = next(image for image in _children(root, "Image") if pixels in list(image))
+    settings = next(_children(image, "ObjectiveSettings"), None)
+    if settings is not None:
+        found = [objective for objective in found if objective.get("ID") == settings.get("ID")]
+    return found[0] if len(found) == 1 else None
+
+
+def _wavelength_nm(pixels: ElementTree.Element) -> float | None:
+    """Give the wavelength of the illumination, where all channels have the same."""
+    channels = _children(pixels, "Channel")
+    found = {_length(channel, "ExcitationWavelength", "nm") for channel in channels}
+    wavelength = found.pop() if len(found) == 1 else None
+    low, high = WAVELENGTH_NM
+    return wavelength if wavelength is not None and low <= wavelength <= high else None
+
+
+def _annotations(root: ElementTree.Element) -> dict[str, str]:
+    """Collect the pairs that programs add: of maps, and what Bio-Formats keeps of other files."""
+    found: dict[str, str] = {}
+    for notes in _children(root, "StructuredAnnotations"):
+        for element in notes.iter():
+            kind = element.tag.rpartition("}")[2]
+            if kind == "M":
+                found[element.get("K", "")] = (element.text or "").strip()
+            elif kind == "OriginalMetadata":
+                key, value = (
+                    next((child.text or "" for child in _children(element, name)), "").strip()
+                    for name in ("Key", "Value")
+                )
+                found[key] = value
+    return found
 
 
 def _times_s(planes: list[ElementTree.Element], name: str) -> dict[int, float]:
@@ -286,8 +343,8 @@ def _times_s(planes: list[ElementTree.Element], name: str) -> dict[int, float]:
     return times
 
 
-def _length(element: ElementTree.Element, name: str) -> float | None:
-    factor = _factor(element, f"{name}Unit", "µm", LENGTH_NM)
+def _length(element: ElementTree.Element, name: str, unit: str = "µm") -> float | None:
+    factor = _factor(element, f"{name}Unit", unit, LENGTH_NM)
     return None if factor is None else positive(element.get(name), factor)
 
 

@@ -56,6 +56,10 @@ class Preview:
         With what the movie's metadata say.
     notes : tuple of str
         What the metadata left to say, one line each.
+    camera : LearnedCamera
+        Its numbers, and where they come from.
+    steady : Stack
+        The frames with what is unsteady in their light divided out.
 
     Raises
     ------
@@ -86,8 +90,10 @@ class Preview:
         movie, config, known = with_camera(movie, config, span)
         camera = known.camera
         self.config = config
+        self.camera = known
         self.notes = (*movie.notes, *notes, *known.messages)
         judged = judge_light(movie, config, camera)
+        self.steady = judged.steady
         self._search = _SEARCHES[background_mode(config)](
             judged.movie, config, camera, judged.lines
         )

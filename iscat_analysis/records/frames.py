@@ -31,6 +31,12 @@ class StackMetadata:
         Photoelectrons per count, as the camera's driver has it.
     offset_adu : float or None
         Counts in the dark, as the driver has it.
+    wavelength_nm : float or None
+        Of the illumination, in vacuum [nm].
+    na : float or None
+        Numerical aperture of the objective.
+    magnification : float or None
+        Of the objective, as engraved.
     source : str
         Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
     """
@@ -41,6 +47,9 @@ class StackMetadata:
     ticks: tuple[int, ...] | None = None
     gain_e_per_adu: float | None = None
     offset_adu: float | None = None
+    wavelength_nm: float | None = None
+    na: float | None = None
+    magnification: float | None = None
     source: str = "none"
 
 

@@ -31,6 +31,7 @@ _DOCUMENTS: Mapping[str, str] = {
     "camera": "calibration.Camera",
     "comparison": "bounds.Comparison",
     "fit": "fit.Fit",
+    "init": "setup.Init",
     "kd": "answers.Kd",
     "optics": "calibration.Optics",
     "optics_bounds": "bounds.OpticsBounds",
@@ -61,10 +62,10 @@ def schema(name: str) -> dict[str, Any]:
     Parameters
     ----------
     name : str
-        ``"fit"``, ``"batch"``, ``"simulate"`` or ``"bounds"`` for what the command prints with
-        ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds --preset`` and
-        ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several tables;
-        ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
+        ``"fit"``, ``"init"``, ``"batch"``, ``"simulate"`` or ``"bounds"`` for what the command
+        prints with ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds
+        --preset`` and ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several
+        tables; ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
         ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and what is printed
         beside it.
 

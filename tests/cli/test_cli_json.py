@@ -57,7 +57,7 @@ def _printed(capsys, *arguments: str) -> Any:
 
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
-        "batch", "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "kd",
+        "batch", "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "init", "kd",
         "optics", "optics_bounds", "simulate", "species", "species_comparison", "summary",
         "template",
     }  # fmt: skip

@@ -127,7 +127,7 @@ def test_unreadable_maps_are_refused(tmp_path: Path) -> None:
 
 def test_metadata_fills_what_is_absent() -> None:
     config = parse_config({"camera": {"exposure_ms": 5.0}})
-    resolved, notes = resolve_metadata(config, StackMetadata(84.4, 5.04, 200.0, "ome"))
+    resolved, notes = resolve_metadata(config, StackMetadata(84.4, 5.04, 200.0, source="ome"))
     assert resolved.camera.pixel_size_nm == 84.4
     assert resolved.camera.exposure_ms == 5.0
     assert resolved.camera.frame_rate_hz == 200.0
@@ -137,7 +137,7 @@ def test_metadata_fills_what_is_absent() -> None:
 
 def test_the_configuration_wins_and_says_so() -> None:
     config = parse_config({"camera": {"pixel_size_nm": 84.4, "frame_rate_hz": 100.0}})
-    resolved, notes = resolve_metadata(config, StackMetadata(50.0, None, 102.0, "imagej"))
+    resolved, notes = resolve_metadata(config, StackMetadata(50.0, None, 102.0, source="imagej"))
     assert resolved.camera.pixel_size_nm == 84.4
     assert len(notes) == 2
     assert notes[0].startswith("the pixel size is 84.4 nm in the configuration")

@@ -514,7 +514,7 @@ def test_reads_arrays_of_any_library(tmp_path: Path) -> None:
         for name, array in arrays.items():
             with open_stack(array, name=name, pixel_size_nm=84.4, frame_rate_hz=200) as stack:
                 assert stack.name == name
-                assert stack.metadata == StackMetadata(84.4, None, 200, "arguments")
+                assert stack.metadata == StackMetadata(84.4, None, 200, source="arguments")
                 assert stack.dtype == np.dtype("u2")
                 block = stack.read(2, 5)
                 np.testing.assert_array_equal(block, expected[2:5])

@@ -10,6 +10,9 @@ import tifffile
 from numpy.typing import NDArray
 from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
 
+from iscat_analysis.camera.learned import learn_camera
+from iscat_analysis.camera.metadata import resolve_metadata
+from iscat_analysis.config import CameraConfig, configure
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.clock import measure_clock
@@ -183,6 +186,93 @@ def test_ome_series_are_refused(path: Path) -> None:
         open_stack(ome(path, more=more))
 
 
+INSTRUMENT = (
+    '<Instrument ID="Instrument:0"><Objective ID="Objective:0" LensNA="1.3" '
+    'NominalMagnification="60"/>{second}</Instrument>'
+)
+SECOND = '<Objective ID="Objective:1" LensNA="0.75" NominalMagnification="20"/>'
+
+
+def with_instrument(path: Path, settings: str = "", second: str = "", channel: str = "") -> Path:
+    text = OME.format(pixels="", body=channel, more=INSTRUMENT.format(second=second))
+    return described(path, text.replace("<Pixels", f"{settings}<Pixels"))
+
+
+@pytest.mark.parametrize(
+    ("settings", "second", "found"),
+    [
+        ("", "", (1.3, 60)),
+        ('<ObjectiveSettings ID="Objective:1"/>', SECOND, (0.75, 20)),
+        ("", SECOND, (None, None)),  # which of the two, nobody says
+        ('<ObjectiveSettings ID="Objective:7"/>', SECOND, (None, None)),
+    ],
+)
+def test_ome_objective(path: Path, settings: str, second: str, found: tuple) -> None:
+    read = metadata(with_instrument(path, settings, second))
+    assert (read.na, read.magnification) == found
+
+
+@pytest.mark.parametrize(
+    ("channels", "wavelength_nm"),
+    [
+        (['ExcitationWavelength="532"'], 532),
+        (['ExcitationWavelength="0.532" ExcitationWavelengthUnit="µm"'], 532),
+        (['ExcitationWavelength="445"', 'ExcitationWavelength="445"'], 445),
+        (['ExcitationWavelength="445"', 'ExcitationWavelength="532"'], None),
+        (['ExcitationWavelength="532" ExcitationWavelengthUnit="Hz"'], None),
+        (['ExcitationWavelength="5"'], None),
+        (['EmissionWavelength="600"'], None),  # of fluorescence, and not of what illuminates
+    ],
+)
+def test_ome_wavelength(path: Path, channels: list[str], wavelength_nm: float | None) -> None:
+    body = "".join(f'<Channel ID="Channel:0:{k}" {c}/>' for k, c in enumerate(channels))
+    found = metadata(ome(path, body=body)).wavelength_nm
+    assert found == (wavelength_nm if wavelength_nm is None else pytest.approx(wavelength_nm))
+
+
+def test_ome_keeps_the_conversion_of_hamamatsu(path: Path) -> None:
+    """As Bio-Formats copies it; Gain and Offset of a Detector have no unit and are not read."""
+    pair = (
+        "<OriginalMetadata><Key>Cam-CONVERSION FACTOR {}</Key><Value>{}</Value></OriginalMetadata>"
+    )
+    pairs = "".join(pair.format(*one) for one in (("COEFF", "0.46"), ("OFFSET", "100")))
+    notes = f"<StructuredAnnotations><XMLAnnotation><Value>{pairs}</Value></XMLAnnotation>"
+    found = metadata(ome(path, more=f"{notes}</StructuredAnnotations>"))
+    assert (found.gain_e_per_adu, found.offset_adu) == (0.46, 100)
+    slider = '<Instrument><Detector ID="Detector:0" Gain="4" Offset="7"/></Instrument>'
+    assert metadata(ome(path, more=slider)) == StackMetadata()
+
+
+# --- what is read is used --------------------------------------------------------------------
+
+
+def test_optics_of_the_file_take_the_place_of_defaults_only(path: Path) -> None:
+    channel = '<Channel ID="Channel:0:0" ExcitationWavelength="445"/>'
+    read = metadata(with_instrument(path, channel=channel))
+    used, notes = resolve_metadata(configure({"camera.pixel_size_nm": 84.4}), read)
+    assert (used.optics.na, used.optics.wavelength_nm) == (1.3, 445)
+    assert [note.split(",")[0] for note in notes] == ["the wavelength is 445 nm", "the NA is 1.3"]
+    given = configure({"camera.pixel_size_nm": 84.4, "optics.na": 1.42})
+    given = configure(given, settings={"optics.wavelength_nm": 450.0})
+    used, notes = resolve_metadata(given, read)
+    assert (used.optics.na, used.optics.wavelength_nm) == (1.42, 450)
+    assert len(notes) == 1
+    assert "the NA is 1.42 in the configuration (optics.na) but 1.3 in" in notes[0]
+
+
+def test_a_default_stays_one_when_other_keys_change() -> None:
+    changed = configure(configure(), settings={"camera.pixel_size_nm": 84.4})
+    used, _ = resolve_metadata(changed, StackMetadata(na=1.3, source="ome"))
+    assert used.optics.na == 1.3
+
+
+def test_an_aperture_that_the_oil_does_not_admit_is_refused() -> None:
+    with pytest.raises(DataError, match=r"ome metadata do not suit.*below n_immersion"):
+        resolve_metadata(
+            configure({"camera.pixel_size_nm": 84.4}), StackMetadata(na=1.7, source="ome")
+        )
+
+
 # --- ImageJ ------------------------------------------------------------------------------------
 
 
@@ -218,6 +308,44 @@ def test_imagej_as_tifffile_writes_it(path: Path) -> None:
     found = metadata(path)
     assert found.pixel_size_nm == pytest.approx(50, rel=1e-6)
     assert found.frame_rate_hz == pytest.approx(100)
+
+
+@pytest.mark.parametrize(
+    ("lines", "gain", "offset"),
+    [
+        ("cf=0\nc0=-46.0\nc1=0.46\nvunit=electrons", 0.46, 100),
+        ("cf=0\nc0=-46.0\nc1=0.46\nvunit=e-", 0.46, 100),
+        ("cf=0\nc0=-32768.0\nc1=1.0\nvunit=Gray Value", None, 32768),
+        ("cf=0\nc0=-46.0\nc1=0.46\nvunit=OD", None, None),
+        ("cf=3\nc0=-46.0\nc1=0.46\nvunit=electrons", None, None),  # an exponential
+        ("cf=0\nc0=-46.0\nc1=-0.46\nvunit=electrons", None, None),
+        ("cf=0\nc0=nan\nc1=0.46\nvunit=electrons", None, None),
+        ("cf=0\nc1=0.46\nvunit=electrons", None, None),
+    ],
+)
+def test_imagej_counts(path: Path, lines: str, gain: float | None, offset: float | None) -> None:
+    found = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    assert found.gain_e_per_adu == gain
+    assert found.offset_adu == (None if offset is None else pytest.approx(offset))
+
+
+def test_the_zero_of_signed_numbers_makes_the_gain_right(path: Path) -> None:
+    """2 e per count; without the line, 32768 counts would be light and the gain far off."""
+    light = np.random.default_rng(4).poisson(4000.0, (FRAMES * 8, 48, 48))
+    counts = (light / 2 + 32768).round().astype("uint16")
+    text = "ImageJ=1.53t\nimages=40\nframes=40\n{}"
+    learned = []
+    for line in ("cf=0\nc0=-32768.0\nc1=1.0\nvunit=Gray Value\n", ""):
+        tags: dict = {270: (ASCII, text.format(line))}
+        write_tiff(path, pages_of(counts), counts.shape[1:], page_tags={0: tags})
+        with open_stack(path) as stack:
+            found = learn_camera(stack, CameraConfig(), (0, 40), metadata=stack.metadata)
+        learned.append(found.numbers)
+    gain = learned[0]["gain_e_per_adu"]
+    assert abs(gain.value - 2) < 4 * gain.se
+    assert gain.se < 0.05
+    assert learned[0]["offset_adu"].source == "metadata"
+    assert learned[1]["gain_e_per_adu"].value > 10
 
 
 # --- Micro-Manager -----------------------------------------------------------------------------

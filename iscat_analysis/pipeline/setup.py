@@ -1,0 +1,325 @@
+"""From a bare movie to a configuration: what the file says, what is measured, what is asked.
+
+`write_setup` writes ``iscat.toml`` beside the movie, where `iscat-fit` finds it.  Every value in it
+has its origin beside it: the file's metadata, this movie's own noise, an answer of the user, or a
+default.  Then the search looks at some frames, so that one sees whether the values make sense.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.camera.learned import ASSUMPTION, METADATA, LearnedCamera
+from iscat_analysis.camera.learned import MEASURED as BY_NOISE
+from iscat_analysis.config import AUTO, Config, configure, toml_value
+from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.files import whole_file
+from iscat_analysis.movie import Stack, open_stack
+from iscat_analysis.movie.addresses import setup_beside
+from iscat_analysis.pipeline.preview import Preview
+from iscat_analysis.records import StackMetadata
+from iscat_analysis.text import in_toml
+from iscat_analysis.units import count
+
+ANSWER, DEFAULT, MEASURED = "your answer", "default", "measured here"
+"""Where a value comes from, if not from the file's metadata."""
+
+SAMPLES = ("protein", "gold", "silica", "polystyrene")
+"""Kinds of samples: what the particles are made of."""
+
+_LOOKS = 5  # places in a movie at which the search looks
+_LIT = 16  # frames whose light is averaged
+_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
+
+
+@dataclass(frozen=True)
+class Question:
+    """What nobody but the user may know, and what is taken otherwise; None: it must be known."""
+
+    key: str
+    words: str
+    default: float | str | None
+    choices: tuple[str, ...] = ()
+
+
+_NOBODY = Config()  # what is taken where nobody says anything
+_QUESTIONS = (
+    Question("camera.pixel_size_nm", "size of a pixel in the sample plane [nm]", None),
+    Question("optics.wavelength_nm", "wavelength in vacuum [nm]", _NOBODY.optics.wavelength_nm),
+    Question("optics.na", "numerical aperture of the objective", _NOBODY.optics.na),
+    Question("particle.kind", "kind of sample", _NOBODY.particle.kind, SAMPLES),
+)
+_STANDING = ("optics.n_immersion", "optics.n_sample")  # shown, since they may have to be changed
+_EACH_MOVIE = ("camera.exposure_ms", "camera.frame_rate_hz")  # left to the metadata of each
+_ORIGINS = {ASSUMPTION: DEFAULT, METADATA: "the file's metadata", BY_NOISE: MEASURED}
+_CAMERA = ("camera.gain_e_per_adu", "camera.offset_adu", "camera.read_noise_e")
+
+
+@dataclass(frozen=True)
+class Value:
+    """A key of the configuration, its value, and where that comes from.
+
+    What is not `written` is shown in the file as a comment, and every movie tells it anew.
+    """
+
+    key: str
+    value: float | str
+    origin: str
+    se: float | None = None
+    written: bool = True
+
+    @property
+    def shown(self) -> str:
+        """The value in words, with its standard error where there is one."""
+        if isinstance(self.value, str):
+            return self.value
+        return f"{self.value:.4g}" + (f" ± {self.se:.2g}" if self.se else "")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What `write_setup` found, and the file that it wrote."""
+
+    movie: str
+    shape: tuple[int, int, int]
+    values: tuple[Value, ...]
+    config: Config
+    notes: tuple[str, ...]
+    preview: Mapping[str, Any]
+    out: Path
+
+    def to_dict(self) -> dict[str, Any]:
+        """Give it as the document ``init``."""
+        return {
+            "movie": self.movie,
+            "shape": list(self.shape),
+            "values": {
+                each.key: {"value": each.value, "se": each.se, "from": each.origin}
+                for each in self.values
+            },
+            "notes": list(self.notes),
+            "preview": dict(self.preview),
+            "out": str(self.out),
+        }
+
+
+def write_setup(
+    movie: Path,
+    *,
+    answers: Mapping[str, float | str] | None = None,
+    ask: Callable[[Question], str] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> Setup:
+    """Write a configuration for a movie, and look at some of its frames with it.
+
+    `answers` are keys of the configuration and what the user has said already; `ask` puts the
+    questions that are left, and without it defaults are taken; `tell` says what is known, line by
+    line.
+    """
+    target = setup_beside(movie) if out is None else out
+    if target.exists() and not overwrite:
+        raise DataError(f"{target}: exists already; give another name, or pass `overwrite`")
+    with open_stack(movie) as stack:
+        frames, rows, columns = stack.shape
+        tell(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
+        known = _known(stack.metadata, answers or {})
+        tell(_metadata_said(stack))
+        values, config = _ask_the_rest(known, ask, tell)
+        if config.camera.pixel_size_nm is None:
+            raise DataError(
+                f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
+                "guess: give `pixel_size_nm`, in the sample plane"
+            )
+        values += [Value(key, _get(_NOBODY, key), DEFAULT) for key in _STANDING]
+        preview = Preview(stack, config)
+        mode, preview = _mode_of(preview, stack, config)
+        values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.camera)]
+        found = Setup(
+            movie=stack.name,
+            shape=stack.shape,
+            values=tuple(values),
+            config=preview.config,
+            notes=preview.notes,
+            preview=_look_around(preview),
+            out=target,
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with whole_file(target) as partial:
+        partial.write_text(_toml(found), encoding="utf-8")
+    return found
+
+
+def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
+    """Collect what answers and metadata say of what would be asked; answers win."""
+    known = []
+    for question in _QUESTIONS:
+        said = getattr(metadata, question.key.partition(".")[2], None)
+        if question.key in answers:
+            known.append(Value(question.key, answers[question.key], ANSWER))
+        elif said is not None:
+            known.append(Value(question.key, said, _of_file(metadata)))
+    return known
+
+
+def _ask_the_rest(
+    known: list[Value], ask: Callable[[Question], str] | None, tell: Callable[[str], None]
+) -> tuple[list[Value], Config]:
+    """Put one question at a time, and once more where the answer cannot be."""
+    config = configure(None, settings={each.key: each.value for each in known})
+    values = list(known)
+    open_questions = [q for q in _QUESTIONS if q.key not in {each.key for each in known}]
+    if open_questions:
+        tell("not known: " + ", ".join(question.words for question in open_questions))
+    for question in open_questions:
+        answer: float | str | None = question.default
+        while ask is not None:
+            answer = ask(question)
+            try:
+                config = configure(config, settings={question.key: answer})
+                break
+            except ConfigError as error:
+                tell(str(error))
+        if answer is None:
+            continue
+        given = _get(config, question.key)
+        values.append(Value(question.key, given, DEFAULT if given == question.default else ANSWER))
+    config = configure(None, settings={each.key: each.value for each in values})
+    return values, config
+
+
+def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Preview]:
+    """Take particles to move where the frames show it clearly, and to land otherwise."""
+    changes = look_at_changes(preview.steady, preview.config, preview.camera.camera, preview.frames)
+    if not as_moving(changes, stack.name):
+        return Value("fit.mode", config.fit.mode, DEFAULT), preview
+    moving = configure(config, settings={"fit.mode": "track"})
+    return Value("fit.mode", "track", MEASURED), Preview(stack, moving)
+
+
+def _each_movie(metadata: StackMetadata) -> list[Value]:
+    """Show what the metadata of every movie say, and its configuration should not."""
+    said = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
+    return [
+        Value(key, value, _of_file(metadata), written=False)
+        for key, value in said.items()
+        if value is not None
+    ]
+
+
+def _camera_values(camera: LearnedCamera) -> list[Value]:
+    """Give the camera's numbers, which every movie tells anew."""
+    values = []
+    for key in _CAMERA:
+        number = camera.numbers[key.partition(".")[2]]
+        origin = _ORIGINS.get(number.source, f"{MEASURED} ({number.source})")
+        values.append(Value(key, number.value, origin, number.se or None, written=False))
+    return values
+
+
+def _look_around(preview: Preview) -> dict[str, Any]:
+    """Search at places all over the movie that have no frame in common."""
+    (first, last), window = preview.frames, preview.window
+    apart = 1 if preview.config.fit.mode == "track" else window
+    places = max(1, min(_LOOKS, (last - first) // (2 * apart)))
+    at = np.linspace(first, last, places + 1)
+    looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
+    found = [look.found() for look in looks]
+    lit = preview.steady.read(first, min(first + _LIT, last))
+    strongest = max((float(table["snr"].abs().max()) for table in found if len(table)), default=0.0)
+    return {
+        "frames": [look.frame for look in looks],
+        "window": window,
+        "candidates": [len(table) for table in found],
+        "threshold_snr": looks[0].threshold,
+        "strongest_snr": strongest if strongest else None,
+        "noise_contrast": float(np.median([_spread(look.image) for look in looks])),
+        "light_e": float(np.mean(preview.camera.camera.to_electrons(lit))),
+    }
+
+
+def _spread(image: np.ndarray[Any, Any]) -> float:
+    """Give the standard deviation of the pixels, which a few particles do not change.
+
+    Shapes: `image` (y, x).
+    """
+    used = image[np.isfinite(image)]
+    return float(_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
+
+
+def _toml(setup: Setup) -> str:
+    """Write the file: each value with what it is and where it comes from."""
+    lines = [
+        f"# Configuration for {in_toml(setup.movie)}, written by `iscat init`; iscat-fit finds it",
+        "# where it lies beside a movie.  Behind each value stands where it comes from.  A line",
+        "# that begins with # is unset; `iscat config` prints every key there is.",
+    ]
+    for section in Config.model_fields:
+        own = [each for each in setup.values if each.key.startswith(f"{section}.")]
+        lines += ["", f"[{section}]"] if own else []
+        for each in own:
+            name = each.key.partition(".")[2]
+            if each.key in _CAMERA:
+                line = f"{name} = {toml_value(AUTO)}"
+                origin = f"{each.shown} in this movie: {each.origin}"
+            else:
+                line = f"{'' if each.written else '# '}{name} = {toml_value(each.value)}"
+                origin = each.origin if each.written else f"{each.origin}; taken from each movie"
+            lines.append(f"{line:<32} # {origin}")
+    return "\n".join(lines) + "\n"
+
+
+def _metadata_said(stack: Stack) -> str:
+    """Give in one line what the file says of itself."""
+    metadata = stack.metadata
+    parts = [
+        words.format(value)
+        for key, words in (
+            ("pixel_size_nm", "pixels of {:.4g} nm"),
+            ("wavelength_nm", "wavelength {:.4g} nm"),
+            ("na", "NA {:.4g}"),
+            ("magnification", "{:.4g}×"),
+            ("exposure_ms", "exposure {:.4g} ms"),
+            ("frame_rate_hz", "{:.4g} frames per second"),
+            ("gain_e_per_adu", "{:.4g} e per count"),
+            ("offset_adu", "offset {:.4g} counts"),
+        )
+        if (value := getattr(metadata, key)) is not None
+    ]
+    if not parts:
+        return f"{stack.name}: the file has no metadata that help"
+    return f"{stack.name}: its {metadata.source} metadata say " + ", ".join(parts)
+
+
+def _of_file(metadata: StackMetadata) -> str:
+    return f"the file's metadata ({metadata.source})"
+
+
+def _get(config: Config, key: str) -> Any:
+    section, _, name = key.partition(".")
+    return getattr(getattr(config, section), name)
+
+
+def preview_said(setup: Setup) -> list[str]:
+    """Say in a few lines what the search saw."""
+    seen = setup.preview
+    total, places = sum(seen["candidates"]), len(seen["frames"])
+    moving = setup.config.fit.mode == "track"
+    where = count(places, "frame" if moving else "place")
+    windows = "" if moving else f", with windows of {count(seen['window'], 'frame')}"
+    strongest = f", the strongest at {seen['strongest_snr']:.1f}" if seen["strongest_snr"] else ""
+    return [
+        f"light: {seen['light_e']:.3g} photoelectrons in a pixel of a frame; noise of the contrast "
+        f"that is searched: {seen['noise_contrast']:.2g}",
+        f"preview: {count(total, 'candidate')} at {where} of the movie{windows}; threshold "
+        f"{seen['threshold_snr']:.1f} times the noise{strongest}",
+    ]
