@@ -126,7 +126,7 @@ def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> 
 
 def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
     """Make a table of events whose frames are given."""
-    return make_rows(lines_of(scene, events), event=range(len(events)))
+    return make_rows(lines_of(scene, events), {"event": range(len(events))})
 
 
 def view_of(

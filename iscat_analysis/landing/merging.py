@@ -99,7 +99,7 @@ class Merged:
         """Events of all chunks, each once, numbered in order of frame; their views and repeats."""
         homes = [(done, row) for done in self._done for row in range(len(done.lines))]
         if not homes:
-            return make_rows([], event=[], **{FRAME_COLUMN: []}), (), ()
+            return make_rows([], {"event": [], FRAME_COLUMN: []}), (), ()
         table = pd.concat([d.lines for d in self._done if len(d.lines)], ignore_index=True)
         cores = np.array([done.core for done, _ in homes])
         frame = table["frame"].to_numpy()
@@ -121,7 +121,7 @@ class Merged:
                 views.append(view if number < CLIPS else replace(view, clip=None))
         told = [homes[i][0].evidence[homes[i][1]] for i in order]
         self.evidence = np.array(told).reshape(-1, len(NOTHING))
-        rows = make_rows(table.iloc[order], event=range(len(order)))
+        rows = make_rows(table.iloc[order], {"event": range(len(order))})
         return rows, tuple(views), tuple(repeats)
 
     def searched(self) -> Searched:

@@ -156,7 +156,7 @@ def fit_rois(
     compile_kernels(counts.model, parts)
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
-    table = make_rows(rows, event=range(count))
+    table = make_rows(rows, {"event": range(count)})
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 

@@ -73,7 +73,7 @@ def gather(
     recorded = ready.movie.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
-        table = make_rows(table, tick=ticks[table["frame"].to_numpy(int)])
+        table = make_rows(table, {"tick": ticks[table["frame"].to_numpy(int)]})
     for flag in ready.flags:
         table = flagged(table, flag)
     scale = scene.model.scale

@@ -79,7 +79,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
-    table = make_rows(fits, **columns)
+    table = make_rows(fits, columns)
     budget = budget_of(
         table, shared, achieved,
         calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",

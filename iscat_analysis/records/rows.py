@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus
 
 
 def make_rows(
-    lines: pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any]], **columns: Any
+    lines: pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any]],
+    columns: Mapping[str, Any] = MappingProxyType({}),
 ) -> pd.DataFrame:
     """Put lines below one another, in the order and with the types of the registry.
 
@@ -23,7 +25,7 @@ def make_rows(
     """
     whole = isinstance(lines, (pd.DataFrame, Mapping))
     table = pd.DataFrame(lines if whole else list(lines)).reset_index(drop=True)
-    table = table.assign(**columns)
+    table = table.assign(**dict(columns))
     unknown = set(table) - {column.name for column in EVENTS}
     if unknown:
         raise ValueError(f"no column of fits.csv: {', '.join(sorted(unknown))}; see `EVENTS`")

@@ -289,7 +289,7 @@ def track_frames(
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
     own = numbers[order]
-    fits = make_rows([lines[k] for k in order], event=own, track=own)
+    fits = make_rows([lines[k] for k in order], {"event": own, "track": own})
     seen: dict[int, EventView] = {}
     for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
         if number not in seen:

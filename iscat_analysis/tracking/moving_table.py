@@ -102,7 +102,7 @@ def table_of_tracks(
     status = [str(status) for status, _ in judged]
     flags = [";".join(map(str, flags)) for _, flags in judged]
     status, flags = (np.array(said, dtype=object)[2 * numbers + off] for said in (status, flags))
-    return make_rows(table, status=status, flags=flags)
+    return make_rows(table, {"status": status, "flags": flags})
 
 
 def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:

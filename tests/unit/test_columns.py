@@ -34,7 +34,7 @@ def test_every_column_is_named_once_and_described(columns) -> None:
 
 
 def test_rows_have_the_order_and_the_types_of_the_registry() -> None:
-    table = make_rows([{FRAME_COLUMN: 2} | LINE], event=range(1), systematic_z_nm=[0.5])
+    table = make_rows([{FRAME_COLUMN: 2} | LINE], {"event": range(1), "systematic_z_nm": [0.5]})
     assert list(table) == [*EVENT_COLUMNS, "systematic_z_nm", FRAME_COLUMN]
     types = {column.name: column.dtype for column in EVENTS}
     assert {name: str(kind) for name, kind in table.dtypes.items()} == {
@@ -46,7 +46,7 @@ def test_rows_have_the_order_and_the_types_of_the_registry() -> None:
 def test_a_row_has_its_number_once_it_is_given() -> None:
     lines = make_rows([LINE, LINE])
     assert list(lines) == list(EVENT_COLUMNS[1:])
-    assert list(make_rows(lines, event=[4, 5])["event"]) == [4, 5]
+    assert list(make_rows(lines, {"event": [4, 5]})["event"]) == [4, 5]
 
 
 def test_sums_do_not_say_when() -> None:
