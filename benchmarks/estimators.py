@@ -109,7 +109,7 @@ def heights(report: Report) -> None:
         found = run_trials(
             experiment, count, seed=report.seed, stream=1, workers=report.workers, truths=truths
         )
-        wrong = np.abs(found.estimate - truths)[:, 2] > experiment.scene.model.fringe_nm / 4
+        wrong = np.abs(found.estimate - truths)[:, 2] > experiment.context.model.fringe_nm / 4
         silent = int(np.sum(wrong & found.unflagged))
         report.numbers[f"heights.{mode}"] = {
             "trials": count, "wrong": int(wrong.sum()), "silent": silent,

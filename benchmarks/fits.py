@@ -109,8 +109,8 @@ class Batch:
 
     def __init__(self, side: int, count: int) -> None:
         self.setting = experiment(side)
-        compile_kernels(self.setting.scene.model, parts_of(self.setting.free, posteriors=False))
-        pixel, truth = self.setting.scene.pixel_nm, self.setting.truth
+        compile_kernels(self.setting.context.model, parts_of(self.setting.free, posteriors=False))
+        pixel, truth = self.setting.context.pixel_nm, self.setting.truth
         self.sets: list[tuple[Likelihood, FloatArray, Box]] = []
         for i in range(count):
             random = trial_generator(5, side, i)
@@ -160,7 +160,7 @@ class Batch:
     def whole_fits_per_second(self, mode: str) -> float:
         """Fits with the search of heights, uncertainty and goodness of fit, as a movie's are."""
         setting, z_nm, some = self.whole[mode]
-        pixel, truth = setting.scene.pixel_nm, setting.truth
+        pixel, truth = setting.context.pixel_nm, setting.truth
         start = Candidate(truth[0] / pixel + 0.3, truth[1] / pixel - 0.3, z_nm, 800.0, 0.0)
         fit_particle(some[0], start, mode, (0.0, 500.0), level=False)
         begun = time.process_time()

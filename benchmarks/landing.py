@@ -38,7 +38,7 @@ from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import load_config
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.search.sliding import make_chunk, make_filter, measure_frames, sliding_maps
 from iscat_analysis.study.simulate import write_stack
 
@@ -180,7 +180,7 @@ def rolling_average(video: np.ndarray, window: int) -> None:
 def sliding_ratio(frames: int, side: int, peer: Path | None) -> dict[str, float | str]:
     """Frames per second of both, in turns."""
     config = load_config(CONFIG, [f"simulation.shape=[{side}, {side}]"])
-    template = make_scene(config, (side, side), sliding=True).templates.images[0]
+    template = make_context(config, (side, side), sliding=True).templates.images[0]
     counts = np.random.default_rng(0).poisson(25000, (frames, side, side)).astype(np.uint16)
     camera = Camera(gain_e_per_adu=4.0)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:

@@ -145,7 +145,7 @@ def analyse(movie: InstrumentMovie, config: Config, said: list[str]) -> Detectio
         movie,
         config,
         camera_from_config(config.camera, movie.shape[1:], movie.dtype),
-        tell=said.append,
+        warn=said.append,
         progress=lambda *_: None,
     )
 
@@ -245,7 +245,7 @@ def learn(name: str, changes: Mapping[str, Any], seed: int) -> dict[str, Any]:
     said: list[str] = []
     camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
     start = time.perf_counter()
-    config, found = learn_optics(movie, config, camera, tell=said.append)
+    config, found = learn_optics(movie, config, camera, warn=said.append)
     learning = time.perf_counter() - start
     result = analyse(movie, config, said)
     table = counted(result)

@@ -24,9 +24,9 @@ from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import misfit_warning
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import table_of
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import FRAME_COLUMN
 
 SHAPE = (200, 200, 200)
@@ -46,13 +46,13 @@ def judge(name: str, seed: int) -> dict[str, Any]:
     landings = draw_landings(SHAPE, COUNT, seed=seed, frame=BOUND, apart_px=12.0)
     movie = InstrumentMovie(Instrument(**MICROSCOPES[name]), SHAPE, landings, seed=seed + 2)
     config = fixed(nominal())
-    scene = make_scene(config, SHAPE[1:])
+    context = make_context(config, SHAPE[1:])
     start = time.process_time()
     camera = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
     windows = measure_windows(movie, camera, (0, BOUND), (BOUND, SHAPE[0]))
     with ThreadPoolExecutor(1) as pool:
-        events, windows = fit_field(scene, windows, pool=pool)
-    table = table_of(scene, events)
+        events, windows = fit_field(context, windows, pool=pool)
+    table = table_of(context, events)
     seconds = time.process_time() - start
     table = table[table["status"] != "sidelobe"].reset_index(drop=True)
     table = table.assign(frame=BOUND, **{FRAME_COLUMN: 0})

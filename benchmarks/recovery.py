@@ -67,7 +67,7 @@ def analyse(config: Config, seed: int) -> tuple[pd.DataFrame, DetectionResult]:
         counts[frame] = image
     found = analyse_landings(
         Memory(counts), config, camera_from_config(config.camera, simulation.shape, np.uint16),
-        tell=lambda text: print(f"   {text}", flush=True), progress=lambda *_: None,
+        warn=lambda text: print(f"   {text}", flush=True), progress=lambda *_: None,
     )  # fmt: skip
     truth = movie.truth
     landing = truth.assign(sign=1)

@@ -77,11 +77,11 @@ class Messages:
         """Show how far the work is: bars on a terminal, a line now and then elsewhere."""
         with self._shown() as shown:
 
-            def tell(stage: str, done: int, total: int) -> None:
+            def warn(stage: str, done: int, total: int) -> None:
                 self.writing = stage == "report" and done < total
                 shown(stage, done, total)
 
-            yield tell
+            yield warn
 
     @contextmanager
     def _shown(self) -> Iterator[Progress]:

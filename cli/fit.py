@@ -142,14 +142,14 @@ def fit(
             messages.notify(f"the configuration is {config}, which lies beside the movie")
         resolved = load_config(config, changes)
 
-        from iscat_analysis.executors import open_place
+        from iscat_analysis.executors import open_executor
 
         movie, many = stack, resolved.compute.workers
         if raw is not None:
             stack = Path(f"{stack}{MARK}{raw}")
         folder = beside(stack, ".iscat") if out is None else out
         with (
-            open_place(scheduler, scheduler_file, shared=movie, workers=many) as place,
+            open_executor(scheduler, scheduler_file, shared=movie, workers=many) as place,
             messages.progress() as progress,
         ):
             from iscat_analysis.pipeline import fit_stack  # while the second process imports

@@ -88,7 +88,7 @@ def init(
             movie,
             answers={key: value for key, value in given.items() if value is not None},
             ask=None if yes or not sys.stdin.isatty() else _asker(),
-            tell=messages.notify,
+            warn=messages.notify,
             out=out,
             overwrite=overwrite,
         )

@@ -197,7 +197,7 @@ def _second_for(movie: Path | None, workers: int) -> SecondProcess | None:
 
 
 class DaskExecutor:
-    """The workers of a Dask cluster; `open_place` connects to one."""
+    """The workers of a Dask cluster; `open_executor` connects to one."""
 
     distant = True
 
@@ -362,7 +362,7 @@ def _work(expected: dict[str, str], sent: bytes) -> bytes:
 
 
 @contextmanager
-def open_place(
+def open_executor(
     scheduler: str = THREADS,
     scheduler_file: str | Path | None = None,
     *,

@@ -16,7 +16,7 @@ from iscat_analysis.answers.calibrations import optics_calibration
 from iscat_analysis.bounds import bounds_report
 from iscat_analysis.config import Config, configure
 from iscat_analysis.config.values import LARGEST_NM
-from iscat_analysis.executors import THREADS, open_place
+from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.instrument.learner import OpticsCalibration, OpticsForecast
 from iscat_analysis.instrument.learner import forecast_optics as _forecast
@@ -113,7 +113,7 @@ def fit_movie(
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite)
-    with open_stack(movie, name=name) as stack, open_place(scheduler, scheduler_file) as place:
+    with open_stack(movie, name=name) as stack, open_executor(scheduler, scheduler_file) as place:
         command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
         analysis = analyse(stack, resolved, progress=progress, command=command, place=place)
     result = Result(analysis)

@@ -26,7 +26,7 @@ _NINE_IN_TEN = 0.9
 _NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 
 
-def find_seams(
+def find_amplifier_boundaries(
     changes: Changes, window: int, known: AmplifierBoundaries = ((), ())
 ) -> AmplifierBoundaries:
     """Look for rows and columns at which the changes of the light have a step."""

@@ -26,11 +26,15 @@ import numpy as np
 from numpy.polynomial.legendre import legvander, legvander2d
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.amplifier_boundaries import AmplifierBoundaries, find_seams, parts_of
+from iscat_analysis.camera.amplifier_boundaries import (
+    AmplifierBoundaries,
+    find_amplifier_boundaries,
+    parts_of,
+)
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.fringes import NO_FRINGES, Fringes, find_fringes
 from iscat_analysis.camera.light_changes import Changes
-from iscat_analysis.camera.stray_light import find_haze, lift
+from iscat_analysis.camera.stray_light import find_stray_light, lift
 from iscat_analysis.records import BoolArray, FloatArray
 
 HIGHEST_DEGREE = 12
@@ -192,7 +196,7 @@ def find_surface(
     seamless = _even(changes, replace(found, fringes=NO_FRINGES))
     degree, rms = _smooth(seamless, window, highest, found.fringes)
     found = replace(found, degree=degree, rms=rms)
-    found = replace(found, haze=find_haze(_even(changes, found), window))
+    found = replace(found, haze=find_stray_light(_even(changes, found), window))
     return found if found.measures else None
 
 
@@ -200,7 +204,7 @@ def _patterns(changes: Changes, window: int, highest: int) -> Surface:
     """Look for seams and fringes, which hide each other."""
     found = Surface(changes.light_e, 0, 0.0)
     for _ in range(_ROUNDS):
-        seams = find_seams(_even(changes, found), window, found.seams)
+        seams = find_amplifier_boundaries(_even(changes, found), window, found.seams)
         if len(found.fringes.waves) and seams == found.seams:
             break
         found = replace(found, seams=seams, fringes=NO_FRINGES)

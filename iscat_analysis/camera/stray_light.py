@@ -33,7 +33,7 @@ def lift(light_e: FloatArray) -> FloatArray:
     return np.where(used, light_e[used].mean() / np.where(used, light_e, 1.0), 0.0)
 
 
-def find_haze(changes: Changes, window: int) -> float:
+def find_stray_light(changes: Changes, window: int) -> float:
     """Look for something that is added to all pixels alike, and changes."""
     light, more = changes.light_e, lift(changes.light_e)
     rows, columns = (

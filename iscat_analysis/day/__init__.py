@@ -25,7 +25,7 @@ from iscat_analysis.day.run import Outcome, Runner
 from iscat_analysis.day.state import Records, claim_folder, hash_of
 from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.executors import THREADS, open_place
+from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
@@ -186,15 +186,15 @@ def batch(
         raise ConfigError(f"`standards`: {error}") from None
     plan = make_plan(table, configure(config, settings=settings), named)
     claim_folder(folder)
-    tell = notify or (lambda _: None)
+    warn = notify or (lambda _: None)
     said = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
     outcomes: dict[str, Outcome] = {}
     try:
         where = (THREADS, None) if merge else (scheduler, scheduler_file)
-        with open_place(*where) as place:
+        with open_executor(*where) as place:
             for remark in place.remarks(plan.config.compute.memory_limit_mb):
-                tell(remark)
-            runner = Runner(folder, Records(folder), merge, progress, tell, said, place, retry)
+                warn(remark)
+            runner = Runner(folder, Records(folder), merge, progress, warn, said, place, retry)
             day = calibrate_day(plan, runner)
             wanted = part_of(plan.movies, only)
             progress("movies", 0, len(wanted))
@@ -205,7 +205,7 @@ def batch(
                     outcomes[name] = outcome
                     if outcome.ran:
                         which = f"{len(outcomes)} of {len(wanted)}: " if len(wanted) > 1 else ""
-                        tell(f"{which}{name}: {_short(outcome)}")
+                        warn(f"{which}{name}: {_short(outcome)}")
                     progress("movies", len(outcomes), len(wanted))
         outcomes = {movie.name: outcomes[movie.name] for movie in wanted}
     except KeyboardInterrupt:

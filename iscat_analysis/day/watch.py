@@ -113,7 +113,7 @@ def watch(
     except ValueError as error:
         raise ConfigError(f"`standards`: {error}") from None
     reaction_of(kd, kd_masses_kda)
-    tell = notify or (lambda _: None)
+    warn = notify or (lambda _: None)
     analyse = partial(
         batch,
         out=results,
@@ -124,17 +124,17 @@ def watch(
         scheduler_file=scheduler_file,
         retry=False,
         progress=_of_one_movie(progress),
-        notify=tell,
+        notify=warn,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, tell), _Folder(place, results, tell)
+    run, seen = _Run(analyse, standards, warn), _Folder(place, results, warn)
     ended = stop or threading.Event()
     done: Look | None = None
     try:
         seen.look()
         claim_folder(results)
         Records(results).forget_failed()
-        tell(f"looks at {place} every {interval_s:g} s; Ctrl-C ends it")
+        warn(f"looks at {place} every {interval_s:g} s; Ctrl-C ends it")
         while not ended.wait(interval_s):
             found = seen.look()
             if found is not None and found != done:
@@ -142,24 +142,24 @@ def watch(
                     run.bring_up_to_date(found[0], ended)
                     done = found
                 except (OSError, ConfigError, SchedulerError) as error:
-                    seen.tell(f"{error}; waiting until it is mended")
+                    seen.warn(f"{error}; waiting until it is mended")
     except KeyboardInterrupt:
-        tell("ending; the page is being completed")
+        warn("ending; the page is being completed")
     return run.last_page(progress)
 
 
 def _of_one_movie(progress: Progress) -> Progress:
     """Leave out the stages that count movies, of which there is one at a time."""
 
-    def tell(stage: str, done: int, total: int) -> None:
+    def warn(stage: str, done: int, total: int) -> None:
         if stage not in ("movies", "gather"):
             progress(stage, done, total)
 
-    return tell
+    return warn
 
 
 @dataclass
-class _Sight:
+class _ParticleImage:
     """What was seen of a movie: its files, in how many looks since, and whether it can be read."""
 
     state: State | None
@@ -178,7 +178,7 @@ class _Folder:
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
         self._folder, self._out = folder, out
         self._notify = notify
-        self._sights: dict[Path, _Sight] = {}
+        self._sights: dict[Path, _ParticleImage] = {}
         self._taken: set[Path] = set()
         self._told: set[str] = set()
         self._begun = False
@@ -196,16 +196,16 @@ class _Folder:
         try:
             table = read_growing(self._folder, find_movies(self._folder, but=own))
         except OSError as error:
-            self.tell(f"{self._folder}: cannot be read ({error.strerror}); waiting for it")
+            self.warn(f"{self._folder}: cannot be read ({error.strerror}); waiting for it")
             return None
         except ConfigError as error:
             if not self._begun:
                 raise
-            self.tell(f"{error}; waiting until it is mended")
+            self.warn(f"{error}; waiting until it is mended")
             return None
         self._begun = True
         for given in table.absent:
-            self.tell(f"{given}: is in the table, and waited for")
+            self.warn(f"{given}: is in the table, and waited for")
         known = dict.fromkeys([*self._taken, *(row.path for row in table.rows)])
         sights = {path: self._sight(path) for path in known}
         ready = tuple(row for row in table.rows if sights[row.path].settled)
@@ -215,20 +215,20 @@ class _Folder:
         states = tuple(sights[row.path].state for row in ready)
         return replace(table, rows=ready, absent=()), states
 
-    def _sight(self, path: Path, *, table: bool = False) -> _Sight:
+    def _sight(self, path: Path, *, table: bool = False) -> _ParticleImage:
         state = _state(path)
         before = self._sights.get(path)
         if before is not None and before.state == state:
             before.looks += 1
         else:
             if before is not None and before.state is not None and state is not None and not table:
-                self.tell(f"{path.name}: is being written, and waited for")
-            self._sights[path] = before = _Sight(state)
+                self.warn(f"{path.name}: is being written, and waited for")
+            self._sights[path] = before = _ParticleImage(state)
         if before.looks == 1 and state is not None and not table:
             before.readable = _opens(path)
         return before
 
-    def tell(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         """Say something once."""
         if text not in self._told:
             self._told.add(text)

@@ -219,7 +219,7 @@ def scale_warning(scale: MassScale) -> str:
     )
 
 
-def bend_warning(scale: MassScale, table: pd.DataFrame) -> str:
+def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
     """Say which particles are too heavy for a line that faint standards gave."""
     bent = is_bent(scale, table)
     if not bent.any():
@@ -253,7 +253,7 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
     )
 
 
-def course_warning(table: pd.DataFrame) -> str:
+def landing_rate_warning(table: pd.DataFrame) -> str:
     """Say that the light of many steps does not change from one frame to the next.
 
     Their pictures may agree with the model; `Status.CHANGING` is of the course of the light before
@@ -272,7 +272,7 @@ def course_warning(table: pd.DataFrame) -> str:
     )
 
 
-def plane_warning(config: Config, table: pd.DataFrame) -> str:
+def fixed_height_warning(config: Config, table: pd.DataFrame) -> str:
     """Say that particles whose height was fitted in every frame do not move along z."""
     if config.track.free != "joint":
         return ""

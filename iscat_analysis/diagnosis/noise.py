@@ -27,7 +27,7 @@ from iscat_analysis.diagnosis.camera_numbers import (
     zero_by_law,
 )
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
 from iscat_analysis.search.sliding import (
@@ -172,7 +172,7 @@ def judge_background(
 
 
 def judge_beside(
-    scene: Scene,
+    context: AnalysisContext,
     movie: FrameSource,
     camera: Camera,
     span: tuple[int, int],
@@ -188,9 +188,9 @@ def judge_beside(
 
     Shapes: `seen` (n,), `used` (y, x).
     """
-    optics = scene.config.optics
+    optics = context.config.optics
     away = _AWAY * optics.wavelength_nm / optics.na
-    y, x = np.indices(used.shape) * scene.pixel_nm
+    y, x = np.indices(used.shape) * context.pixel_nm
     pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
     count = min(_GAIN_FRAMES, span[1] - span[0])
@@ -199,7 +199,7 @@ def judge_beside(
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
         if free.any() and free.sum() >= _FREE * used.sum():
             counts = movie.read(span[0], span[0] + count)
-            additive = scene.additive
+            additive = context.additive
             if judge_counts(counts, camera, masked=~free, additive=additive).messages:
                 counts = camera.to_counts(without(count))
                 return judge_counts(counts, camera, masked=~free, additive=additive)

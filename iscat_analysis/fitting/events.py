@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.regions import Region
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
@@ -70,7 +70,7 @@ class Event(Fitted):
 
 
 def remarks(
-    scene: Scene,
+    context: AnalysisContext,
     fitted: Fitted,
     windows: Windows,
     *,
@@ -81,7 +81,9 @@ def remarks(
     """Add what the surroundings of a particle say of its fit."""
     fit, region = fitted.fit, fitted.region
     corner = region.rows[0], region.columns[0]
-    saturated = saturated_near(windows.saturated, fit.x_nm, fit.y_nm, scene.pixel_nm, corner=corner)
+    saturated = saturated_near(
+        windows.saturated, fit.x_nm, fit.y_nm, context.pixel_nm, corner=corner
+    )
     said = (
         (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
         (too_close, Status.TOO_CLOSE), (changing, Status.CHANGING),
@@ -95,16 +97,20 @@ def standing_out(events: Sequence[Event]) -> Sequence[Event]:
 
 
 def posterior_of(
-    scene: Scene, event: Event, number: int, *, stopped: Callable[[], bool] = lambda: False
+    context: AnalysisContext,
+    event: Event,
+    number: int,
+    *,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> PosteriorResult:
     """Sample the posterior of an event."""
-    settings = scene.config.posterior
+    settings = context.config.posterior
     return sample_posterior(
         event.likelihood,
         event.fit,
         walkers=settings.walkers,
         steps=settings.steps,
-        seed=scene.config.compute.seed + number,
+        seed=context.config.compute.seed + number,
         prior=Prior(settings.priors),
         stopped=stopped,
     )

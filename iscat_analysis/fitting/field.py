@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from iscat_analysis.camera.background import refine_power
+from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, remarks
 from iscat_analysis.fitting.regions import (
     Region,
@@ -26,7 +27,6 @@ from iscat_analysis.fitting.regions import (
     region_likelihood,
     search_likelihood,
 )
-from iscat_analysis.fitting.scene import SPREAD_NM, Scene, search_both
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
@@ -53,7 +53,7 @@ _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
 
 def fit_field(
-    scene: Scene,
+    context: AnalysisContext,
     windows: Windows,
     *,
     starts: Sequence[Candidate] = (),
@@ -67,51 +67,51 @@ def fit_field(
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
         if number or not fresh:
-            fresh, doubtful = search_field(scene, windows, events, excess_noise)
+            fresh, doubtful = search_field(context, windows, events, excess_noise)
         if not fresh and (number or not starts):
             break
-        events = _fit_all(scene, windows, [*(e.candidate for e in events), *fresh], events, pool)
-        windows = _refined(scene, windows, events)
-    events, windows = _settled(scene, windows, events, pool)
-    trial = None if starts else _with_concealed(scene, windows, events, excess_noise, pool)
+        events = _fit_all(context, windows, [*(e.candidate for e in events), *fresh], events, pool)
+        windows = _refined(context, windows, events)
+    events, windows = _settled(context, windows, events, pool)
+    trial = None if starts else _with_concealed(context, windows, events, excess_noise, pool)
     if trial is not None:
         events, windows = trial
-        fresh, doubtful = search_field(scene, windows, events, excess_noise)
+        fresh, doubtful = search_field(context, windows, events, excess_noise)
         if fresh:  # what was too faint to be told while its neighbours were not described
             events = _fit_all(
-                scene, windows, [*(e.candidate for e in events), *fresh], events, pool
+                context, windows, [*(e.candidate for e in events), *fresh], events, pool
             )
-            events, windows = _settled(scene, windows, events, pool)
-            _, doubtful = search_field(scene, windows, events, excess_noise)
-    least = _AS_FOUND * scene.templates.threshold
-    kept = [e for e in events if e.snr > least and _wanted(scene, e)]
+            events, windows = _settled(context, windows, events, pool)
+            _, doubtful = search_field(context, windows, events, excess_noise)
+    least = _AS_FOUND * context.templates.threshold
+    kept = [e for e in events if e.snr > least and _wanted(context, e)]
     while 0 < len(kept) < len(events):  # a dropped fit no longer belongs to the others' background
-        events = _fit_all(scene, windows, [e.candidate for e in kept], kept, pool)
-        kept = [e for e in events if e.snr > least and _wanted(scene, e)]
+        events = _fit_all(context, windows, [e.candidate for e in kept], kept, pool)
+        kept = [e for e in events if e.snr > least and _wanted(context, e)]
     lobes: list[Fitted] = []
     if doubtful and not starts:
-        lobes = _fit_all(scene, windows, doubtful, kept, pool, first=len(kept))
-        lobes = [e for e in lobes if e.snr > least and _wanted(scene, e)]
-    judged = _judged(scene, windows, kept, lobes)
+        lobes = _fit_all(context, windows, doubtful, kept, pool, first=len(kept))
+        lobes = [e for e in lobes if e.snr > least and _wanted(context, e)]
+    judged = _judged(context, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 
 
 def _settled(
-    scene: Scene, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
+    context: AnalysisContext, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
 ) -> tuple[list[Fitted], Windows]:
     """Fit everything with everything else in place, until fits near each other hardly change."""
     for sweep in range(_MOST_SWEEPS if events else 0):
-        last = _without_doubles(events, scene)
-        events = _fit_all(scene, windows, [e.candidate for e in last], last, pool)
-        windows = _refined(scene, windows, events)
-        if sweep + 1 >= _SWEEPS and _is_settled(last, events, scene.roi_px / 2):
+        last = _without_doubles(events, context)
+        events = _fit_all(context, windows, [e.candidate for e in last], last, pool)
+        windows = _refined(context, windows, events)
+        if sweep + 1 >= _SWEEPS and _is_settled(last, events, context.roi_px / 2):
             break
     return events, windows
 
 
 def _with_concealed(
-    scene: Scene,
+    context: AnalysisContext,
     windows: Windows,
     known: list[Fitted],
     excess_noise: ExcessNoise | None,
@@ -127,29 +127,31 @@ def _with_concealed(
     for _ in range(MAX_ROUNDS):
         if not any(Status.POOR_FIT in event.fit.flags for event in trial):
             break
-        fresh, _ = search_field(scene, power, trial, excess_noise, explains=_TRIED)
+        fresh, _ = search_field(context, power, trial, excess_noise, explains=_TRIED)
         if not fresh:
             break
-        both = _fit_all(scene, power, [*(e.candidate for e in trial), *fresh], trial, pool)
-        trial = _fit_all(scene, power, [e.candidate for e in both], both, pool)
-        power = _refined(scene, power, trial)
+        both = _fit_all(context, power, [*(e.candidate for e in trial), *fresh], trial, pool)
+        trial = _fit_all(context, power, [e.candidate for e in both], both, pool)
+        power = _refined(context, power, trial)
     while len(trial) > len(known):
-        trial, power = _settled(scene, power, trial, pool)
-        kept = _tenable(scene, trial, known)
+        trial, power = _settled(context, power, trial, pool)
+        kept = _tenable(context, trial, known)
         if len(kept) == len(trial):
             return (trial, power) if len(trial) > len(known) else None
         trial = kept
     return None
 
 
-def _tenable(scene: Scene, trial: Sequence[Fitted], known: Sequence[Fitted]) -> list[Fitted]:
+def _tenable(
+    context: AnalysisContext, trial: Sequence[Fitted], known: Sequence[Fitted]
+) -> list[Fitted]:
     """Leave out the added ones that explain less than what is left, the worst of each place."""
     places, earlier = (
         np.array([(e.candidate.x_px, e.candidate.y_px) for e in events])
         for events in (trial, known)
     )
     apart = np.hypot(*(places[:, None] - places).T)
-    near = apart <= _reach_px(scene)
+    near = apart <= _reach_px(context)
     added = np.ones(len(trial), dtype=bool)
     added[np.hypot(*(earlier[:, None] - places).T).argmin(axis=0)] = False
     left = np.array([_chi2_left(event) for event in trial])
@@ -162,18 +164,22 @@ def _tenable(scene: Scene, trial: Sequence[Fitted], known: Sequence[Fitted]) -> 
     return [event for event, out in zip(trial, leave, strict=True) if not out]
 
 
-def total_signal(scene: Scene, shape: tuple[int, int], events: Sequence[Fitted]) -> FloatArray:
+def total_signal(
+    context: AnalysisContext, shape: tuple[int, int], events: Sequence[Fitted]
+) -> FloatArray:
     """Signal of all fitted particles over the field.
 
     Shapes: result (y, x).
     """
     total = np.zeros(shape)
     for event in events:
-        add_signal(scene, event.place, Region((0, shape[0]), (0, shape[1])), total)
+        add_signal(context, event.place, Region((0, shape[0]), (0, shape[1])), total)
     return total
 
 
-def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatArray) -> None:
+def add_signal(
+    context: AnalysisContext, place: PlaceAndMass, region: Region, total: FloatArray
+) -> None:
     """Add a particle's signal to the pixels of a region that it reaches.
 
     Shapes: `total` (y, x).
@@ -181,21 +187,21 @@ def add_signal(scene: Scene, place: PlaceAndMass, region: Region, total: FloatAr
     x_nm, y_nm, _, _ = place
     spans = []
     for centre, (low, high) in ((y_nm, region.rows), (x_nm, region.columns)):
-        first = max(low, math.ceil((centre - SPREAD_NM) / scene.pixel_nm))
-        spans.append((first, min(high, math.floor((centre + SPREAD_NM) / scene.pixel_nm) + 1)))
+        first = max(low, math.ceil((centre - SPREAD_NM) / context.pixel_nm))
+        spans.append((first, min(high, math.floor((centre + SPREAD_NM) / context.pixel_nm) + 1)))
     rows, columns = spans
     if rows[0] >= rows[1] or columns[0] >= columns[1]:
         return
-    grid = PixelGrid.region(rows, columns, scene.pixel_nm)
+    grid = PixelGrid.region(rows, columns, context.pixel_nm)
     inside = (
         slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
         slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
     )
-    total[inside] += scene.wide.image(grid, *place)
+    total[inside] += context.wide.image(grid, *place)
 
 
 def search_field(
-    scene: Scene,
+    context: AnalysisContext,
     windows: Windows,
     events: Sequence[Fitted] = (),
     excess_noise: ExcessNoise | None = None,
@@ -204,24 +210,24 @@ def search_field(
 ) -> tuple[list[Candidate], list[Candidate]]:
     """Find new particles, and what may be but the side lobe of a known one."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    explained = scene.left(total_signal(scene, shape, events))
-    likelihood = search_likelihood(scene, windows, explained)
+    explained = context.left(total_signal(context, shape, events))
+    likelihood = search_likelihood(context, windows, explained)
     found = find_particles(
         likelihood,
-        scene.templates,
-        search_both(scene.config.detection),
-        roi_px=scene.roi_px,
+        context.templates,
+        search_both(context.config.detection),
+        roi_px=context.roi_px,
         explained=explained,
         excess_noise=excess_noise,
         known=[(e.candidate.x_px, e.candidate.y_px) for e in events],
-        cumulants=noise_cumulants(scene, windows, likelihood),
+        cumulants=noise_cumulants(context, windows, likelihood),
     )
-    near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na) / scene.pixel_nm
+    near = context.config.optics.wavelength_nm / (4 * context.config.optics.na) / context.pixel_nm
     fresh: list[Candidate] = []
     doubtful: list[Candidate] = []
     for candidate in found:
         size = max(
-            (_misfit(candidate, event, scene, near, explains) for event in events),
+            (_misfit(candidate, event, context, near, explains) for event in events),
             default=0.0,
         )
         size = max(size, EXCEEDS * candidate.beside)
@@ -233,20 +239,20 @@ def search_field(
 
 
 def _misfit(
-    candidate: Candidate, event: Fitted, scene: Scene, near_px: float, explains: float
+    candidate: Candidate, event: Fitted, context: AnalysisContext, near_px: float, explains: float
 ) -> float:
     """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
         return math.inf
-    return math.sqrt(explains * _excess(event)) if distance <= _reach_px(scene) else 0.0
+    return math.sqrt(explains * _excess(event)) if distance <= _reach_px(context) else 0.0
 
 
-def _reach_px(scene: Scene) -> float:
+def _reach_px(context: AnalysisContext) -> float:
     """How far from a particle a poor fit leaves something over [pixels]."""
     # In dark field a wrong background level leaves residuals beyond the fitted region.
-    return (2 if scene.additive else 0.75) * scene.roi_px
+    return (2 if context.additive else 0.75) * context.roi_px
 
 
 def _excess(event: Fitted) -> float:
@@ -260,7 +266,7 @@ def _chi2_left(event: Fitted) -> float:
 
 
 def _fit_all(
-    scene: Scene,
+    context: AnalysisContext,
     windows: Windows,
     candidates: Sequence[Candidate],
     events: Sequence[Fitted],
@@ -272,22 +278,22 @@ def _fit_all(
 
     Candidate i is event ``first + i``, where there is one of that number.
     """
-    nominal = scene.model.material.mass_kda
-    free = FREE_PARAMETERS[scene.mode]
+    nominal = context.model.material.mass_kda
+    free = FREE_PARAMETERS[context.mode]
     taken: FloatArray | None = None
-    if scene.lines is not None:
+    if context.lines is not None:
         shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-        taken = scene.lines.taken(total_signal(scene, shape, events))
+        taken = context.lines.taken(total_signal(context, shape, events))
 
     starts = [
         replace(
             start,
             mass_kda=start.mass_kda if "mass_kda" in free else nominal,
-            z_nm=start.z_nm if "z_nm" in free else scene.height_nm(start.mass_kda),
+            z_nm=start.z_nm if "z_nm" in free else context.height_nm(start.mass_kda),
         )
         for start in candidates
     ]
-    regions = [region_around(scene.roi_px, windows.after_e.shape, start) for start in starts]
+    regions = [region_around(context.roi_px, windows.after_e.shape, start) for start in starts]
     beside = [np.zeros(region.shape) for region in regions]
 
     def drawn(number: int) -> list[tuple[int, FloatArray]]:
@@ -296,7 +302,7 @@ def _fit_all(
         for index, region in enumerate(regions):
             image = np.zeros(region.shape)
             if number != first + index:
-                add_signal(scene, events[number].place, region, image)
+                add_signal(context, events[number].place, region, image)
             if image.any():
                 images.append((index, image))
         return images
@@ -309,30 +315,32 @@ def _fit_all(
         start, region, others = starts[index], regions[index], beside[index]
         if taken is not None:
             others = (1 + others) / taken[region.slices] - 1
-        likelihood = region_likelihood(scene, windows, region, others)
-        likelihood = scene.with_prior(likelihood, start.mass_kda)
+        likelihood = region_likelihood(context, windows, region, others)
+        likelihood = context.with_prior(likelihood, start.mass_kda)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
-        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=False)
+        fit = fit_particle(
+            likelihood, start, context.mode, context.config.fit.z_range_nm, level=False
+        )
         return Fitted(region, fit, likelihood)
 
     return [event for event in pool.map(one, range(len(candidates))) if event is not None]
 
 
-def _refined(scene: Scene, windows: Windows, events: Sequence[Fitted]) -> Windows:
-    if not scene.config.background.power_normalization:
+def _refined(context: AnalysisContext, windows: Windows, events: Sequence[Fitted]) -> Windows:
+    if not context.config.background.power_normalization:
         return windows
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
-    signal = scene.left(total_signal(scene, shape, events))
-    if scene.additive:
-        signal = signal * photons_scale(scene, windows)
-    return refine_power(windows, signal, additive=scene.additive)
+    signal = context.left(total_signal(context, shape, events))
+    if context.additive:
+        signal = signal * photons_scale(context, windows)
+    return refine_power(windows, signal, additive=context.additive)
 
 
-def _wanted(scene: Scene, event: Fitted) -> bool:
+def _wanted(context: AnalysisContext, event: Fitted) -> bool:
     """Whether the fitted contrast has the polarity that is reported."""
-    sign = scene.config.detection.sign
-    return sign == 0 or scene.additive or sign * event.fit.contrast > 0
+    sign = context.config.detection.sign
+    return sign == 0 or context.additive or sign * event.fit.contrast > 0
 
 
 def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: float) -> bool:
@@ -345,14 +353,14 @@ def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: floa
     return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
 
 
-def _without_doubles(events: Sequence[Fitted], scene: Scene) -> list[Fitted]:
+def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list[Fitted]:
     """Keep the better of two fits that fell onto one particle."""
     kept: list[Fitted] = []
     for event in sorted(events, key=lambda e: -e.snr):
         here = event.candidate
         if all(
             math.hypot(here.x_px - k.candidate.x_px, here.y_px - k.candidate.y_px)
-            * scene.pixel_nm > min(_DUPLICATE_PX * scene.pixel_nm, 150.0)
+            * context.pixel_nm > min(_DUPLICATE_PX * context.pixel_nm, 150.0)
             for k in kept
         ):  # fmt: skip
             kept.append(event)
@@ -360,11 +368,11 @@ def _without_doubles(events: Sequence[Fitted], scene: Scene) -> list[Fitted]:
 
 
 def _judged(
-    scene: Scene, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
+    context: AnalysisContext, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
 ) -> list[Event]:
     """Add the verdicts that need the neighbourhood: saturation, crowding, side lobes."""
     judged = []
-    limit = scene.config.detection.min_separation_nm
+    limit = context.config.detection.min_separation_nm
     for number, one in enumerate((*fitted, *lobes)):
         x, y = one.fit.x_nm, one.fit.y_nm
         crowded = any(
@@ -375,11 +383,11 @@ def _judged(
             other.described
             for other in fitted
             if math.hypot(other.fit.x_nm - x, other.fit.y_nm - y)
-            < LARGEST_IMAGE * scene.roi_px * scene.pixel_nm
+            < LARGEST_IMAGE * context.roi_px * context.pixel_nm
         )
         lobe = number >= len(fitted) or one.described.is_dwarfed(near)
         own = windows.cut(one.region.slices)
-        flags = remarks(scene, one, own, sidelobe=lobe, too_close=crowded)
+        flags = remarks(context, one, own, sidelobe=lobe, too_close=crowded)
         judged.append(
             Event(
                 one.region, one.fit, one.likelihood, own, flags,

@@ -12,9 +12,9 @@ import pandas as pd
 from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.camera.drift import Trajectory
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.nuisances import NOTHING, evidence_of
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of
@@ -63,7 +63,7 @@ class Followed:
 class DetectionResult:
     """What was found in a movie, whichever frames stand against which."""
 
-    scene: Scene
+    context: AnalysisContext
     fits: pd.DataFrame
     views: tuple[EventView, ...]
     image: FloatArray
@@ -79,54 +79,56 @@ class DetectionResult:
     interrupted: bool = False
 
 
-def collected_photons(scene: Scene, event: Event) -> float:
+def collected_photons(context: AnalysisContext, event: Event) -> float:
     """Scattered photons that the pupil collected from one particle in the frames after."""
     windows = event.windows
-    area = collected_area_nm2(scene.model, event.fit.z_nm, event.fit.mass_kda)
-    if scene.additive:
-        per_pixel = photons_scale(scene, windows)
+    area = collected_area_nm2(context.model, event.fit.z_nm, event.fit.mass_kda)
+    if context.additive:
+        per_pixel = photons_scale(context, windows)
     else:
         per_pixel = windows.power_ratio * float(windows.before_e[~windows.masked].mean())
-    return per_pixel * area / scene.pixel_nm**2
+    return per_pixel * area / context.pixel_nm**2
 
 
 def lines_of(
-    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+    context: AnalysisContext, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> list[dict[str, Any]]:
     """Make the lines of ``fits.csv``."""
     heights = {event.fit.estimate[2] for event in events}
     known = {}
-    if len(heights) == 1 and not scene.model.is_measured:  # of heights that are not fitted
+    if len(heights) == 1 and not context.model.is_measured:  # of heights that are not fitted
         (height,) = heights
-        known[height] = quantum_information(scene.model, height)
-    return list(mapper(lambda event: _line(scene, event, known), events))
+        known[height] = quantum_information(context.model, height)
+    return list(mapper(lambda event: _line(context, event, known), events))
 
 
 def evidence_beside(
-    scene: Scene, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
+    context: AnalysisContext, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> FloatArray:
     """Give what the light of each event says beside its fit, where masses are fitted.
 
     Shapes: result (n, 11), in the order of `Evidence`.
     """
-    if scene.mode != "mass":
+    if context.mode != "mass":
         return np.full((len(events), len(NOTHING)), np.nan)
     told = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
     return np.array(list(told)).reshape(-1, len(NOTHING))
 
 
-def _line(scene: Scene, event: Event, quantum: Mapping[float, ComplexArray]) -> dict[str, Any]:
+def _line(
+    context: AnalysisContext, event: Event, quantum: Mapping[float, ComplexArray]
+) -> dict[str, Any]:
     line = line_of(
-        event.likelihood, event.fit, collected_photons(scene, event), flags=event.flags,
+        event.likelihood, event.fit, collected_photons(context, event), flags=event.flags,
         frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
         quantum=quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
     return line if event.half_width is None else line | {FRAME_COLUMN: event.half_width}
 
 
-def table_of(scene: Scene, events: Sequence[Event]) -> pd.DataFrame:
+def table_of(context: AnalysisContext, events: Sequence[Event]) -> pd.DataFrame:
     """Make a table of events whose frames are given."""
-    return make_rows(lines_of(scene, events), {"event": range(len(events))})
+    return make_rows(lines_of(context, events), {"event": range(len(events))})
 
 
 def view_of(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from iscat_analysis.executors import Executor
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.records import FREE_PARAMETERS, Progress
@@ -46,16 +46,16 @@ class Run:
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)
 
-    def tell(self, text: str) -> None:
+    def warn(self, text: str) -> None:
         """Tell the user something that belongs to the result, and keep it."""
         self.warnings.append(text)
         self.notify(text)
 
-    def warm_up(self, scene: Scene) -> None:
+    def warm_up(self, context: AnalysisContext) -> None:
         """Load the compiled kernels of fits, or compile them."""
-        config = scene.config
+        config = context.config
         parts = parts_of(
-            FREE_PARAMETERS[scene.mode], heights=has_prior(config),
+            FREE_PARAMETERS[context.mode], heights=has_prior(config),
             posteriors=config.samples_posterior,
         )  # fmt: skip
-        compile_kernels(scene.model, parts)
+        compile_kernels(context.model, parts)

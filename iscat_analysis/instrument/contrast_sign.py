@@ -40,8 +40,13 @@ from iscat_analysis.instrument.learning import (
     usable,
     why_not,
 )
-from iscat_analysis.instrument.microscope import calibrate_sights, goodness, microscopes, with_sign
-from iscat_analysis.instrument.particle_images import bright_sights, reach_nm
+from iscat_analysis.instrument.microscope import (
+    calibrate_particle_images,
+    goodness,
+    microscopes,
+    with_sign,
+)
+from iscat_analysis.instrument.particle_images import bright_particle_images, reach_nm
 from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
@@ -105,7 +110,7 @@ def learn_sign(
     wrong: WrongSign,
     camera: Camera,
     *,
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
     opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
@@ -133,7 +138,7 @@ def learn_sign(
             if heights_free(config):
                 start, sights, others = _begun(movie, wrong, camera, pool)
             else:
-                sights, others = bright_sights(movie, config, camera, pool, opening)
+                sights, others = bright_particle_images(movie, config, camera, pool, opening)
             if len(sights) < LEAST_TESTED:
                 raise DataError(too_few(movie.name, len(sights)))
             median, _ = median_p(sights, config, others, pool.map)
@@ -142,9 +147,9 @@ def learn_sign(
             found = _found(movie, sights, others, start, wrong, camera, pool)
         except DataError as error:
             raise wrong.error(str(error)) from error
-    tell(wrong.said)
+    warn(wrong.said)
     tested = {"tested": len(sights), "median_p": median}
-    return taken(found, config, tested, wrong.said, tell=tell)
+    return taken(found, config, tested, wrong.said, warn=warn)
 
 
 def _begun(
@@ -176,7 +181,7 @@ def _found(
     """Measure the focus alone, or where that does not describe the particles all of the optics."""
     source, config = {"movie": movie.name}, wrong.config
     known: Settings | None = None if start is config else settings_of(start)
-    found = calibrate_sights(
+    found = calibrate_particle_images(
         sights, others, config, ("focus",), source,
         least=LEAST_TESTED, known=known, mapper=pool.map,
     )  # fmt: skip
@@ -189,7 +194,7 @@ def _found(
     if len(sights) >= LEAST_SIGHTS:
         if heights_free(config):
             known = found.measured.settings
-            every = calibrate_sights(
+            every = calibrate_particle_images(
                 sights, others, config, tuple(FREE), source, known=known, mapper=pool.map
             )
         else:

@@ -16,8 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.instrument.learner import (
     LEAST_SIGHTS,
     OpticsCalibration,
@@ -26,7 +26,7 @@ from iscat_analysis.instrument.learner import (
     settings_of,
     with_settings,
 )
-from iscat_analysis.instrument.microscope import calibrate_sights, with_sign
+from iscat_analysis.instrument.microscope import calibrate_particle_images, with_sign
 from iscat_analysis.instrument.particle_images import bright_places, known_places
 from iscat_analysis.instrument.unknown_heights import learn_with_heights, misfit_of
 from iscat_analysis.records import Status, Windows
@@ -50,8 +50,8 @@ def seen_in_field(
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
     rows, columns = windows.after_e.shape
-    scene = make_scene(config.model_copy(update={"fit": fit}), (rows, columns))
-    events, _ = fit_field(scene, windows, pool=pool)
+    context = make_context(config.model_copy(update={"fit": fit}), (rows, columns))
+    events, _ = fit_field(context, windows, pool=pool)
     # with free heights what wrong optics leave over is beside particles, which would not be alone
     known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]
     return known_places(windows, config, known, LEAST_SIGHTS)
@@ -69,7 +69,7 @@ def learn_in_field(
     before, free = math.inf, heights_free(config)
     if not free:
         places, others = bright_places(windows, config, alone_nm=0.0)
-        found = calibrate_sights(
+        found = calibrate_particle_images(
             places, others, config, groups, source, least=LEAST_ROUGH, mapper=pool.map
         )
         guess, why = with_sign(with_settings(config, found.measured.settings))
@@ -78,7 +78,9 @@ def learn_in_field(
             raise DataError(why)
         sights, others = seen_in_field(windows, guess, pool)
         if not free:
-            found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+            found = calibrate_particle_images(
+                sights, others, config, groups, source, mapper=pool.map
+            )
         else:
             found = learn_with_heights(
                 sights, others, config, groups, source,

@@ -24,7 +24,7 @@ from iscat_analysis.instrument.learner import (
     prior_range,
 )
 from iscat_analysis.instrument.learner.starts import with_masses
-from iscat_analysis.instrument.microscope import calibrate_sights, microscopes
+from iscat_analysis.instrument.microscope import calibrate_particle_images, microscopes
 from iscat_analysis.instrument.particle_images import reach_nm
 from iscat_analysis.records import Mapper
 
@@ -107,7 +107,7 @@ def learned_with_drift(
     placed = with_masses(dated(signed, frames), build, near)
     fitted = maximise(placed, build, near, ("focus_nm", FOCUS_DRIFT), passes=_PASSES, mapper=mapper)
     optics = config.optics.model_copy(update={"focus_frame": _middle(frames)})
-    return calibrate_sights(
+    return calibrate_particle_images(
         fitted.sights, dated(others, frames), config.model_copy(update={"optics": optics}),
         tuple(FREE), source, known=fitted.values, mapper=mapper,
     )  # fmt: skip

@@ -38,8 +38,17 @@ from iscat_analysis.instrument.learner import (
     heights_free,
     settings_of,
 )
-from iscat_analysis.instrument.microscope import calibrate_sights, refuse_uncalibratable, with_sign
-from iscat_analysis.instrument.particle_images import TESTED, bright_sights, kind_of, scan_sights
+from iscat_analysis.instrument.microscope import (
+    calibrate_particle_images,
+    refuse_uncalibratable,
+    with_sign,
+)
+from iscat_analysis.instrument.particle_images import (
+    TESTED,
+    bright_particle_images,
+    kind_of,
+    scan_particle_images,
+)
 from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p, not_alone
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Progress, Windows, silent
@@ -63,7 +72,7 @@ def learn_optics(
     config: Config,
     camera: Camera,
     *,
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
     opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
@@ -71,7 +80,7 @@ def learn_optics(
     optics = config.optics
     reason = why_not(config)
     if reason and optics.calibrate == "always":
-        tell(f"the optics are not learned {reason}; the analysis goes on as configured")
+        warn(f"the optics are not learned {reason}; the analysis goes on as configured")
     if (
         reason
         or config.fit.mode == "track"  # which learns from its tracks
@@ -84,7 +93,9 @@ def learn_optics(
     frames = fitted_frames(movie, config, config.background.recorded)
     first_tested = optics.calibrate == "auto" and sliding
     with threads(config.compute.workers) as pool:
-        sights, others = bright_sights(movie, config, camera, pool, opening, rings=not first_tested)
+        sights, others = bright_particle_images(
+            movie, config, camera, pool, opening, rings=not first_tested
+        )
         alone, source = len(sights), {"movie": movie.name}
         together = alone < LEAST_TESTED and background_mode(config) == "fixed"
         windows = _summed(movie, config, camera) if together else None
@@ -98,13 +109,15 @@ def learn_optics(
                 raise DataError(too_few(movie.name, len(sights), by_noise=by_noise))
             median, fitted = median_p(sights, config, others, pool.map)
             if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
-                sights, others = bright_sights(movie, config, camera, pool, opening)
+                sights, others = bright_particle_images(movie, config, camera, pool, opening)
                 alone = len(sights)
                 median, fitted = median_p(sights, config, others, pool.map)
             if sliding:
                 drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
             if drift.moves:  # which the first particles of a long movie tell badly
-                sights, others = bright_sights(movie, config, camera, pool, opening, whole=True)
+                sights, others = bright_particle_images(
+                    movie, config, camera, pool, opening, whole=True
+                )
                 alone = len(sights)
             elif optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
                 pairs, median = not_alone(sights, config, others, pool.map)
@@ -118,7 +131,7 @@ def learn_optics(
                 return config, tested | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 reason = f"{NOISE}; the analysis goes on as configured"
-                tell(f"the optics cannot be tested on this movie: {reason}")
+                warn(f"the optics cannot be tested on this movie: {reason}")
                 return config, tested | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
             found = (
@@ -132,9 +145,9 @@ def learn_optics(
             )
         except DataError as error:
             reason = f"{error}; {drift.said}" if drift.moves else str(error)
-            tell(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
+            warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
             return config, tested | {"calibrated": False, "reason": reason}
-    return taken(found, config, tested, drift.said if passed else _verdict(tested), tell=tell)
+    return taken(found, config, tested, drift.said if passed else _verdict(tested), warn=warn)
 
 
 def why_not(config: Config) -> str:
@@ -176,19 +189,19 @@ def taken(
     verdict: str,
     *,
     pictures_of: str = "particles",
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> tuple[Config, dict[str, Any]]:
     """Take what was learned, where it may be used, and say so."""
     learned, why = usable(found, config)
     if learned is None:
-        tell(f"{verdict}: {why}; the analysis goes on as configured")
+        warn(f"{verdict}: {why}; the analysis goes on as configured")
         return config, {**tested, **_told(found), "calibrated": False, "reason": why}
     if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
         found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
     headline = found.headline(pictures_of)
-    tell(f"optics learned from the movie, instead of the configured ones: {headline}")
+    warn(f"optics learned from the movie, instead of the configured ones: {headline}")
     for note in found.notes:
-        tell(note)
+        warn(note)
     return learned, {**tested, **_told(found), "calibrated": True}
 
 
@@ -230,9 +243,9 @@ def calibrate_movie(
         progress("particles", 0, 1)
         if focus_step_nm is not None:
             others: list[ParticleImage] = []
-            sights = scan_sights(movie, config, camera)
+            sights = scan_particle_images(movie, config, camera)
         else:
-            sights, others = bright_sights(movie, config, camera, pool)
+            sights, others = bright_particle_images(movie, config, camera, pool)
         progress("particles", 1, 1)
         source = {
             "movie": movie.path.name,
@@ -242,7 +255,7 @@ def calibrate_movie(
         }  # fmt: skip
         if focus_step_nm is None:
             return learned_from(sights, others, movie, config, camera, groups, source, pool)
-        return calibrate_sights(
+        return calibrate_particle_images(
             sights, others, config, groups, source,
             focus_step_nm=focus_step_nm, mapper=pool.map,
         )  # fmt: skip
@@ -273,7 +286,7 @@ def learned_from(
     way = background_mode(config)
     crowded = way == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
-        found = calibrate_sights(sights, others, config, groups, source, mapper=pool.map)
+        found = calibrate_particle_images(sights, others, config, groups, source, mapper=pool.map)
         if way == "sliding":
             frames = fitted_frames(movie, config)
             return with_drift(found, sights, others, config, frames, source, pool.map)

@@ -48,7 +48,7 @@ def refuse_uncalibratable(config: Config) -> None:
         raise ConfigError('optics.convention = "dong2021" cannot be calibrated: use "exact"')
 
 
-def calibrate_sights(
+def calibrate_particle_images(
     sights: Sequence[ParticleImage],
     others: Sequence[ParticleImage],
     config: Config,

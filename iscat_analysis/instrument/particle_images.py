@@ -16,9 +16,9 @@ from iscat_analysis.camera.counts import Camera, check_counts
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey, judge_window
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.context import is_counted, variance_of_background
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
-from iscat_analysis.fitting.scene import is_counted, variance_of_background
 from iscat_analysis.inference.counts import choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
@@ -70,7 +70,7 @@ _PARTS = 8  # of a movie, that are searched where all of it is asked for
 _SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
 
-def bright_sights(
+def bright_particle_images(
     movie: Stack,
     config: Config,
     camera: Camera,
@@ -86,10 +86,12 @@ def bright_sights(
     """
     if background_mode(config) == "sliding":
         if opening is not None:
-            return landing_sights(opening.reader, opening.window, config, pool, rings, whole)
+            return landing_particle_images(
+                opening.reader, opening.window, config, pool, rings, whole
+            )
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
         window = judge_window(reader, config, pool.map)[2]
-        return landing_sights(reader, window, config, pool, rings, whole)
+        return landing_particle_images(reader, window, config, pool, rings, whole)
     if heights_free(config) and background_mode(config) == "fixed":
         return [], []
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
@@ -101,7 +103,7 @@ def kind_of(config: Config) -> str:
     return "landing movie" if background_mode(config) == "sliding" else "frames before and after"
 
 
-def landing_sights(
+def landing_particle_images(
     reader: Reader,
     window: int,
     config: Config,
@@ -145,7 +147,10 @@ def landing_sights(
     model = build_microscope(config, 1000.0, settings_of(config))
     sights = [
         [
-            replace(_sight_of(step, config, model), neighbours=_neighbours(step, others, config))
+            replace(
+                _particle_image_of(step, config, model),
+                neighbours=_neighbours(step, others, config),
+            )
             for step in steps
         ]
         for steps in (unique[:MOST_SIGHTS], others)
@@ -284,7 +289,7 @@ def _among(sight: ParticleImage, others: Sequence[ParticleImage], least_nm: floa
     return replace(sight, neighbours=tuple(near))
 
 
-def scan_sights(movie: Stack, config: Config, camera: Camera) -> list[ParticleImage]:
+def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[ParticleImage]:
     """Cut the particles of a scan of the focus out of its frames.
 
     The particles stay where they are, so that no frame shows the background alone.  It comes from
@@ -368,7 +373,7 @@ def _bright(sights: Iterable[ParticleImage]) -> list[ParticleImage]:
     return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
 
 
-def _sight_of(step: BrightStep, config: Config, model: ForwardModel) -> ParticleImage:
+def _particle_image_of(step: BrightStep, config: Config, model: ForwardModel) -> ParticleImage:
     """Make a sight of a step."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
     likelihood = conditional(

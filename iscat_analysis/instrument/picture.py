@@ -20,10 +20,10 @@ from iscat_analysis.instrument.learner.measured_picture import (
     PictureFit,
     fit_own,
     fit_picture,
-    place_sights,
+    place_particle_images,
 )
 from iscat_analysis.instrument.microscope import goodness, refuse_uncalibratable
-from iscat_analysis.instrument.particle_images import bright_sights, kind_of, reach_nm
+from iscat_analysis.instrument.particle_images import bright_particle_images, kind_of, reach_nm
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import ForwardModel, forward_model, with_template
 from iscat_analysis.optics.measured import Template, lattice_step_nm
@@ -144,7 +144,7 @@ def measure_template(
             progress("particles", number, len(MARGINS_PX))
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
             cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
-            alone = _alone(*bright_sights(movie, cut, camera, pool))
+            alone = _alone(*bright_particle_images(movie, cut, camera, pool))
             if len(alone) >= _PLENTY:
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
@@ -167,7 +167,9 @@ def measure_template(
             "step_nm": step,
             "level": background_mode(config) == "sliding",
         }
-        return _judged(place_sights(alone, nominal), nominal, config, settings, source, pool.map)
+        return _judged(
+            place_particle_images(alone, nominal), nominal, config, settings, source, pool.map
+        )
 
 
 def _judged(

@@ -17,7 +17,7 @@ from iscat_analysis.instrument.learner import (
     maximise,
     settings_of,
 )
-from iscat_analysis.instrument.learner.starts import average_sights, with_masses
+from iscat_analysis.instrument.learner.starts import average_particle_images, with_masses
 from iscat_analysis.instrument.microscope import goodness, microscopes, rings_of
 from iscat_analysis.instrument.particle_images import TESTED, reach_nm
 from iscat_analysis.optics.forward import ForwardModel
@@ -50,7 +50,7 @@ def median_p(
     shown: Sequence[ParticleImage] = sights[:TESTED]
     x, y = 0.0, 0.0
     if not heights_free(config):
-        averages, shown = average_sights(shown)
+        averages, shown = average_particle_images(shown)
         x, y = _centre(averages[0], model, build, settings)
 
     def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:

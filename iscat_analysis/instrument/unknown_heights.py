@@ -25,7 +25,12 @@ from iscat_analysis.instrument.learner import (
     optics_limits,
 )
 from iscat_analysis.instrument.learner.starts import FOCUS_STEP_NM, with_masses
-from iscat_analysis.instrument.microscope import calibrate_sights, goodness, microscopes, rings_of
+from iscat_analysis.instrument.microscope import (
+    calibrate_particle_images,
+    goodness,
+    microscopes,
+    rings_of,
+)
 from iscat_analysis.instrument.particle_images import reach_nm
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.records import Mapper
@@ -52,11 +57,13 @@ def learn_with_heights(
     mapper: Mapper = map,
 ) -> OpticsCalibration:
     """Learn the optics from particles whose heights are between limits."""
-    found = calibrate_sights(sights, others, config, groups, source, known=known, mapper=mapper)
+    found = calibrate_particle_images(
+        sights, others, config, groups, source, known=known, mapper=mapper
+    )
     if not around or (found.accepted and misfit_of(found) < _DESCRIBED_CHI2):
         return found
     begun = _likeliest(sights, others, config, known, groups, mapper)
-    other = calibrate_sights(
+    other = calibrate_particle_images(
         begun.sights, begun.others, config, groups, source, known=begun.settings, mapper=mapper
     )
     return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))

@@ -13,10 +13,10 @@ from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import misfit_warning
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.merging import CLIPS, VIEWS, Done
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.records import (
@@ -53,9 +53,9 @@ class ChunkSetting:
         return reader_of(self.frames, self.config, self.camera, self.span)
 
     @cached_property
-    def scene(self) -> Scene:
+    def context(self) -> AnalysisContext:
         """The models, which all chunks share."""
-        return make_scene(
+        return make_context(
             self.config, self.reader.shape, searches=self.searches, noise=self.noise,
             lines=self.lines, sliding=True,
         )  # fmt: skip
@@ -75,13 +75,13 @@ def chunk_job(
         chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
         return analyse_chunk(
-            setting.scene, chunk, core, setting.window, pool, posteriors, setting.excess_noise,
+            setting.context, chunk, core, setting.window, pool, posteriors, setting.excess_noise,
             earlier,
         )  # fmt: skip
 
 
 def analyse_chunk(
-    scene: Scene,
+    context: AnalysisContext,
     chunk: Chunk,
     core: tuple[int, int],
     window: int,
@@ -91,9 +91,9 @@ def analyse_chunk(
     earlier: int,
 ) -> Done:
     """Find and fit every step of a chunk."""
-    wanted = scene.config.background.follows_pattern
+    wanted = context.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-    fitter = ChunkFitter(scene, still, window, pool, pattern, excess_noise=excess_noise)
+    fitter = ChunkFitter(context, still, window, pool, pattern, excess_noise=excess_noise)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam), core)
     events = [step.event for step in steps]
@@ -105,7 +105,7 @@ def analyse_chunk(
         if not core[0] <= event.frame < core[1]:
             continue
         try:
-            chains[number] = posterior_of(scene, event, event.frame)
+            chains[number] = posterior_of(context, event, event.frame)
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True
             break
@@ -114,9 +114,9 @@ def analyse_chunk(
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
     return Done(
         core=core,
-        lines=make_rows(lines_of(scene, events, mapper=pool.map)),
+        lines=make_rows(lines_of(context, events, mapper=pool.map)),
         repeats=np.array([step.repeats for step in steps]),
-        evidence=evidence_beside(scene, events, mapper=pool.map),
+        evidence=evidence_beside(context, events, mapper=pool.map),
         views=tuple(
             view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)
             for n, (trace, clip) in enumerate(shown)
@@ -130,7 +130,7 @@ def analyse_chunk(
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
-        cause=misfit_warning(scene.config, events),
+        cause=misfit_warning(context.config, events),
         empty=fitter.empty,
         searched=fitter.searched,
     )

@@ -25,10 +25,10 @@ from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import FloodError
 from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, unheard
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
@@ -60,7 +60,7 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
             ready.movie,
             config,
             ready.camera,
-            tell=run.tell,
+            warn=run.warn,
             progress=run.progress,
             prepare=run.warm_up,
             partial=run.partial,
@@ -89,21 +89,21 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     some = config.fit.model_copy(update={"frames": (first, min(last, first + TOLD_FRAMES))})
     trial = config.model_copy(update={"fit": some})
     found = analyse_landings(
-        ready.movie, trial, ready.camera, tell=unheard, progress=silent, prepare=run.warm_up,
+        ready.movie, trial, ready.camera, warn=unheard, progress=silent, prepare=run.warm_up,
         lines=ready.lines,
     )  # fmt: skip
     run.clock.lap("heights")
     good = (found.fits["status"] == Status.OK).to_numpy()
     told = None if found.evidence is None else spread_of_heights(*found.evidence[good, :2].T)
     if told is None or told.mean_se_nm > particle.height_prior_sd_nm / 2:
-        run.tell(
+        run.warn(
             "the heights cannot be learned from so few or so faint particles: they are taken as "
             f"{particle.nominal_height_nm:g} ± {particle.height_prior_sd_nm:g} nm"
         )
         return config
     run.notify(f"{ready.movie.name}: {told}, learned from {told.events} particles")
     if ready.summary.get("optics", {}).get("calibrated"):
-        run.tell(
+        run.warn(
             "a common height and the focus are one number, and the focus was learned from the same "
             f"particles: only their spread, {told.sd_nm:.1f} nm, is known, and the mean of "
             f"{told.mean_nm:.1f} nm is where the learned optics put it"
@@ -115,7 +115,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     return config.model_copy(update={"particle": particle.model_copy(update=learned)})
 
 
-def _nothing(scene: Scene) -> None:
+def _nothing(context: AnalysisContext) -> None:
     """Do nothing."""
 
 
@@ -124,9 +124,9 @@ def analyse_landings(
     config: Config,
     camera: Camera,
     *,
-    tell: Notify,
+    warn: Notify,
     progress: Progress,
-    prepare: Callable[[Scene], None] = _nothing,
+    prepare: Callable[[AnalysisContext], None] = _nothing,
     partial: Path | None = None,
     identity: str = "",
     lines: Lines | None = None,
@@ -142,17 +142,17 @@ def analyse_landings(
         opening = survey_noise(reader, config)
     reader, noise, window = opening.reader, opening.noise, opening.window
     for text in noise.said(movie.name):
-        tell(text)
+        warn(text)
     stride = stride_of(window)
     count = boundaries(last - first, window)
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
     with one_thread_algebra():
-        scene = make_scene(
+        context = make_context(
             config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
         )
-    prepare(scene)
+    prepare(context)
     plan = plan_chunks(reader, config, window, stride)
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
     movie_job = ChunkSetting(
@@ -175,7 +175,7 @@ def analyse_landings(
                 def here() -> Done:
                     chunk = reader.chunk(span, stride, pool)
                     return analyse_chunk(
-                        scene, chunk, core, window, pool, budget, noise.excess, earlier
+                        context, chunk, core, window, pool, budget, noise.excess, earlier
                     )
 
                 done = place.call(chunk_job, movie_job, core, span, budget, earlier, here=here)
@@ -202,14 +202,14 @@ def analyse_landings(
         progress("landing", last - first, last - first)
     wanted = config.background.follows_pattern
     for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
-        tell(text)
-    searched = merged.searched().summary(_median_snr(fits), scene.templates.threshold, stride)
+        warn(text)
+    searched = merged.searched().summary(_median_snr(fits), context.templates.threshold, stride)
     if text := searched_warning(movie.name, searched):
-        tell(text)
+        warn(text)
     if merged.cause:
-        tell(f"{movie.name}: {merged.cause}")
+        warn(f"{movie.name}: {merged.cause}")
     if not config.background.power_normalization:
-        tell(
+        warn(
             "background.power_normalization = false has no effect on a landing movie: each frame "
             "is weighed by its own light"
         )
@@ -229,10 +229,10 @@ def analyse_landings(
         "chunks": len(plan),
     }
     return DetectionResult(
-        scene=scene,
+        context=context,
         fits=fits,
         views=views,
-        image=scene.contrasts(merged.image),
+        image=context.contrasts(merged.image),
         compared=Compared(
             frames_before=(0, 0),
             frames_after=(first, first + light.size),

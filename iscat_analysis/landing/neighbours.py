@@ -20,9 +20,9 @@ import numpy as np
 
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.fitting.regions import Region
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
@@ -55,16 +55,21 @@ class Neighbours:
     """Which steps see each other, and how."""
 
     def __init__(
-        self, scene: Scene, chunk: Chunk, window: int, pattern: MovingPattern | None = None
+        self,
+        context: AnalysisContext,
+        chunk: Chunk,
+        window: int,
+        pattern: MovingPattern | None = None,
     ) -> None:
         self._pattern = pattern
-        self._scene = scene
+        self._context = context
         self._chunk = chunk
         self._window = window
-        self._roi_px = scene.roi_px
-        nominal = scene.model.material.mass_kda
+        self._roi_px = context.roi_px
+        nominal = context.model.material.mass_kda
         self._contrast_per_kda = (
-            scene.model.peak_contrast(scene.config.particle.nominal_height_nm, nominal) / nominal
+            context.model.peak_contrast(context.config.particle.nominal_height_nm, nominal)
+            / nominal
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
 
@@ -82,15 +87,15 @@ class Neighbours:
 
         Shapes: `theta` (5,).
         """
-        scene, half = self._scene, self._half(start)
+        context, half = self._context, self._half(start)
         sides = []
         for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
             middle = round(centre)
             sides.append((max(middle - half, 0), min(middle + half + 1, size)))
-        grid = PixelGrid.region(sides[0], sides[1], scene.pixel_nm)
-        pixel = scene.pixel_nm
+        grid = PixelGrid.region(sides[0], sides[1], context.pixel_nm)
+        pixel = context.pixel_nm
         shown = at.frame + sign * self._window // 2
-        image = scene.wide_at(shown).image(
+        image = context.wide_at(shown).image(
             grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         )
         corner = sides[0][0], sides[1][0]
@@ -232,11 +237,11 @@ class Neighbours:
     def shown(self, step: Step, region: Region) -> tuple[tuple[slice, slice], FloatArray] | None:
         """Which pixels of a region show a step, and its contrast there, as frames are corrected."""
         shared = self.shared(step, region)
-        if self._scene.lines is None:
+        if self._context.lines is None:
             return None if shared is None else (shared[0], step.image[shared[1]])
         total = np.zeros(self._chunk.shape)
         total[self.box(step)] = step.image
-        return WHOLE, self._scene.left(total)[region.slices]
+        return WHOLE, self._context.left(total)[region.slices]
 
     def shared(
         self, step: Step, region: Region

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
 from iscat_analysis.fitting.regions import Region, photons_scale
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.split_frames import (
     PARTS,
     Response,
@@ -126,7 +126,7 @@ def _moved(
 
 
 def step_controls(
-    scene: Scene,
+    context: AnalysisContext,
     chunk: Chunk,
     window: int,
     events: Sequence[Event],
@@ -139,10 +139,10 @@ def step_controls(
     if not times:
         return None
     field = empty_field(
-        scene, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
+        context, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
         [event.fit for event in events], level=True,
     )  # fmt: skip
-    most = _most_windows(field.places, (chunk.edges.size - 2) / scene.searches)
+    most = _most_windows(field.places, (chunk.edges.size - 2) / context.searches)
     apart: list[int] = []
     for t in times:
         if not apart or t >= apart[-1] + window:
@@ -152,7 +152,7 @@ def step_controls(
     for turn in chosen:
         near = [s for s in steps if abs(s.at.frame - turn) <= window]
         taken = taken_places(
-            scene, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
+            context, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
         )
         sides, powers = [], []
         for start, stop in ((turn - window, turn), (turn, turn + window)):
@@ -164,7 +164,7 @@ def step_controls(
                 for s in near:
                     box = neighbours.box(s)
                     known[box] += neighbours.presence(s, cut) * s.image
-                known = scene.left(known)
+                known = context.left(known)
                 parts.append(field.errors(sum_e, power, known * chunk.mean_e))
                 light.append(power)
             sides.append(parts)
@@ -211,7 +211,11 @@ class _Own:
 
 
 def field_repeats(
-    scene: Scene, movie: Stack, camera: Camera, windows: Windows, events: Sequence[Event]
+    context: AnalysisContext,
+    movie: Stack,
+    camera: Camera,
+    windows: Windows,
+    events: Sequence[Event],
 ) -> tuple[list[FloatArray], EmptySpread | None]:
     """Compare parts of the frames before and after, at the events and where there are none."""
     if not events:
@@ -232,9 +236,11 @@ def field_repeats(
     scale = windows.power_ratio * max(powers[0].sum(), 1.0) / powers[1].sum() if n_before else 1.0
     powers = (powers[0], powers[1] * scale)
     fits = [event.fit for event in events]
-    field = background_field(scene, windows, powers[0].sum(), read, fits) if n_before > 1 else None
-    signal = scene.left(total_signal(scene, shape, events))
-    taken = taken_by(scene, windows, events, signal)
+    field = (
+        background_field(context, windows, powers[0].sum(), read, fits) if n_before > 1 else None
+    )
+    signal = context.left(total_signal(context, shape, events))
+    taken = taken_by(context, windows, events, signal)
     parts: tuple[list[FloatArray], list[FloatArray]] = ([], [])
     lights: tuple[list[float], list[float]] = ([], [])
     for side, (span, power) in enumerate(zip(spans, powers, strict=True)):
@@ -249,8 +255,8 @@ def field_repeats(
         known = None
         if side:
             light = windows.before_e / powers[0].sum() if n_before else windows.before_e
-            known = signal * (photons_scale(scene, windows) / power.sum()
-                              if scene.additive else light)  # fmt: skip
+            known = signal * (photons_scale(context, windows) / power.sum()
+                              if context.additive else light)  # fmt: skip
         for a, b in pairwise(edges):
             total = np.zeros(shape)
             for start, stop in _pieces(shape, a, b):
@@ -270,7 +276,7 @@ def field_repeats(
         left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
         empty = field.spread(parts[0], parts[1], light, taken, left)
     return [
-        nothing_repeated(scene.mode) if own is None
+        nothing_repeated(context.mode) if own is None
         else repeats_of(tuple(_joined(side) for side in own.sides if side))
         for own in owns
     ], empty  # fmt: skip

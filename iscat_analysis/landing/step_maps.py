@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from iscat_analysis._kernels.stepping import add_image
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.pattern import MovingPattern
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.sliding import STRIDES, Chunk, Filter, MapArray, sliding_maps
@@ -26,15 +26,15 @@ class StepMaps:
 
     def __init__(
         self,
-        scene: Scene,
+        context: AnalysisContext,
         chunk: Chunk,
         matched: Filter,
         neighbours: Neighbours,
         pattern: MovingPattern | None = None,
     ) -> None:
-        self._scene, self._chunk, self.matched = scene, chunk, matched
+        self._context, self._chunk, self.matched = context, chunk, matched
         self._neighbours, self._pattern = neighbours, pattern
-        self._is_local = pattern is None and scene.lines is None and matched.noise is None
+        self._is_local = pattern is None and context.lines is None and matched.noise is None
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._known: list[Step] = []
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
@@ -91,7 +91,7 @@ class StepMaps:
             total = np.zeros(chunk.shape)
             for step in near[boundary]:
                 self._neighbours.add_change(total, step, before, after)
-            total = self._scene.left(total)
+            total = self._context.left(total)
             return total + moving.contrast[boundary] * (1 + total) if moving else total
 
         changed = [

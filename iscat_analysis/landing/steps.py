@@ -17,9 +17,9 @@ from itertools import compress
 import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
+from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.events import Event, remarks, standing_out
 from iscat_analysis.fitting.pattern import MovingPattern
-from iscat_analysis.fitting.scene import Scene, reported_steps
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
     detection_snr,
@@ -81,7 +81,7 @@ class ChunkFitter:
 
     def __init__(
         self,
-        scene: Scene,
+        context: AnalysisContext,
         chunk: Chunk,
         window: int,
         pool: ThreadPoolExecutor,
@@ -90,16 +90,16 @@ class ChunkFitter:
         excess_noise: ExcessNoise | None = None,
     ) -> None:
         self._excess_noise = excess_noise
-        self._scene = scene
+        self._context = context
         self._chunk = chunk
         self._pattern = pattern
         self._window = window
         self._pool = pool
-        self._roi_px = scene.roi_px
-        self._neighbours = Neighbours(scene, chunk, window, pattern)
-        self._tasks = TaskBuilder(scene, chunk, window, self._neighbours, pattern)
+        self._roi_px = context.roi_px
+        self._neighbours = Neighbours(context, chunk, window, pattern)
+        self._tasks = TaskBuilder(context, chunk, window, self._neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
-        self._sieve = SidelobeFilter(chunk.first, self._stride, window, scene.roi_px)
+        self._sieve = SidelobeFilter(chunk.first, self._stride, window, context.roi_px)
         self._doubtful: list[Peak] = []
         self._last: tuple[list[Peak], tuple[MapArray, FloatArray]] | None = None
         self.strongest = np.zeros((2, *chunk.shape))
@@ -109,9 +109,9 @@ class ChunkFitter:
 
     def run(self, keep: tuple[int, int], core: tuple[int, int] | None = None) -> list[StepEvent]:
         """Find and fit every step."""
-        templates = self._scene.templates
+        templates = self._context.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
-        maps = StepMaps(self._scene, self._chunk, matched, self._neighbours, self._pattern)
+        maps = StepMaps(self._context, self._chunk, matched, self._neighbours, self._pattern)
         steps: list[Step] = []
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
@@ -135,19 +135,19 @@ class ChunkFitter:
                 chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
                     break
-            if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+            if "z_nm" in FREE_PARAMETERS[self._context.mode]:
                 steps = self._lifted(steps, set(range(known, len(steps))), seen)
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
             steps = with_measured_images(
                 credible, self._neighbours.of(credible)[0], self._chunk, self._neighbours,
-                self._window, self._scene.templates.threshold, self._roi_px,
+                self._window, self._context.templates.threshold, self._roi_px,
             ) if credible else []  # fmt: skip
         if core is not None and self._last is not None:
             self.searched = searched_shares(
                 self._chunk, core, steps, *self._last,
-                window=self._window, roi_px=self._roi_px, threshold=self._scene.templates.threshold,
+                window=self._window, roi_px=self._roi_px, threshold=self._context.templates.threshold,
             )  # fmt: skip
         self._last = None
         del maps  # fits need their memory
@@ -157,7 +157,7 @@ class ChunkFitter:
         everything = steps + lobes
         seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
         # steps of the other polarity are fitted too: their rings have the one that is reported
-        sign = reported_steps(self._scene)
+        sign = reported_steps(self._context)
         own = [
             i
             for i, s in enumerate(everything)
@@ -170,7 +170,7 @@ class ChunkFitter:
         if fitted and not self._pattern:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
-                scene=self._scene, chunk=self._chunk, window=self._window,
+                context=self._context, chunk=self._chunk, window=self._window,
                 events=events, steps=everything, neighbours=self._neighbours,
             )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
@@ -187,7 +187,7 @@ class ChunkFitter:
             trace = trace_of(step, patch, chunk, self._neighbours, self._tasks)
             clip = None
             if number < clips:
-                clip = clip_of(step, patch, self._scene, chunk, window, self._pattern)
+                clip = clip_of(step, patch, self._context, chunk, window, self._pattern)
             return trace, clip
 
         return list(self._pool.map(one, range(len(fitted))))
@@ -195,7 +195,7 @@ class ChunkFitter:
     # ---- search ----------------------------------------------------------------------------
 
     def _search(self, maps: StepMaps, steps: Sequence[Step]) -> list[Step]:
-        scene, chunk, matched = self._scene, self._chunk, maps.matched
+        context, chunk, matched = self._context, self._chunk, maps.matched
         snr, effective = maps.without(steps, self._pool.map)
         if not steps and len(snr):
             where = np.empty(chunk.shape, dtype=np.int64)
@@ -203,9 +203,9 @@ class ChunkFitter:
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
-        peaks = find_steps(chunk, matched, snr, effective, scene.templates.threshold)
+        peaks = find_steps(chunk, matched, snr, effective, context.templates.threshold)
         refuse_flood(
-            len(peaks), scene.templates, self._excess_noise,
+            len(peaks), context.templates, self._excess_noise,
             images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
         )  # fmt: skip
         self._last = peaks, (snr, effective)
@@ -213,13 +213,13 @@ class ChunkFitter:
         return [self._begin(peak) for peak in fresh]
 
     def _begin(self, peak: Peak) -> Step:
-        scene = self._scene
+        context = self._context
         sign = 1 if peak.amplitude > 0 else -1
-        mass = float(scene.model.scale.mass(np.asarray(abs(peak.amplitude))))
-        if "mass_kda" not in FREE_PARAMETERS[scene.mode]:
-            mass = scene.model.material.mass_kda
-        mass = max(mass, 1e-3 * scene.model.material.mass_kda)
-        start = Candidate(peak.x_px, peak.y_px, scene.height_nm(mass), mass, abs(peak.snr))
+        mass = float(context.model.scale.mass(np.asarray(abs(peak.amplitude))))
+        if "mass_kda" not in FREE_PARAMETERS[context.mode]:
+            mass = context.model.material.mass_kda
+        mass = max(mass, 1e-3 * context.model.material.mass_kda)
+        start = Candidate(peak.x_px, peak.y_px, context.height_nm(mass), mass, abs(peak.snr))
         return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     # ---- one step --------------------------------------------------------------------------
@@ -228,7 +228,7 @@ class ChunkFitter:
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
         """Fit the chosen steps at the heights that they have, each with the others as they were."""
-        z_range = self._scene.config.fit.z_range_nm
+        z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
             likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
@@ -248,12 +248,12 @@ class ChunkFitter:
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
         """Fit the chosen steps at all heights, so that their rings are those of their own."""
-        z_range = self._scene.config.fit.z_range_nm
+        z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
             start = _displaced(step.start, *task.offset_px)
             fit = fit_particle(
-                task.likelihood, start, self._scene.mode, z_range, level=True, correct_bias=False
+                task.likelihood, start, self._context.mode, z_range, level=True, correct_bias=False
             )
             return self._moved(step, task, fit.theta, fit.snr) if fit.mass_kda > 0 else step
 
@@ -277,14 +277,14 @@ class ChunkFitter:
 
     def _seated(self, step: Step) -> Candidate:
         """Put a step where a particle of its mass is expected, unless its height is free."""
-        if "z_nm" in FREE_PARAMETERS[self._scene.mode]:
+        if "z_nm" in FREE_PARAMETERS[self._context.mode]:
             return step.start
-        return replace(step.start, z_nm=self._scene.height_nm(step.start.mass_kda))
+        return replace(step.start, z_nm=self._context.height_nm(step.start.mass_kda))
 
     def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
         """Put a step where a fit found it."""
         likelihood, (y_px, x_px) = task.likelihood, task.offset_px
-        pixel = self._scene.pixel_nm
+        pixel = self._context.pixel_nm
         start = replace(
             step.start,
             x_px=float(theta[0]) / pixel - x_px,
@@ -303,13 +303,13 @@ class ChunkFitter:
     @property
     def _quick_mode(self) -> str:
         """Where z is free it is found after place and mass, from all heights at once."""
-        return "mass" if "mass_kda" in FREE_PARAMETERS[self._scene.mode] else "localize"
+        return "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
 
     def _finish(
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
     ) -> _Finished | None:
         """Fit a step for good."""
-        scene, step = self._scene, steps[index]
+        context, step = self._context, steps[index]
         task = self._tasks.build(index, steps, near)
         if task is None:
             return None
@@ -318,23 +318,27 @@ class ChunkFitter:
             return None
         y_px, x_px = task.offset_px
         start = _displaced(self._seated(step), y_px, x_px)
-        fit = fit_particle(likelihood, start, scene.mode, scene.config.fit.z_range_nm, level=True)
+        fit = fit_particle(
+            likelihood, start, context.mode, context.config.fit.z_range_nm, level=True
+        )
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
-        pixel = scene.pixel_nm
+        pixel = context.pixel_nm
         event = Event(
             task.region, fit.shifted(-x_px * pixel, -y_px * pixel), likelihood, task.windows, (),
             task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
             task.at.rise,
         )  # fmt: skip
-        if event.snr < _EXPLAINED * scene.templates.threshold:
+        if event.snr < _EXPLAINED * context.templates.threshold:
             return None
         step = replace(step, at=task.at)
-        seen = near[index] if scene.lines is None else [i for i in range(len(steps)) if i != index]
+        seen = (
+            near[index] if context.lines is None else [i for i in range(len(steps)) if i != index]
+        )
         others = tuple(steps[i] for i in seen)
         repeats = step_repeats(
             self._chunk, task.patch, event, step, others, self._neighbours, self._pattern,
-            scene.mode,
+            context.mode,
         )  # fmt: skip
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
@@ -351,7 +355,7 @@ class ChunkFitter:
             near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
             event = own.fitted.event
             flags = remarks(
-                self._scene, event, event.windows,
+                self._context, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
                 changing=steps[number].at.p_constant < POOR_FIT_P
@@ -369,7 +373,7 @@ class ChunkFitter:
         frame = np.array([s.at.frame for s in steps])
         width = np.array([s.at.half_width for s in steps])
         x_px, y_px = _places(steps)
-        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._scene.templates.threshold
+        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._context.templates.threshold
         for number in np.flatnonzero(kept).tolist():
             same = kept[:number] & (sign[:number] == sign[number])
             same &= np.abs(frame[:number] - frame[number]) <= np.maximum(

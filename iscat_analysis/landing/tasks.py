@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
 from iscat_analysis.fitting.regions import Region, region_around
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
@@ -45,18 +45,18 @@ class TaskBuilder:
 
     def __init__(
         self,
-        scene: Scene,
+        context: AnalysisContext,
         chunk: Chunk,
         window: int,
         neighbours: Neighbours,
         pattern: MovingPattern | None = None,
     ) -> None:
         self._pattern = pattern
-        self._scene = scene
+        self._context = context
         self._chunk = chunk
         self._window = window
         self._neighbours = neighbours
-        self._roi_px = scene.roi_px
+        self._roi_px = context.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
 
@@ -64,10 +64,10 @@ class TaskBuilder:
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
     ) -> Task | None:
         """Set up the likelihood of a step with its neighbours in place; None without frames."""
-        scene, chunk, step = self._scene, self._chunk, steps[index]
+        context, chunk, step = self._context, self._chunk, steps[index]
         region = region_around(self._roi_px, chunk.shape, step.start)
         neighbours = [steps[i] for i in near[index]]
-        limit_px = scene.config.detection.min_separation_nm / scene.pixel_nm
+        limit_px = context.config.detection.min_separation_nm / context.pixel_nm
         close = [s for s in neighbours if distance_px(s, step) < limit_px]
         span, crowded = self._span(step, close)
         patch = chunk.patch(*span, region.rows, region.columns)
@@ -96,9 +96,9 @@ class TaskBuilder:
         cuts = chunk.cut(*first), chunk.cut(*second)
         for other in neighbours:
             self._neighbours.apply(ratio, other, *cuts, region)
-        if scene.lines is not None:
+        if context.lines is not None:
             there = [self._present(steps, span, cut) for cut in cuts]
-            taken = [scene.lines.taken(signal)[region.slices] for signal in there]
+            taken = [context.lines.taken(signal)[region.slices] for signal in there]
             ratio *= taken[0] / taken[1]
         offset = np.zeros(2)
         if moving and local:
@@ -117,15 +117,15 @@ class TaskBuilder:
             variances.reverse()
         counts = (n_before, n_after)[:: step.sign]
         ranges = (first, second)[:: step.sign]
-        grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+        grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
         used = chunk.usable[region.slices]
         shown = second if step.sign > 0 else first
         likelihood = conditional(
-            scene.model_at(sum(shown) // 2), grid, before, after, ratio,
+            context.model_at(sum(shown) // 2), grid, before, after, ratio,
             read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
             masked=~used,
         )  # fmt: skip
-        likelihood = scene.with_prior(likelihood, step.start.mass_kda)
+        likelihood = context.with_prior(likelihood, step.start.mass_kda)
         windows = Windows(
             before_e=before,
             after_e=after,

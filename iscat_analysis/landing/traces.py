@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.fitting.regions import Region, region_around
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.landing.neighbours import Neighbours
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.records import BoolArray, Clip, FloatArray, Trace
@@ -77,14 +77,14 @@ def trace_of(
 def clip_of(
     fitted: StepEvent,
     patch: Patch,
-    scene: Scene,
+    context: AnalysisContext,
     chunk: Chunk,
     window: int,
     pattern: MovingPattern | None = None,
 ) -> Clip | None:
     """Set windows that slide over a step against those before them."""
     turn, start = fitted.step.at.frame, fitted.event.candidate
-    side = min(scene.roi_px, 2 * math.ceil(CLIP_NM / scene.pixel_nm / 2) - 1)
+    side = min(context.roi_px, 2 * math.ceil(CLIP_NM / context.pixel_nm / 2) - 1)
     fold = math.ceil(side / CLIP_PIXELS)
     square, whole = region_around(side, chunk.shape, start), fitted.event.region
     sides = []

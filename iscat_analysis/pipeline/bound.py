@@ -22,6 +22,7 @@ from iscat_analysis.diagnosis.dark_frames import without_cut_off
 from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import Noise, judge_background, judge_beside
 from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, posterior_of
 from iscat_analysis.fitting.field import add_signal, fit_field
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
@@ -34,7 +35,6 @@ from iscat_analysis.fitting.results import (
     view_of,
 )
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.landing.split_frame_estimates import field_repeats
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import (
@@ -62,20 +62,20 @@ _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of 
 def find_bound(ready: Prepared, run: Run) -> DetectionResult:
     """Find particles in the frames after a background, together or, in mode track, one by one."""
     ready, windows = _summed(ready, run)
-    scene, noise, summary, doubt = _background(ready, run, windows)
+    context, noise, summary, doubt = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera
-    with threads(scene.config.compute.workers) as pool:
-        if scene.mode == "track":
+    with threads(context.config.compute.workers) as pool:
+        if context.mode == "track":
             found = track_frames(
-                scene, movie, camera, windows, summary,
+                context, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,
-                doubt=doubt, tell=run.tell,
+                doubt=doubt, warn=run.warn,
             )  # fmt: skip
             if not windows.n_before:
-                for text in _judged_beside(ready, scene, windows, found.fits).messages:
-                    run.tell(text)
+                for text in _judged_beside(ready, context, windows, found.fits).messages:
+                    run.warn(text)
         else:
-            found = _together(ready, run, scene, windows, noise, summary, pool)
+            found = _together(ready, run, context, windows, noise, summary, pool)
     run.clock.lap("results")
     return found
 
@@ -93,7 +93,7 @@ def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
         return ready, windows
     movie, message = without_cut_off(ready.steady, camera, windows)
     if message:
-        run.tell(message)
+        run.warn(message)
     if movie is ready.steady:
         return ready, windows
     return replace(ready, steady=movie), sums(movie)
@@ -101,7 +101,7 @@ def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
 
 def _background(
     ready: Prepared, run: Run, windows: Windows
-) -> tuple[Scene, Noise, dict[str, Any], str]:
+) -> tuple[AnalysisContext, Noise, dict[str, Any], str]:
     """Make the models, and judge the noise, pixels and drift of the background.
 
     The last is why it may not be the background of these frames; empty where it is.
@@ -109,34 +109,36 @@ def _background(
     movie, config, camera = ready.steady, ready.config, ready.camera
     after = windows.frames_after
     searches = after[1] - after[0] if config.fit.mode == "track" else 1
-    scene = make_scene(config, ready.shape, searches=searches, lines=ready.lines)
-    run.warm_up(scene)
+    context = make_context(config, ready.shape, searches=searches, lines=ready.lines)
+    run.warm_up(context)
     run.clock.lap("model")
     still = config.fit.mode != "track"
-    noise = judge_background(movie, camera, windows, still=still, additive=scene.additive)
+    noise = judge_background(movie, camera, windows, still=still, additive=context.additive)
     if noise.spectrum is not None:
-        scene = make_scene(
+        context = make_context(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
     for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
-        run.tell(text)
+        run.warn(text)
     uneven = "" if still else uneven_warning(config, movie.name, windows)
     for text in (repeats_warning(movie, windows), uneven):
         if text:
-            run.tell(text)
+            run.warn(text)
     summary: dict[str, Any] = {}
     moved = ""
-    if not scene.additive:
+    if not context.additive:
         summary = examine_background(movie, camera, windows)
         summary["noise_spectrum"] = noise.summary
         moved = drift_warning(movie.name, summary) or ""
         if moved:
-            run.tell(moved)
+            run.warn(moved)
     run.clock.lap("background")
-    return scene, noise, summary, uneven or moved
+    return context, noise, summary, uneven or moved
 
 
-def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.DataFrame) -> Noise:
+def _judged_beside(
+    ready: Prepared, context: AnalysisContext, windows: Windows, table: pd.DataFrame
+) -> Noise:
     """Judge the camera where the background is known and all frames hold particles that move."""
     movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
     frame = table["frame"].to_numpy(np.int64)
@@ -146,15 +148,15 @@ def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.Da
 
     def without(count: int) -> FloatArray:
         electrons = camera.to_electrons(movie.read(first, first + count))
-        for number, image in enumerate(electrons if not scene.additive else ()):
+        for number, image in enumerate(electrons if not context.additive else ()):
             signal = np.zeros(field.shape)
             for x, y, z, mass in particles[frame == first + number].tolist():
-                add_signal(scene, (x, y, z, mass), field, signal)
+                add_signal(context, (x, y, z, mass), field, signal)
             image /= 1 + signal
         return electrons
 
     noise = judge_beside(
-        scene, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
+        context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
     )
     return noise.beside(table["chi2_reduced"].to_numpy(float))
 
@@ -162,7 +164,7 @@ def _judged_beside(ready: Prepared, scene: Scene, windows: Windows, table: pd.Da
 def _together(
     ready: Prepared,
     run: Run,
-    scene: Scene,
+    context: AnalysisContext,
     windows: Windows,
     noise: Noise,
     summary: dict[str, Any],
@@ -170,19 +172,19 @@ def _together(
 ) -> DetectionResult:
     """Find, fit and sample the particles that are there in all frames after the background."""
     events, windows = fit_field(
-        scene, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
+        context, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
     )
     run.clock.lap("fit")
     # rings of many particles that a wrong microscope leaves over look uneven too
-    cause = misfit_warning(scene.config, events)
-    cause = cause or _uneven(scene, ready.steady.name, windows, events)
+    cause = misfit_warning(context.config, events)
+    cause = cause or _uneven(context, ready.steady.name, windows, events)
     if cause:
-        run.tell(cause)
-    repeats, empty = field_repeats(scene, ready.steady, ready.camera, windows, events)
-    if scene.config.fit.sigma != "measured":
-        events, changing = _with_changes(scene.mode, events, repeats)
+        run.warn(cause)
+    repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
+    if context.config.fit.sigma != "measured":
+        events, changing = _with_changes(context.mode, events, repeats)
         if changing:
-            run.tell(
+            run.warn(
                 f"the mass of {count(changing, 'event')} changes within the frames by more than "
                 f"{CHANGES:g} times its error, flagged poor_fit: they land, leave or move there; "
                 "let background.frames end before they land and fit.frames begin after"
@@ -190,18 +192,18 @@ def _together(
     run.clock.lap("repeats")
     chains: list[PosteriorResult] = []
     interrupted = False
-    if scene.config.samples_posterior:
-        chains, interrupted = _sampled(scene, events, pool, run.progress)
+    if context.config.samples_posterior:
+        chains, interrupted = _sampled(context, events, pool, run.progress)
         run.clock.lap("posterior")
     return DetectionResult(
-        scene=scene,
-        fits=table_of(scene, events),
-        evidence=evidence_beside(scene, events),
+        context=context,
+        fits=table_of(context, events),
+        evidence=evidence_beside(context, events),
         views=tuple(
             view_of(number, event, posterior=chain)
             for number, (event, chain) in enumerate(zip_longest(events, chains))
         ),
-        image=contrast_image(scene, windows),
+        image=contrast_image(context, windows),
         compared=Compared.of(windows),
         heading="background",
         summary=summary,
@@ -211,26 +213,26 @@ def _together(
     )
 
 
-def _uneven(scene: Scene, name: str, windows: Windows, events: Sequence[Event]) -> str:
+def _uneven(context: AnalysisContext, name: str, windows: Windows, events: Sequence[Event]) -> str:
     """Say that a known background is uneven, away from the particles that were fitted over it."""
     if windows.n_before:
         return ""
     rows, columns = windows.after_e.shape
     field, signal = Region((0, rows), (0, columns)), np.zeros(windows.after_e.shape)
-    optics = scene.config.optics
+    optics = context.config.optics
     near_nm = _NEAR * optics.wavelength_nm / optics.na
-    y, x = (scene.pixel_nm * index for index in np.indices(signal.shape))
+    y, x = (context.pixel_nm * index for index in np.indices(signal.shape))
     away = np.ones(signal.shape, dtype=np.bool_)
     for event in events:
         x_nm, y_nm, z_nm = (float(v) for v in event.fit.theta[:3])
-        mass = float(scene.model.scale.mass(event.fit.theta[3]))
-        add_signal(scene, (x_nm, y_nm, z_nm, mass), field, signal)
+        mass = float(context.model.scale.mass(event.fit.theta[3]))
+        add_signal(context, (x_nm, y_nm, z_nm, mass), field, signal)
         away &= np.hypot(x - x_nm, y - y_nm) > near_nm
     if away.mean() < _LEAST_AWAY:
-        return uneven_warning(scene.config, name, windows)
-    if scene.additive:
-        signal = signal * photons_scale(scene, windows)
-    return uneven_warning(scene.config, name, windows, np.where(away, signal, np.nan))
+        return uneven_warning(context.config, name, windows)
+    if context.additive:
+        signal = signal * photons_scale(context, windows)
+    return uneven_warning(context.config, name, windows, np.where(away, signal, np.nan))
 
 
 def _with_changes(
@@ -250,14 +252,14 @@ def _with_changes(
 
 
 def _sampled(
-    scene: Scene, events: Sequence[Event], pool: ThreadPoolExecutor, progress: Progress
+    context: AnalysisContext, events: Sequence[Event], pool: ThreadPoolExecutor, progress: Progress
 ) -> tuple[list[PosteriorResult], bool]:
     """Sample the posteriors, in order; an interrupt keeps those that are done."""
     stop = threading.Event()
     done: list[PosteriorResult] = []
     try:
         for chain in pool.map(
-            lambda n: posterior_of(scene, events[n], n, stopped=stop.is_set), range(len(events))
+            lambda n: posterior_of(context, events[n], n, stopped=stop.is_set), range(len(events))
         ):
             done.append(chain)
             progress("posterior", len(done), len(events))

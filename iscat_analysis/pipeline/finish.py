@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from iscat_analysis.calibration.mass import as_given
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.diagnosis.causes import (
-    bend_warning,
-    course_warning,
+    fixed_height_warning,
+    landing_rate_warning,
     line_warning,
-    plane_warning,
+    nonlinearity_warning,
     scale_warning,
     sign_warning,
 )
@@ -59,8 +59,8 @@ def gather(
     if interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)
         progress = silent  # another stage would end the time that writing is given
-    scene, compared = found.scene, found.compared
-    config = scene.config
+    context, compared = found.context, found.compared
+    config = context.config
     further = {**ready.summary}
     if found.summary:
         further[found.heading] = found.summary
@@ -76,9 +76,9 @@ def gather(
         table = make_rows(table, {"tick": ticks[table["frame"].to_numpy(int)]})
     for flag in ready.flags:
         table = flagged(table, flag)
-    scale = scene.model.scale
+    scale = context.model.scale
     if rows.course:
-        run.tell(rows.course)
+        run.warn(rows.course)
     for name, beside in (
         ("heights", rows.heights), ("extension", rows.extension),
         ("fluctuation", rows.fluctuation),
@@ -86,16 +86,16 @@ def gather(
         if beside is not None:
             further[name] = beside.summary
             if beside.message:
-                run.tell(beside.message)
+                run.warn(beside.message)
     for doubt in (
         scale_warning(scale),
         line_warning(config, table),
-        bend_warning(scale, table),
+        nonlinearity_warning(scale, table),
         sign_warning(config, table),
-        course_warning(table) if ready.way == "sliding" else "",
+        landing_rate_warning(table) if ready.way == "sliding" else "",
     ):
         if doubt:
-            run.tell(doubt)
+            run.warn(doubt)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
         had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
@@ -105,9 +105,9 @@ def gather(
         )  # fmt: skip
         further["repeats"] = verdict
         if verdict["message"]:
-            run.tell(verdict["message"])
+            run.warn(verdict["message"])
     elif scaled and len(table):
-        run.tell(
+        run.warn(
             'fit.sigma = "measured" has no effect: the spread is not measured where the background '
             "is learnt with the tracks, and σ is that of the likelihood"
         )
@@ -116,22 +116,22 @@ def gather(
     if found.followed is not None:
         followed = found.followed
         tracks, said = tracks_of(
-            scene, table, followed.windows,
-            masses=followed.masses, ticks=ticks, tell=run.tell, progress=progress,
+            context, table, followed.windows,
+            masses=followed.masses, ticks=ticks, warn=run.warn, progress=progress,
         )  # fmt: skip
         further |= said
         for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
-            run.tell(text)
-        flat = plane_warning(config, table)
+            run.warn(text)
+        flat = fixed_height_warning(config, table)
         if flat:
-            run.tell(flat)
+            run.warn(flat)
         backgrounds = followed.parts or (followed.windows,)
-        films = make_films(scene, ready.steady, ready.camera, backgrounds, table, tracks)
+        films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")
     if scale.refusal:
         table = flagged(table, Status.UNCALIBRATED_OPTICS)
         tracks = None if tracks is None else flagged(tracks, TrackStatus.UNCALIBRATED_OPTICS)
-    summary = summary_of(scene, table, compared, run.clock.seconds, achieved)
+    summary = summary_of(context, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
         input_path=printable(str(ready.movie.path)),
@@ -156,9 +156,9 @@ def gather(
     frames, first = _each_once(compared)
     analysis = Analysis(
         config_toml=config_to_toml(as_given(config)),
-        mode=scene.mode,
+        mode=context.mode,
         scheme=config.optics.scheme,
-        pixel_size_nm=scene.pixel_nm,
+        pixel_size_nm=context.pixel_nm,
         table=table,
         views=found.views,
         ratio_image=found.image,
@@ -172,12 +172,12 @@ def gather(
         response=ready.response.table if ready.response is not None else None,
     )
     searched = found.summary.get("searched_share") if found.summary else None
-    described = species_of(scene, table, searched)
+    described = species_of(context, table, searched)
     explained = {"explained_kda": explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
     wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)
     if wide:
-        run.tell(wide)
+        run.warn(wide)
     warned = {"warnings": run.warnings}
     return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 

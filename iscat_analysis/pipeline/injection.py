@@ -25,10 +25,10 @@ from iscat_analysis.camera.drift import Mover, Trajectory
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import Executor
+from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run, unheard
-from iscat_analysis.fitting.scene import Scene, reported_steps
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.rows import reported_rows
@@ -143,7 +143,7 @@ def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[st
         return {}, False
     try:
         recovered = inject_and_recover(
-            ready.movie, found.scene.config, ready.camera, found, run.inject,
+            ready.movie, found.context.config, ready.camera, found, run.inject,
             progress=run.progress, place=run.place,
         )  # fmt: skip
     except KeyboardInterrupt:
@@ -169,15 +169,15 @@ def inject_and_recover(
     fixed = config.background.model_copy(update={"window_frames": window})
     seed = config.compute.seed
     particles = draw_particles(
-        result.scene, (movie.shape[1], movie.shape[2]), frames, window, count, result.fits, seed
+        result.context, (movie.shape[1], movie.shape[2]), frames, window, count, result.fits, seed
     )
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
-        tell=unheard,  # the user has been told already
+        warn=unheard,  # the user has been told already
         progress=progress,
-        lines=result.scene.lines,
+        lines=result.context.lines,
         place=place,
     )
     if again.interrupted:
@@ -187,16 +187,16 @@ def inject_and_recover(
         particles,
         rows[rows["status"] != Status.SIDELOBE],
         frames[1],
-        result.scene.roi_px / 2,
+        result.context.roi_px / 2,
         window,
-        sign=reported_steps(result.scene),
-        threshold=result.scene.templates.threshold,
+        sign=reported_steps(result.context),
+        threshold=result.context.templates.threshold,
         searched=again.summary["searched_share"],
     )
 
 
 def draw_particles(
-    scene: Scene,
+    context: AnalysisContext,
     field_px: tuple[int, int],
     frames: tuple[int, int],
     window: int,
@@ -208,8 +208,8 @@ def draw_particles(
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
     good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
     if not good.size:
-        good = np.array([scene.model.material.mass_kda])
-    margin = min(scene.roi_px / 2, (min(field_px) - 1) / 2)
+        good = np.array([context.model.material.mass_kda])
+    margin = min(context.roi_px / 2, (min(field_px) - 1) / 2)
     stay = STAY * window
     first = frames[0] + window
     last = max(frames[1] - window - stay, first + 1)
@@ -221,14 +221,14 @@ def draw_particles(
         mass = float(rng.choice(good))
         spans = []
         for centre, size in zip((y, x), field_px, strict=True):
-            middle, half = round(centre), round(LARGEST_IMAGE * scene.roi_px)
+            middle, half = round(centre), round(LARGEST_IMAGE * context.roi_px)
             spans.append((max(middle - half, 0), min(middle + half + 1, size)))
-        grid = PixelGrid.region(spans[0], spans[1], scene.pixel_nm)
-        image = scene.wide_at(int(landing)).image(
+        grid = PixelGrid.region(spans[0], spans[1], context.pixel_nm)
+        image = context.wide_at(int(landing)).image(
             grid,
-            x * scene.pixel_nm,
-            y * scene.pixel_nm,
-            scene.config.particle.nominal_height_nm,
+            x * context.pixel_nm,
+            y * context.pixel_nm,
+            context.config.particle.nominal_height_nm,
             mass,
         )
         frame = int(landing)

@@ -18,11 +18,11 @@ from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import judge_background, survey_noise
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.context import AnalysisContext, make_context, reported_steps
 from iscat_analysis.fitting.field import search_field
 from iscat_analysis.fitting.pattern import SPAN, corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import contrast_image
-from iscat_analysis.fitting.scene import Scene, make_scene, reported_steps
 from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, silent
@@ -116,7 +116,7 @@ class Search(Protocol):
     longest: int
     frames: tuple[int, int]
 
-    def scene(self, window: int) -> Scene:
+    def context(self, window: int) -> AnalysisContext:
         """Give models and threshold for windows of a length."""
 
     def look(self, frame: int, window: int) -> Look:
@@ -136,13 +136,13 @@ class LandingSearch:
         noise, self.window = opening.noise, opening.window
 
         @lru_cache(_WINDOWS_KEPT)
-        def scene(window: int) -> Scene:
-            return make_scene(
+        def context(window: int) -> AnalysisContext:
+            return make_context(
                 config, self._reader.shape, searches=boundaries(last - first, window),
                 noise=noise.spectrum, lines=lines, sliding=True,
             )  # fmt: skip
 
-        self.scene = scene
+        self.context = context
 
     def look(self, frame: int, window: int) -> Look:
         """Look at the windows before and after the boundary at which a frame begins."""
@@ -153,7 +153,7 @@ class LandingSearch:
         reach = (SPAN if self._config.background.follows_pattern else 1) * STRIDES
         blocks_before = min(reach, (frame - first) // stride)
         span = frame - blocks_before * stride, min(frame + reach * stride, last)
-        scene = self.scene(window)
+        context = self.context(window)
         with threads(self._config.compute.workers) as pool:
             chunk = self._reader.chunk(span, stride, pool)
             chunk, pattern = corrected(chunk, wanted=reach > STRIDES, mapper=pool.map)
@@ -170,7 +170,7 @@ class LandingSearch:
 
         @cache
         def map_of() -> tuple[Filter, MapArray, FloatArray]:
-            matched = make_filter(chunk, scene.templates.images[0], scene.templates.noise)
+            matched = make_filter(chunk, context.templates.images[0], context.templates.noise)
             count = chunk.edges.size - 2
             empty = np.zeros((count, *chunk.shape), np.float32), np.zeros(count)
             snr, effective = sliding_maps(
@@ -182,10 +182,10 @@ class LandingSearch:
         def search(threshold: float) -> pd.DataFrame:
             matched, snr, effective = map_of()
             peaks = find_steps(chunk, matched, snr, effective, threshold)
-            sieve = SidelobeFilter(chunk.first, stride, window, scene.roi_px)
-            sign, scale = reported_steps(scene), scene.model.scale
+            sieve = SidelobeFilter(chunk.first, stride, window, context.roi_px)
+            sign, scale = reported_steps(context), context.model.scale
             return _listed(
-                (p.x_px, p.y_px, p.snr, float(scene.contrasts(np.asarray(p.amplitude))),
+                (p.x_px, p.y_px, p.snr, float(context.contrasts(np.asarray(p.amplitude))),
                  math.copysign(float(scale.mass(np.asarray(abs(p.amplitude)))), p.amplitude))
                 for p in sieve.sift(peaks, (), snr)[0]
                 if sign * p.amplitude >= 0
@@ -193,7 +193,7 @@ class LandingSearch:
 
         return Look(
             frame, (max(frame - half, first), frame), (frame, min(frame + half, last)), contrast,
-            scene.templates.threshold, search,
+            context.templates.threshold, search,
         )  # fmt: skip
 
 
@@ -220,17 +220,17 @@ class BoundSearch:
             additive=config.optics.scheme == "darkfield",
         )
         searches = self.longest if tracked else 1
-        self._scene = make_scene(
+        self._context = make_context(
             config, shape, searches=searches, noise=noise.spectrum, lines=lines
         )
 
-    def scene(self, window: int) -> Scene:  # noqa: ARG002
+    def context(self, window: int) -> AnalysisContext:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""
-        return self._scene
+        return self._context
 
     def look(self, frame: int, window: int) -> Look:
         """Look at the frames from one on, over the background."""
-        scene, known = self._scene, self._windows
+        context, known = self._context, self._windows
         frame = min(max(frame, self.frames[0]), self.frames[1] - window)
         part = measure_windows(
             self._movie, self._camera, None, (frame, frame + window),
@@ -248,20 +248,20 @@ class BoundSearch:
         )
         if self._config.background.power_normalization:
             windows = start_power(windows)
-        image = contrast_image(scene, windows)
+        image = contrast_image(context, windows)
         wanted = self._config.detection.sign
 
         def search(threshold: float) -> pd.DataFrame:
-            found, _ = search_field(_with_threshold(scene, threshold), windows)
+            found, _ = search_field(_with_threshold(context, threshold), windows)
             rows = [
-                (c.x_px, c.y_px, c.snr, scene.model.peak_contrast(c.z_nm, c.mass_kda), c.mass_kda)
+                (c.x_px, c.y_px, c.snr, context.model.peak_contrast(c.z_nm, c.mass_kda), c.mass_kda)
                 for c in found
             ]
-            return _listed(r for r in rows if scene.additive or wanted * r[3] >= 0)
+            return _listed(r for r in rows if context.additive or wanted * r[3] >= 0)
 
         return Look(
             frame, known.frames_before if known.n_before else None, windows.frames_after,
-            np.where(windows.masked, np.nan, image), scene.templates.threshold, search,
+            np.where(windows.masked, np.nan, image), context.templates.threshold, search,
         )  # fmt: skip
 
 
@@ -276,21 +276,21 @@ class MovingSearch:
         self.longest = last - first
         self.window = min(AROUND, self.longest)
         shape = (movie.shape[1], movie.shape[2])
-        self._scene = track_scene(config, shape, max(last - first, 1))
+        self._context = track_scene(config, shape, max(last - first, 1))
 
         @lru_cache(1)
         def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
             with threads(config.compute.workers) as pool:
                 field = load_field(
-                    self._scene, self._movie, camera, span, self._check, pool, silent
+                    self._context, self._movie, camera, span, self._check, pool, silent
                 )
                 return field, opening_ground(config, field)
 
         self._background = background
 
-    def scene(self, window: int) -> Scene:  # noqa: ARG002
+    def context(self, window: int) -> AnalysisContext:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""
-        return self._scene
+        return self._context
 
     def look(self, frame: int, window: int) -> Look:
         """Look at one frame over the median of those around it."""
@@ -302,31 +302,31 @@ class MovingSearch:
         field, ground = self._background(span)
         nothing = np.zeros(0, dtype=np.int64)
         rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
-        here, scene = frame - start, self._scene
+        here, context = frame - start, self._context
         light = ground.level * ground.power[here]
         image = field.residual(ground, rows, here, here + 1)[0] / light
 
         def search(threshold: float) -> pd.DataFrame:
             with threads(self._config.compute.workers) as pool:
                 found = search_frames(
-                    _with_threshold(scene, threshold), field, ground, rows,
+                    _with_threshold(context, threshold), field, ground, rows,
                     pool=pool, frames=(here, here + 1),
                 )  # fmt: skip
-            mass = np.asarray(scene.model.scale.mass(found.strength))
+            mass = np.asarray(context.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
             return _listed(
-                (x, y, snr, scene.model.peak_contrast(float(z), float(m)), m)
+                (x, y, snr, context.model.peak_contrast(float(z), float(m)), m)
                 for x, y, snr, z, m in each
             )
 
         return Look(
             frame, span, (frame, frame + 1), np.where(field.used, image, np.nan),
-            scene.templates.threshold, search,
+            context.templates.threshold, search,
         )  # fmt: skip
 
 
-def _with_threshold(scene: Scene, threshold: float) -> Scene:
-    return replace(scene, templates=replace(scene.templates, threshold=threshold))
+def _with_threshold(context: AnalysisContext, threshold: float) -> AnalysisContext:
+    return replace(context, templates=replace(context.templates, threshold=threshold))
 
 
 def _listed(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:

@@ -48,16 +48,16 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         darkfield_photons(config.particle)
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
-        run.tell(note)
+        run.warn(note)
     way = background_mode(config)
     run.notify(describe_background_mode(config))
     span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
     if tracked:
         for note in judge_times(config, tracked_frames(movie, config), movie.name):
-            run.tell(note)
+            run.warn(note)
     if config.optics.psf == "measured":
-        run.tell(
+        run.warn(
             'optics.psf = "measured": bounds are those of the template, and there is no quantum '
             "bound, because a picture does not say what light made it"
         )
@@ -68,12 +68,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
     for text in (*known.messages, *law_said(known)):
-        run.tell(f"{movie.name}: {text}")
+        run.warn(f"{movie.name}: {text}")
     if auto:
         run.notify(f"{movie.name}: {known.said}")
     processing = find_processing(movie, camera, span)
     if processing is not None:
-        run.tell(f"{movie.name}: {processing.message}")
+        run.warn(f"{movie.name}: {processing.message}")
     stop = min(stop, start + _OPENING, movie.shape[0])
     seen = movie.read(start, max(start, stop))
     if way != "sliding":  # windows that slide pass over frames that repeat
@@ -81,7 +81,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     refuse_overflow(stored.read(start, max(start, stop)), movie.name)
     swapped = axes_warning(movie.name, seen)
     if swapped:
-        run.tell(swapped)
+        run.warn(swapped)
     summary: dict[str, Any] = {"camera": known.summary}
     if processing is not None:
         summary["processing"] = processing.summary
@@ -101,7 +101,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
                 looking = beside(look_at_changes, movie, config, camera, span)
             judged = judge_light(movie, config, camera)
     for text in judged.messages:
-        run.tell(f"{movie.name}: {text}")
+        run.warn(f"{movie.name}: {text}")
     unsteady = judged.steady is not movie
     movie, lines, steady = judged.movie, judged.lines, judged.steady
     if lines is not None:
@@ -113,13 +113,13 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     wrong = wrong_sign(config)
     if wrong is not None:
         config, learned = learn_sign(
-            steady, wrong, camera, tell=run.tell, notify=run.notify, opening=opened
+            steady, wrong, camera, warn=run.warn, notify=run.notify, opening=opened
         )
         config = _with_standards(config, run)
     else:
         config, learned = learn_optics(
             steady, _with_standards(config, run), camera,
-            tell=run.tell, notify=run.notify, opening=opened,
+            warn=run.warn, notify=run.notify, opening=opened,
         )  # fmt: skip
     if learned:
         summary["optics"] = learned
@@ -132,7 +132,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         summary["changes"] = changes_summary(changes)
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
         if other_kind:
-            run.tell(other_kind)
+            run.warn(other_kind)
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(

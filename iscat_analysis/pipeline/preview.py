@@ -127,7 +127,7 @@ class Preview:
         float
             Signal-to-noise ratio.
         """
-        return self._search.scene(self._checked(window)).templates.threshold
+        return self._search.context(self._checked(window)).templates.threshold
 
     def false_alarms(self, threshold: float, window: int | None = None) -> float:
         """Say how many false alarms a threshold would bring.
@@ -145,7 +145,7 @@ class Preview:
             Expected in the whole movie: the ``detection.false_alarms_per_movie`` that has this
             threshold.
         """
-        templates = self._search.scene(self._checked(window)).templates
+        templates = self._search.context(self._checked(window)).templates
         above = templates.excursions.above
         share = above(positive(threshold)) / above(templates.threshold)
         return self.config.detection.false_alarms_per_movie * share

@@ -24,13 +24,13 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.events import Fitted, PlaceAndMass
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import Region, photons_scale, region_around, region_likelihood
 from iscat_analysis.fitting.results import view_of
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.landing.tasks import TaskBuilder
@@ -92,7 +92,7 @@ def _landings(
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = reader_of(frames, config, camera, (first, last))
-    scene = make_scene(config, reader.shape, lines=lines, sliding=True)
+    context = make_context(config, reader.shape, lines=lines, sliding=True)
     stride = stride_of(window)
 
     def draw(row: int) -> EventView:
@@ -102,12 +102,12 @@ def _landings(
             chunk = reader.chunk(span, stride, pool)
             wanted = config.background.follows_pattern
             chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-        neighbours = Neighbours(scene, chunk, window, pattern)
+        neighbours = Neighbours(context, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window
         known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
         steps = [_step(neighbours, table.iloc[i]) for i in numbers]
-        task = TaskBuilder(scene, chunk, window, neighbours, pattern).build(
+        task = TaskBuilder(context, chunk, window, neighbours, pattern).build(
             0, steps, neighbours.of(steps)[0]
         )
         if task is None:
@@ -116,7 +116,7 @@ def _landings(
         start = Candidate(
             start.x_px + x_px, start.y_px + y_px, start.z_nm, start.mass_kda, start.snr
         )
-        fit = fit_particle(task.likelihood, start, scene.mode, config.fit.z_range_nm, level=True)
+        fit = fit_particle(task.likelihood, start, context.mode, config.fit.z_range_nm, level=True)
         number = int(table["event"].iloc[row])
         return view_of(number, Fitted(task.region, fit, task.likelihood))
 
@@ -144,14 +144,14 @@ def _bound(
     before, after = frame_ranges(movie, config)
     tracked = config.fit.mode == "track"
     shape = (movie.shape[1], movie.shape[2])
-    scene = make_scene(config, shape, lines=lines)
+    context = make_context(config, shape, lines=lines)
     whole = Region((0, shape[0]), (0, shape[1]))
 
     def drawn(region: Region, rows: Sequence[int]) -> FloatArray:
         """Draw the signal of some rows in a region."""
         total = np.zeros(region.shape)
         for i in rows:
-            add_signal(scene, _place(table.iloc[i]), region, total)
+            add_signal(context, _place(table.iloc[i]), region, total)
         return total
 
     @lru_cache(1)
@@ -161,24 +161,24 @@ def _bound(
         rows = table.index[table["mass_kda"].notna() & (table["status"] != "sidelobe")]
         here = [int(i) for i in rows if not tracked or int(table["frame"].iloc[i]) == span[0]]
         if config.background.power_normalization:
-            signal = scene.left(drawn(whole, here))
-            if scene.additive:
-                signal = signal * photons_scale(scene, windows)
-            windows = refine_power(windows, signal, additive=scene.additive)
+            signal = context.left(drawn(whole, here))
+            if context.additive:
+                signal = signal * photons_scale(context, windows)
+            windows = refine_power(windows, signal, additive=context.additive)
         return windows, here
 
     def draw(row: int) -> EventView:
         frame = int(table["frame"].iloc[row])
         windows, here = seen((frame, frame + 1) if tracked else after)
         x_nm, y_nm, z_nm, mass = _place(table.iloc[row])
-        pixel = scene.pixel_nm
+        pixel = context.pixel_nm
         start = Candidate(x_nm / pixel, y_nm / pixel, z_nm, mass, float(table["snr"].iloc[row]))
-        region = region_around(scene.roi_px, shape, start)
+        region = region_around(context.roi_px, shape, start)
         others = drawn(region, [i for i in here if i != row])
         if lines is not None:
             others = (1 + others) / lines.taken(drawn(whole, here))[region.slices] - 1
-        likelihood = region_likelihood(scene, windows, region, others)
-        fit = fit_particle(likelihood, start, scene.mode, config.fit.z_range_nm, level=False)
+        likelihood = region_likelihood(context, windows, region, others)
+        fit = fit_particle(likelihood, start, context.mode, config.fit.z_range_nm, level=False)
         number = int(table["event"].iloc[row])
         return view_of(number, Fitted(region, fit, likelihood))
 
@@ -202,7 +202,7 @@ def _moving(
     """Draw particles in single frames, over the background of their block under all of them."""
     first, last = fitted_frames(movie, config)
     shape = movie.shape[1], movie.shape[2]
-    scene = track_scene(config, shape, max(last - first, 1), lines)
+    context = track_scene(config, shape, max(last - first, 1), lines)
     edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
     known = table["mass_kda"].notna() & table["track"].notna()
     _, exposure_s = exposure_of(config)
@@ -222,7 +222,7 @@ def _moving(
         theta = np.zeros((len(part), 5))
         theta[:, :3] = part[["x_nm", "y_nm", "z_nm"]].to_numpy(float)
         masses = part["mass_kda"].to_numpy(float)
-        theta[:, 3] = scene.model.scale.amplitudes(masses)
+        theta[:, 3] = context.model.scale.amplitudes(masses)
         numbers, track = np.unique(part["track"].to_numpy(int), return_inverse=True)
         frame = part["frame"].to_numpy(np.int64) - start
         order = np.lexsort((track, frame))
@@ -230,11 +230,11 @@ def _moving(
         speeds: FloatArray = np.array([[diffusion.get(int(n), 0.0)] for n in numbers])
         rows, variances = blurred_rows(rows, speeds.reshape(-1, 1), exposure_s)
         with threads(config.compute.workers) as pool:
-            field = load_field(scene, movie, camera, (start, stop), check, pool, silent)
+            field = load_field(context, movie, camera, (start, stop), check, pool, silent)
             field.set_blurs(variances)
             follows = config.background.power_normalization
             ground = opening_ground(config, field)
-            give_back(scene, field, movie, camera, start, ground, rows)
+            give_back(context, field, movie, camera, start, ground, rows)
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level

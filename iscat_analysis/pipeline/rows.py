@@ -44,7 +44,7 @@ class ReportedRows:
 
 def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
     """Make the rows of all events of a movie."""
-    fits, config, mode = found.fits, found.scene.config, found.scene.mode
+    fits, config, mode = found.fits, found.context.config, found.context.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     told, heights, extension = None, None, None
     if found.evidence is not None and len(found.evidence):
@@ -73,9 +73,9 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
         name: fits[name] * factor for name, factor in scale.items()
     }
     unfit = (
-        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.scene.roi_px**2)
+        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.context.roi_px**2)
     )
-    shared = contributions(config, fits, unfit, found.scene.model.scale, shifts)
+    shared = contributions(config, fits, unfit, found.context.model.scale, shifts)
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

@@ -116,14 +116,14 @@ def write_setup(
     *,
     answers: Mapping[str, float | str] | None = None,
     ask: Callable[[Question], str] | None = None,
-    tell: Callable[[str], None] = lambda _: None,
+    warn: Callable[[str], None] = lambda _: None,
     out: Path | None = None,
     overwrite: bool = False,
 ) -> Setup:
     """Write a configuration for a movie, and look at some of its frames with it.
 
     `answers` are keys of the configuration and what the user has said already; `ask` puts the
-    questions that are left, and without it defaults are taken; `tell` says what is known, line by
+    questions that are left, and without it defaults are taken; `warn` says what is known, line by
     line.
     """
     target = setup_beside(movie) if out is None else out
@@ -131,10 +131,10 @@ def write_setup(
         raise DataError(f"{target}: exists already; give another name, or pass `overwrite`")
     with open_stack(movie) as stack:
         frames, rows, columns = stack.shape
-        tell(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
+        warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
         known = _known(stack.metadata, answers or {})
-        tell(_metadata_said(stack))
-        values, config = _ask_the_rest(known, ask, tell)
+        warn(_metadata_said(stack))
+        values, config = _ask_the_rest(known, ask, warn)
         if config.camera.pixel_size_nm is None:
             raise DataError(
                 f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
@@ -172,14 +172,14 @@ def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[
 
 
 def _ask_the_rest(
-    known: list[Value], ask: Callable[[Question], str] | None, tell: Callable[[str], None]
+    known: list[Value], ask: Callable[[Question], str] | None, warn: Callable[[str], None]
 ) -> tuple[list[Value], Config]:
     """Put one question at a time, and once more where the answer cannot be."""
     config = configure(None, settings={each.key: each.value for each in known})
     values = list(known)
     open_questions = [q for q in _QUESTIONS if q.key not in {each.key for each in known}]
     if open_questions:
-        tell("not known: " + ", ".join(question.words for question in open_questions))
+        warn("not known: " + ", ".join(question.words for question in open_questions))
     for question in open_questions:
         answer: float | str | None = question.default
         while ask is not None:
@@ -188,7 +188,7 @@ def _ask_the_rest(
                 config = configure(config, settings={question.key: answer})
                 break
             except ConfigError as error:
-                tell(str(error))
+                warn(str(error))
         if answer is None:
             continue
         given = _get(config, question.key)

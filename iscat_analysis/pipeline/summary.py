@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import holevo_over_quantum
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
 from iscat_analysis.report.spread import rejection
@@ -24,7 +24,7 @@ _HEIGHTS = 65
 
 
 def summary_of(
-    scene: Scene,
+    context: AnalysisContext,
     table: pd.DataFrame,
     compared: Compared,
     timings: Mapping[str, float],
@@ -32,9 +32,9 @@ def summary_of(
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
     good = table[table["status"] == Status.OK]
-    free = free_parameters(scene.mode, table)
+    free = free_parameters(context.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
-    cost = _holevo_over_quantum(scene, good["z_nm"].to_numpy(float)) if conflict else {}
+    cost = _holevo_over_quantum(context, good["z_nm"].to_numpy(float)) if conflict else {}
     precision = {}
     for name in free:
         sigma, crb, qcrb = (good[f"{kind}_{name}"] for kind in ("sigma", "crb", "qcrb"))
@@ -52,12 +52,12 @@ def summary_of(
         if f"systematic_{name}" in good:
             precision[name]["systematic_median"] = _median(good[f"systematic_{name}"])
     return {
-        "mode": scene.mode,
-        "scheme": scene.model.optics.scheme,
-        "emission": scene.model.optics.emission,
-        "convention": scene.model.optics.convention,
-        "mass_scale": "calibration" if scene.config.calibration else "absolute model",
-        **_carried(scene),
+        "mode": context.mode,
+        "scheme": context.model.optics.scheme,
+        "emission": context.model.optics.emission,
+        "convention": context.model.optics.convention,
+        "mass_scale": "calibration" if context.config.calibration else "absolute model",
+        **_carried(context),
         "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
         "frames_before": list(compared.frames_before),
@@ -65,7 +65,7 @@ def summary_of(
         "power_ratio": compared.power_ratio,
         "power_spread": _spread(compared.power),
         "masked_pixels": compared.masked_pixels,
-        "detection_threshold_snr": scene.templates.threshold,
+        "detection_threshold_snr": context.templates.threshold,
         "medians": {
             "mass_kda": _median(good["mass_kda"]),
             "contrast": _median(good["contrast"]),
@@ -78,9 +78,9 @@ def summary_of(
     }
 
 
-def _carried(scene: Scene) -> dict[str, Any]:
+def _carried(context: AnalysisContext) -> dict[str, Any]:
     """Say how far the scale was carried from the optics of its standards."""
-    scale = scene.model.scale
+    scale = context.model.scale
     if scale.calibration is None:
         return {}
     return {
@@ -92,11 +92,13 @@ def _carried(scene: Scene) -> dict[str, Any]:
     }
 
 
-def species_of(scene: Scene, table: pd.DataFrame, searched: float | None = None) -> dict[str, Any]:
+def species_of(
+    context: AnalysisContext, table: pd.DataFrame, searched: float | None = None
+) -> dict[str, Any]:
     """Describe the species of all events, of which so large a share could be seen."""
     good = table[table["status"] == Status.OK]
-    distribution = _distribution(scene, good, searched or 1.0)
-    across = _across(scene, table, distribution)
+    distribution = _distribution(context, good, searched or 1.0)
+    across = _across(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
 
@@ -115,33 +117,35 @@ def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
     }
 
 
-def _holevo_over_quantum(scene: Scene, z_nm: FloatArray) -> dict[str, FloatArray]:
+def _holevo_over_quantum(context: AnalysisContext, z_nm: FloatArray) -> dict[str, FloatArray]:
     """Cost of fitting height and mass at once, of each particle, by parameter.
 
     It depends on the height through the evanescent waves alone, and smoothly.
     """
-    free = FREE_PARAMETERS[scene.mode]
+    free = FREE_PARAMETERS[context.mode]
     heights = np.linspace(max(z_nm.min(), 0.0), max(z_nm.max(), 1.0), _HEIGHTS)
-    costs = [holevo_over_quantum(scene.model, float(z), free) for z in heights]
+    costs = [holevo_over_quantum(context.model, float(z), free) for z in heights]
     return {name: np.interp(z_nm, heights, [cost[name] for cost in costs]) for name in free}
 
 
-def _distribution(scene: Scene, good: pd.DataFrame, searched: float) -> dict[str, Any] | None:
+def _distribution(
+    context: AnalysisContext, good: pd.DataFrame, searched: float
+) -> dict[str, Any] | None:
     """Describe the species where masses were fitted, each event once.
 
     The matched filter's standard deviation is what its snr makes of each mass.
     """
-    if "mass_kda" not in FREE_PARAMETERS[scene.mode] or scene.mode == "track":
+    if "mass_kda" not in FREE_PARAMETERS[context.mode] or context.mode == "track":
         return None
     mass, sigma = (good[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
     efficiency = None
     if len(good) >= LEAST_EVENTS:  # fewer have no species whose numbers it would correct
-        efficiency = filter_efficiency(good, scene.templates.threshold, searched)
+        efficiency = filter_efficiency(good, context.templates.threshold, searched)
     found = describe(
         mass,
         sigma,
         efficiency=efficiency,
-        seed=scene.config.compute.seed,
+        seed=context.config.compute.seed,
         scale_error=shared_error(good),
         window_frames=int(good["n_after"].max()) if len(good) else None,
     )
@@ -149,7 +153,7 @@ def _distribution(scene: Scene, good: pd.DataFrame, searched: float) -> dict[str
 
 
 def _across(
-    scene: Scene, table: pd.DataFrame, distribution: Mapping[str, Any] | None
+    context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""
     if distribution is None:
@@ -159,7 +163,7 @@ def _across(
     if rejection(table):
         used = table[status.isin([Status.OK, Status.POOR_FIT])]
         mass, sigma = (used[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-        found = describe(mass, sigma, seed=scene.config.compute.seed)
+        found = describe(mass, sigma, seed=context.config.compute.seed)
         species = found.to_dict()["species"]
     if not species:
         return []

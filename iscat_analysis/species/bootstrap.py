@@ -10,9 +10,9 @@ from scipy.special import log_ndtr, ndtri_exp
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, climb, height
+from iscat_analysis.species.mixture import Mixture, ascend, height
 from iscat_analysis.species.search import joined_starts, split_starts
-from iscat_analysis.species.structure import Limits, Structure, polish, settle
+from iscat_analysis.species.structure import Limits, Structure, fit_jointly, polish
 
 _SUPPORT_DRAWS = 20
 _RIVAL_EVALUATIONS = 150
@@ -47,7 +47,7 @@ def bootstrap(
         if structure is None:
             fit = polish(drawn, best, tolerance=_TOLERANCE)
         else:
-            fit = settle(drawn, best, *structure, tolerance=_TOLERANCE)
+            fit = fit_jointly(drawn, best, *structure, tolerance=_TOLERANCE)
         repeats.append(Repeat(fit, fit.shares(drawn).sum(axis=0), fit.weight * fit.arrived(drawn)))
         if searched and number < _SUPPORT_DRAWS:
             n = drawn.x.size
@@ -85,7 +85,7 @@ def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generat
 
 def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
     """Fit one species more and, where there are two or more, one less."""
-    more = [climb(events, start) for start in split_starts(events, fit)]
+    more = [ascend(events, start) for start in split_starts(events, fit)]
     return [
         polish(
             events,

@@ -30,7 +30,7 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import Mixture, height
 from iscat_analysis.species.search import fit_species
-from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, settle
+from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, fit_jointly
 
 Widths = Literal["common", "free"]
 
@@ -116,7 +116,7 @@ class Given:
             widths=self.widths, background=self.background, unit_kda=float(masses[0]),
         )  # fmt: skip
         start = _start(events, masses, structure, self.background)
-        best = settle(events, start, structure, limits)
+        best = fit_jointly(events, start, structure, limits)
         return Chosen((best,), best, structure, limits, self.background)
 
 
@@ -197,7 +197,7 @@ class Ladder:
         begin = [1.0] if self.held else _SEARCH
         starts = [_start(events, n * monomer * s, structure, self.background) for s in begin]
         start = max(starts, key=lambda one: height(events, one))
-        best = settle(events, start, structure, limits)
+        best = fit_jointly(events, start, structure, limits)
         return Chosen((best,), best, structure, limits, self.background, tuple(steps))
 
     def _against_free(self, events: Events, found: Chosen) -> float:
@@ -214,7 +214,7 @@ class Ladder:
             np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]), np.full(k, unit),
             widths=self.widths, background=self.background, unit_kda=monomer,
         )  # fmt: skip
-        free = settle(events, found.best, structure, limits)
+        free = fit_jointly(events, found.best, structure, limits)
         gain = max(2 * (free.log_likelihood - found.best.log_likelihood), 0.0)
         return float(chdtrc(k - means, gain))
 

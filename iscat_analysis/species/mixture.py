@@ -64,7 +64,7 @@ class Mixture:
         )
 
 
-def climb(events: Events, start: Mixture) -> Mixture:
+def ascend(events: Events, start: Mixture) -> Mixture:
     """Climb towards the maximum as if nothing were missed: a start for `structure.polish`."""
     weight, mean, variance = start.weight.copy(), start.mean.copy(), start.variance.copy()
     mixture_em(events.x, events.variance, weight, mean, variance, _EM_STEPS)

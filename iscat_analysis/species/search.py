@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, climb, height
+from iscat_analysis.species.mixture import Mixture, ascend, height
 from iscat_analysis.species.structure import polish
 
 _POLISHED = 2  # starts, the best after climbing
@@ -23,7 +23,7 @@ def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mix
         if fits:
             starts += split_starts(events, fits[-1])
         climbed = sorted(
-            (climb(events, start) for start in starts), key=lambda start: height(events, start)
+            (ascend(events, start) for start in starts), key=lambda start: height(events, start)
         )
         tried = [polish(events, start) for start in climbed[-_POLISHED:]]
         fits.append(max(tried, key=lambda fit: fit.log_likelihood))

@@ -166,10 +166,12 @@ def polish(
 ) -> Mixture:
     """Maximise the likelihood of the events seen over all mixtures of as many species."""
     structure, limits = free_structure(events, start.weight.size)
-    return settle(events, start, structure, limits, evaluations=evaluations, tolerance=tolerance)
+    return fit_jointly(
+        events, start, structure, limits, evaluations=evaluations, tolerance=tolerance
+    )
 
 
-def settle(
+def fit_jointly(
     events: Events,
     start: Mixture,
     structure: Structure,

@@ -36,7 +36,7 @@ class Baselines:
     @classmethod
     def calibrated(cls, setting: Setting) -> Baselines:
         """Take the proportionality from the noiseless image."""
-        truth, pixel = setting.truth, setting.scene.pixel_nm
+        truth, pixel = setting.truth, setting.context.pixel_nm
         likelihood = setting.likelihood(setting.draw(truth, None))
         image = likelihood.measured_signal()
         start = Candidate(truth[0] / pixel, truth[1] / pixel, truth[2], truth[3], 0.0)

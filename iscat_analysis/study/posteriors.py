@@ -72,7 +72,7 @@ def calibrate_posterior(
     ranks = np.full((draws, k), -1, dtype=np.int64)
     widths = np.full((draws, k), np.nan)
     inside = np.zeros((2, draws, k), dtype=bool)
-    model = setting.scene.model
+    model = setting.context.model
     compile_kernels(model, parts_of(setting.free, posteriors=True))
     amplitudes = [model.scale.amplitude(float(m)) for m in (lower[3], upper[3])]
 

@@ -16,8 +16,8 @@ import numpy as np
 from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.regions import Region, region_likelihood
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
@@ -38,7 +38,7 @@ class Setting:
     """One experiment to be repeated; build it with `make_setting`."""
 
     config: Config
-    scene: Scene
+    context: AnalysisContext
     region: Region
     experiment: Experiment
     truth: FloatArray
@@ -48,7 +48,7 @@ class Setting:
     @property
     def mode(self) -> str:
         """Key of `FREE_PARAMETERS`."""
-        return self.scene.mode
+        return self.context.mode
 
     @property
     def free(self) -> tuple[str, ...]:
@@ -67,18 +67,18 @@ class Setting:
 
     def level_e(self) -> float:
         """Return the expected background per pixel and frame [e]."""
-        if self.scene.additive:
+        if self.context.additive:
             return self.config.background.level_e or 0.0
         return self.config.bounds.photons_per_pixel
 
     def signal_e(self, truth: FloatArray) -> FloatArray:
         """Return the counts that the particle adds to one frame, shape (ny, nx) [e]."""
-        model = self.scene.model
-        grid = PixelGrid.region(self.region.rows, self.region.columns, self.scene.pixel_nm)
+        model = self.context.model
+        grid = PixelGrid.region(self.region.rows, self.region.columns, self.context.pixel_nm)
         signal = model.image(grid, *(float(v) for v in truth))
-        if self.scene.additive:
+        if self.context.additive:
             photons = self.config.bounds.photons_per_pixel
-            return signal * photons_per_intensity(model, photons, self.scene.pixel_nm)
+            return signal * photons_per_intensity(model, photons, self.context.pixel_nm)
         return signal * self.config.bounds.photons_per_pixel
 
     def draw(self, truth: FloatArray, random: np.random.Generator | None) -> Windows:
@@ -125,7 +125,7 @@ class Setting:
 
     def likelihood(self, windows: Windows) -> Likelihood:
         """Likelihood of drawn counts, as the main job makes it."""
-        return region_likelihood(self.scene, windows, self.region, None)
+        return region_likelihood(self.context, windows, self.region, None)
 
     def start(self, truth: FloatArray, random: np.random.Generator) -> Candidate:
         """Where a fit begins: near the particle, as a detection would be.
@@ -133,7 +133,7 @@ class Setting:
         Shapes: `truth` (4,).
         """
         shift = random.uniform(-START_PX, START_PX, 2)
-        place = truth[:2] / self.scene.pixel_nm + shift
+        place = truth[:2] / self.context.pixel_nm + shift
         factor = START_MASS ** random.uniform(-1, 1)
         low, high = self.config.fit.z_range_nm
         z = random.uniform(low, high)
@@ -148,7 +148,7 @@ class Setting:
     def described(self) -> dict[str, Any]:
         """Say what was simulated, as plain values."""
         at, optics, e = self.config.bounds, self.config.optics, self.experiment
-        centre = (self.pixels - 1) / 2 * self.scene.pixel_nm
+        centre = (self.pixels - 1) / 2 * self.context.pixel_nm
         return {
             "scheme": optics.scheme,
             "mode": self.mode,
@@ -157,9 +157,9 @@ class Setting:
             "z_nm": float(self.truth[2]),
             "mass_kda": float(self.truth[3]),
             "focus_nm": optics.focus_nm,
-            "attenuation": optics.attenuation if self.scene.model.rho else 0.0,
+            "attenuation": optics.attenuation if self.context.model.rho else 0.0,
             "na": optics.na,
-            "pixel_size_nm": self.scene.pixel_nm,
+            "pixel_size_nm": self.context.pixel_nm,
             "pixels": self.pixels,
             "photons_per_pixel": at.photons_per_pixel,
             "n_before": at.n_before,
@@ -176,7 +176,7 @@ def make_setting(
     *,
     collected: float | None = None,
     z_nm: float | None = None,
-    scene: Scene | None = None,
+    context: AnalysisContext | None = None,
 ) -> Setting:
     """Set up one experiment."""
     pixel_nm = config.camera.pixel_size_nm
@@ -194,24 +194,24 @@ def make_setting(
     counted = config.optics.scheme != "darkfield" and config.bounds.n_before > 0
     level = config.background.method == "sliding" and counted
     config = _changed(config, {"background": _background(config)})
-    if scene is None:
-        scene = make_scene(config, (side, side))
+    if context is None:
+        context = make_context(config, (side, side))
     if asked is not None:
-        _check_height(config, scene, asked)
-    experiment = _experiment(config, scene, height, collected)
+        _check_height(config, context, asked)
+    experiment = _experiment(config, context, height, collected)
     if asked is None and "z_nm" in FREE_PARAMETERS[mode]:
-        height = _clear_of_ends(config, scene, collected, mode, height)
-        experiment = _experiment(config, scene, height, collected)
+        height = _clear_of_ends(config, context, collected, mode, height)
+        experiment = _experiment(config, context, height, collected)
     config = _changed(
         experiment.config,
         {"particle": {"photons_per_frame": experiment.config.bounds.photons_per_pixel}},
     )
-    centre = (side - 1) / 2 * scene.pixel_nm
+    centre = (side - 1) / 2 * context.pixel_nm
     at = config.bounds
     read = config.camera.assumed.read_noise_e
     return Setting(
         config=config,
-        scene=replace(scene, config=config),
+        context=replace(context, config=config),
         region=Region((0, side), (0, side)),
         experiment=experiment,
         truth=np.array([at.x_nm + centre, at.y_nm + centre, height, experiment.mass_kda]),
@@ -239,10 +239,10 @@ def _check_place(config: Config, half_nm: float) -> None:
         )
 
 
-def _check_height(config: Config, scene: Scene, z_nm: float) -> None:
+def _check_height(config: Config, context: AnalysisContext, z_nm: float) -> None:
     """Refuse heights at which no fit can find the particle: the model's profiles end there."""
-    free = "z_nm" in FREE_PARAMETERS[scene.mode]
-    low, high = config.fit.z_range_nm if free else scene.model.z_range_nm
+    free = "z_nm" in FREE_PARAMETERS[context.mode]
+    low, high = config.fit.z_range_nm if free else context.model.z_range_nm
     if not low <= z_nm <= high:
         raise ConfigError(
             f"bounds.z_nm = {z_nm:g} lies outside the heights that are searched, fit.z_range_nm = "
@@ -250,24 +250,26 @@ def _check_height(config: Config, scene: Scene, z_nm: float) -> None:
         )
 
 
-def _experiment(config: Config, scene: Scene, z_nm: float, collected: float | None) -> Experiment:
-    experiment = plan(_changed(config, {"bounds": {"z_nm": z_nm}}), model=scene.model)
+def _experiment(
+    config: Config, context: AnalysisContext, z_nm: float, collected: float | None
+) -> Experiment:
+    experiment = plan(_changed(config, {"bounds": {"z_nm": z_nm}}), model=context.model)
     if collected is None:
         return experiment
     photons = config.bounds.photons_per_pixel * collected / experiment.collected
     changes = {"bounds": {"z_nm": z_nm, "photons_per_pixel": photons}}
-    return plan(_changed(config, changes), model=scene.model)
+    return plan(_changed(config, changes), model=context.model)
 
 
 def _clear_of_ends(
-    config: Config, scene: Scene, collected: float | None, mode: str, height: float
+    config: Config, context: AnalysisContext, collected: float | None, mode: str, height: float
 ) -> float:
     """Find the lowest height from `height` up that the ends of the range do not touch."""
     low, high = config.fit.z_range_nm
     z = PARAMETERS.index("z_nm")
-    step = scene.model.fringe_nm / 16
+    step = context.model.fringe_nm / 16
     for candidate in np.arange(max(height, low), high, step):
-        bounds = _experiment(config, scene, candidate, collected).bounds(FREE_PARAMETERS[mode])
+        bounds = _experiment(config, context, candidate, collected).bounds(FREE_PARAMETERS[mode])
         margin = CLEARANCE * bounds.crb_joint[z]
         if candidate - low > margin and high - candidate > margin:
             return float(candidate)

@@ -109,18 +109,18 @@ def run_benchmark(
             name: pull_histogram(_pull(found, PARAMETERS.index(name))) for name in setting.free
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
-        faintest = make_setting(config, mode, collected=PHOTONS[0], scene=setting.scene)
+        faintest = make_setting(config, mode, collected=PHOTONS[0], context=setting.context)
         clear = float(faintest.truth[2])  # far enough from the ends of the range for all photons
         curves["photons"][mode] = _curve(
             list(PHOTONS),
-            [make_setting(config, mode, collected=n, z_nm=clear, scene=setting.scene)
+            [make_setting(config, mode, collected=n, z_nm=clear, context=setting.context)
              for n in PHOTONS],
             fewer, seed, stream + 10, threads, tally,
         )  # fmt: skip
         heights = _heights(config)
         curves["z"][mode] = _curve(
             heights,
-            [make_setting(config, mode, z_nm=z, scene=setting.scene) for z in heights],
+            [make_setting(config, mode, z_nm=z, context=setting.context) for z in heights],
             fewer, seed, stream + 40, threads, tally,
         )  # fmt: skip
         curves["z"][mode]["bounds"] = _bounds_along(config, setting)
@@ -254,7 +254,7 @@ def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
     """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
     heights = np.linspace(*config.fit.z_range_nm, FINE_HEIGHTS)
     bounds = [
-        make_setting(config, setting.mode, z_nm=float(z), scene=setting.scene).bounds
+        make_setting(config, setting.mode, z_nm=float(z), context=setting.context).bounds
         for z in heights
     ]
     lines = {

@@ -91,7 +91,7 @@ def run_trials(
     gauss, peak = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
     p_value, chi2, gap = (np.full(count, np.nan) for _ in range(3))
     fits: list[FitResult | None] = [None] * count
-    compile_kernels(setting.scene.model, parts_of(setting.free, posteriors=False))
+    compile_kernels(setting.context.model, parts_of(setting.free, posteriors=False))
 
     def work(first: int) -> float:
         spent = 0.0

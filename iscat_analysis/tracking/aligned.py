@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import poisson
 from iscat_analysis.instrument.learner import FAINTEST, ParticleImage
@@ -73,13 +73,13 @@ class Aligned:
         names = [f"aligned_{part.name}" for part in fields(cls)]
         return cls(*(data[name] for name in names)) if names[0] in data else None
 
-    def likelihood(self, scene: Scene, number: int) -> Likelihood:
+    def likelihood(self, context: AnalysisContext, number: int) -> Likelihood:
         """Give the likelihood of a picture of a particle that stands still."""
         light = self.light_e[number]
         side = light.shape[0]
         return poisson(
-            scene.model,
-            PixelGrid.region((0, side), (0, side), scene.pixel_nm),
+            context.model,
+            PixelGrid.region((0, side), (0, side), context.pixel_nm),
             self.counts_e[number],
             light,
             light,
@@ -87,25 +87,25 @@ class Aligned:
             masked=light <= 0,
         )
 
-    def sight(self, scene: Scene, number: int) -> ParticleImage:
+    def sight(self, context: AnalysisContext, number: int) -> ParticleImage:
         """Give a picture to those who measure the microscope."""
-        likelihood = self.likelihood(scene, number)
+        likelihood = self.likelihood(context, number)
         theta = self.theta[number]
-        fit = scene.config.fit
+        fit = context.config.fit
         x, y, z = (float(v) for v in theta[:3])
         signal = likelihood.signal(theta)
         return ParticleImage(
             grid=likelihood.grid, noise=likelihood.noise, data=likelihood.data,
-            x_nm=x, y_nm=y, z_nm=z, mass_kda=float(scene.model.scale.mass(theta[3])),
+            x_nm=x, y_nm=y, z_nm=z, mass_kda=float(context.model.scale.mass(theta[3])),
             snr=float(np.sqrt(np.sum(signal**2 * likelihood.signal_information(signal)))),
             owner=int(self.track[number]),
             heights_nm=fit.z_range_nm if fit.mode == "joint" else None,
         )  # fmt: skip
 
 
-def align(scene: Scene, moving: Moving) -> Aligned:
+def align(context: AnalysisContext, moving: Moving) -> Aligned:
     """Put the frames of the brightest tracks on top of each other."""
-    side = _side(scene)
+    side = _side(context)
     empty = np.zeros((0, side, side))
     nothing = np.zeros(0, dtype=np.int64)
     none = Aligned(nothing, empty, empty, empty, np.zeros((0, 5)), nothing)
@@ -120,12 +120,12 @@ def align(scene: Scene, moving: Moving) -> Aligned:
     chosen = np.flatnonzero(_brightest(rows.track, rows.snr, good))
     if not len(chosen):
         return none
-    return _single(scene, moving, chosen) if field.free[2] else _summed(scene, moving, chosen)
+    return _single(context, moving, chosen) if field.free[2] else _summed(context, moving, chosen)
 
 
-def _side(scene: Scene) -> int:
+def _side(context: AnalysisContext) -> int:
     """Give the largest odd side that the fitted square has, in the middle of which a pixel is."""
-    return (scene.roi_px - 1) // 2 * 2 + 1
+    return (context.roi_px - 1) // 2 * 2 + 1
 
 
 def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
@@ -136,30 +136,30 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     return np.asarray(good & np.isin(track, best[enough[best]]))
 
 
-def _single(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
+def _single(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
     """Take frames of their own, from all heights alike."""
     rows = moving.rows
     ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
     some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(np.int64)
     chosen = np.sort(ranked[some])
-    side, theta = _side(scene), rows.theta[chosen].copy()
-    corner = np.rint(theta[:, 1::-1] / scene.pixel_nm).astype(np.int64) - side // 2
-    theta[:, :2] -= corner[:, ::-1] * scene.pixel_nm
+    side, theta = _side(context), rows.theta[chosen].copy()
+    corner = np.rint(theta[:, 1::-1] / context.pixel_nm).astype(np.int64) - side // 2
+    theta[:, :2] -= corner[:, ::-1] * context.pixel_nm
     sums, owner = np.zeros((len(chosen), 3, side, side)), np.arange(len(chosen))
     corner = np.ascontiguousarray(corner)
     moving.field.add_squares(moving.ground, rows, chosen, corner, owner, sums)
     left, light, read = np.moveaxis(sums, 1, 0)
-    grid = PixelGrid.region((0, side), (0, side), scene.pixel_nm)
+    grid = PixelGrid.region((0, side), (0, side), context.pixel_nm)
     counts = left + light
     for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
-        counts[number] += light[number] * scene.model.amplitude_image(grid, x, y, z, amplitude)
+        counts[number] += light[number] * context.model.amplitude_image(grid, x, y, z, amplitude)
     return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
 
 
-def _summed(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
+def _summed(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
     """Add up what is left over of rows, by track and part of the pixel."""
     rows, field, ground = moving.rows, moving.field, moving.ground
-    side, pixel = _side(scene), scene.pixel_nm
+    side, pixel = _side(context), context.pixel_nm
     places = rows.theta[chosen, :2] / pixel
     whole = np.rint(places).astype(np.int64)
     part = np.floor((places - whole + 0.5) * PHASES).clip(0, PHASES - 1).astype(np.int64)
@@ -176,10 +176,10 @@ def _summed(scene: Scene, moving: Moving, chosen: IntArray) -> Aligned:
     track = keys // PHASES**2
     theta = np.zeros((len(keys), 5))
     theta[:, 0], theta[:, 1] = ((v + side // 2) * pixel for v in middle)
-    theta[:, 2], theta[:, 3] = scene.model.height_nm, moving.common.amplitude[track]
+    theta[:, 2], theta[:, 3] = context.model.height_nm, moving.common.amplitude[track]
     grid = PixelGrid.region((0, side), (0, side), pixel)
     counts = left + light
     for number, (x, y, z, amplitude, _) in enumerate(theta.tolist()):
-        unsure = blurred(scene.model, float(spread[number]), upwards=False)
+        unsure = blurred(context.model, float(spread[number]), upwards=False)
         counts[number] += light[number] * unsure.amplitude_image(grid, x, y, z, amplitude)
     return Aligned(track, counts, light, read, theta, count.astype(np.int64))

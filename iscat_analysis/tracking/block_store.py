@@ -16,7 +16,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.diagnosis.causes import smear_warning
 from iscat_analysis.diagnosis.noise import Noise, judge_beside
 from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
 from iscat_analysis.threads import beside
 from iscat_analysis.tracking.aligned import Aligned, align
@@ -72,7 +72,7 @@ class Block:
 
 
 def analyse_block(
-    scene: Scene,
+    context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
@@ -86,10 +86,10 @@ def analyse_block(
     """Follow the particles of a block of frames."""
     first, frames = span[0], span[1] - span[0]
     # Nearer to a border than this a track may go on in the next block.
-    near = scene.config.track.memory_frames + 1
+    near = context.config.track.memory_frames + 1
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
     moving = follow(
-        scene, movie, camera, span,
+        context, movie, camera, span,
         check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
     )  # fmt: skip
     field, ground, rows = moving.field, moving.ground, moving.rows
@@ -101,16 +101,16 @@ def analyse_block(
 
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
-        pictures = beside(align, scene, moving)
-        judged = beside(judge_beside, scene, movie, camera, span, seen, field.used, without)
-    table, inside = moving_table(scene, moving, first), field.holds(rows.theta)
-    masses = common_masses(scene, moving)
+        pictures = beside(align, context, moving)
+        judged = beside(judge_beside, context, movie, camera, span, seen, field.used, without)
+    table, inside = moving_table(context, moving, first), field.holds(rows.theta)
+    masses = common_masses(context, moving)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
     aligned, noise = None, Noise()
     if not goes_on[0]:
         aligned = pictures.result()
         noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
-        smeared = smear_warning(scene.config, table, moving.smear_nm)
+        smeared = smear_warning(context.config, table, moving.smear_nm)
         if smeared:  # what is left over of pictures, far around them, is not the camera's
             noise = Noise(messages=(smeared,))
     return Block(

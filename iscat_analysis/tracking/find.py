@@ -20,21 +20,21 @@ from iscat_analysis.camera.background import Check, add_frames, start_power
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import (
+    fixed_height_warning,
     misfit_warning,
     pixel_warnings,
-    plane_warning,
     shaking_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.checkpoint import GOES_ON, saying
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.ranges import checked, fitted_frames
 from iscat_analysis.fitting.regions import contrast_image
 from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
     CountSource,
@@ -71,17 +71,17 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     kept = keep_frames(ready.steady, camera, span, additive=additive)
     movie, (first, last) = kept.movie, kept.span
     if kept.message:
-        run.tell(kept.message)
+        run.warn(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
     shaking = beside(shaking_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
     if message := plan.message(movie.name):
-        run.tell(message)
+        run.warn(message)
     shaken = shaking.result()
     if shaken:
-        run.tell(f"{movie.name}: {shaken}")
+        run.warn(f"{movie.name}: {shaken}")
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
@@ -93,38 +93,40 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
 
         def begin(config: Config, *, cautious: bool = False) -> Begun:
-            scene = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
+            context = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
             block = _analysed(
-                scene, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
+                context, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
                 check=check, pool=pool, progress=run.progress, cautious=cautious,
             )  # fmt: skip
-            return Begun(config, scene, block)
+            return Begun(config, context, block)
 
         begun, learned = learn_from_tracks(
-            config, begin, name=movie.name, pool=pool, tell=run.tell, notify=run.notify
+            config, begin, name=movie.name, pool=pool, warn=run.warn, notify=run.notify
         )
-        config, scene = begun.config, begun.scene
+        config, context = begun.config, begun.context
         blocks, interrupted = track_movie(
-            scene, movie, camera, plan, shelf(config, run.partial),
+            context, movie, camera, plan, shelf(config, run.partial),
             check=check, pool=pool, progress=run.progress, first=begun.block,
         )  # fmt: skip
         joined = join_blocks(config, blocks, camera)
-        if not interrupted and not plane_warning(config, joined.fits):  # which says it already
+        if not interrupted and not fixed_height_warning(
+            config, joined.fits
+        ):  # which says it already
             held = held_height_warning(
                 ready.config, movie, camera, plan.spans[0], joined.fits, check=check, pool=pool
             )
             if held:
-                run.tell(held)
+                run.warn(held)
     windows = joined.followed.windows
     for text in () if shaken else blocks[0].noise:
-        run.tell(text)
+        run.warn(text)
     for text in pixel_warnings(*windows.left_out):
-        run.tell(text)
+        run.warn(text)
     if not len(joined.fits) and not interrupted:
-        run.tell(f"{movie.name}: {_nothing_found(scene, blocks[0])}")
+        run.warn(f"{movie.name}: {_nothing_found(context, blocks[0])}")
     run.clock.lap("track")
     found = DetectionResult(
-        scene=replace(scene, mode="track", config=config),
+        context=replace(context, mode="track", config=config),
         fits=joined.fits,
         views=joined.views,
         image=windows.after_e / windows.before_e - 1,
@@ -156,22 +158,22 @@ def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[
         raise saying(stop, nothing) from None
 
 
-def _nothing_found(scene: Scene, block: Block) -> str:
+def _nothing_found(context: AnalysisContext, block: Block) -> str:
     """Say why a movie may show no particle: how far one stands out of a frame's noise."""
-    model, grid = scene.model, PixelGrid.centred(scene.roi_px | 1, scene.pixel_nm)
+    model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     light, mass = float(block.level[block.used].mean()), model.material.mass_kda
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
     height = math.sqrt(light * float(np.sum(signal**2)))
     return (
         f"no particle was found: over {light:.3g} e per pixel and frame one of particle.mass_kda = "
         f"{mass:.4g} stands out of the noise of a frame by {height:.2g} standard deviations, and "
-        f"{scene.templates.threshold:.2g} are needed; if there are particles, record with more "
+        f"{context.templates.threshold:.2g} are needed; if there are particles, record with more "
         "light, or longer exposures"
     )
 
 
 def track_movie(
-    scene: Scene,
+    context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
     plan: Plan,
@@ -188,7 +190,7 @@ def track_movie(
     try:
         for number in range(len(blocks), len(plan.spans)):
             block = _analysed(
-                scene, movie, camera, plan, store, number,
+                context, movie, camera, plan, store, number,
                 check=check, pool=pool, progress=progress,
             )  # fmt: skip
             blocks.append(block)
@@ -202,7 +204,7 @@ def track_movie(
 
 
 def _analysed(
-    scene: Scene,
+    context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
     plan: Plan,
@@ -222,7 +224,7 @@ def _analysed(
         told("track", 1, 1)
         return block
     block = analyse_block(
-        scene, movie, camera, span,
+        context, movie, camera, span,
         goes_on=(number > 0, number + 1 < count),
         check=check, pool=pool, progress=told, cautious=cautious,
     )  # fmt: skip
@@ -241,7 +243,7 @@ def _part_of(progress: Progress, number: int, count: int) -> Progress:
 
 
 def track_frames(
-    scene: Scene,
+    context: AnalysisContext,
     movie: FrameSource,
     camera: Camera,
     windows: Windows,
@@ -251,7 +253,7 @@ def track_frames(
     pool: ThreadPoolExecutor,
     progress: Progress,
     doubt: str = "",
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
 ) -> DetectionResult:
     """Fit each frame after the background, starting from the frame before, and link."""
     first, last = windows.frames_after
@@ -262,28 +264,28 @@ def track_frames(
     events: tuple[Event, ...] = ()
     interrupted = False
     shown = np.ones(last - first, dtype=np.bool_)
-    if not scene.additive:
+    if not context.additive:
         shown = well_lit(windows.power, DARK)[-shown.size :]
     try:
         for frame in (first + np.flatnonzero(shown)).tolist():
-            here = _one_frame(movie, camera, windows, frame, check, scene)
+            here = _one_frame(movie, camera, windows, frame, check, context)
             starts = [event.candidate for event in events]
-            events, here = fit_field(scene, here, starts=starts, pool=pool)
+            events, here = fit_field(context, here, starts=starts, pool=pool)
             if events and noise is None:
-                if cause := misfit_warning(scene.config, events):
-                    tell(cause)
+                if cause := misfit_warning(context.config, events):
+                    warn(cause)
                 elif doubt:
                     _refuse_pattern(doubt, frame, events)
                 read = camera.read_variance_e2((here.after_e.shape[0], here.after_e.shape[1]))
-                noise = FrameNoise(scene, windows, read, [event.fit for event in events])
+                noise = FrameNoise(context, windows, read, [event.fit for event in events])
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
             views += [view_of(number, event) for number, event in enumerate(events)]
-            lines += lines_of(scene, events)  # last, so that an interrupted frame has no rows
+            lines += lines_of(context, events)  # last, so that an interrupted frame has no rows
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
         interrupted = True
-    track = scene.config.track
+    track = context.config.track
     places = np.array([(line["x_nm"], line["y_nm"]) for line in lines]).reshape(-1, 2)
     frames = np.array([line["frame"] for line in lines], dtype=np.int64)
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
@@ -295,10 +297,10 @@ def track_frames(
         if number not in seen:
             seen[number] = replace(view, event=number)
     return DetectionResult(
-        scene=scene,
+        context=context,
         fits=fits,
         views=tuple(seen[number] for number in sorted(seen)),
-        image=contrast_image(scene, windows),
+        image=contrast_image(context, windows),
         compared=Compared.of(windows),
         heading="background",
         summary=summary,
@@ -325,9 +327,9 @@ def _one_frame(
     windows: Windows,
     frame: int,
     check: Check,
-    scene: Scene,
+    context: AnalysisContext,
 ) -> Windows:
     counts = movie.read(frame, frame + 1)
     check(counts, frame)
     single = add_frames(windows, camera, counts, frame)
-    return start_power(single) if scene.config.background.power_normalization else single
+    return start_power(single) if context.config.background.power_normalization else single

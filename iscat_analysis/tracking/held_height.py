@@ -56,20 +56,20 @@ def held_height_warning(
         return ""
     track = config.track.model_copy(update={"free": "mass"})
     config, (_, tall, wide) = config.model_copy(update={"track": track}), movie.shape
-    scene = track_scene(config, (tall, wide), last - first)
+    context = track_scene(config, (tall, wide), last - first)
     try:
         moving = follow(
-            scene, movie, camera, (first, last), check=check, pool=pool, progress=silent
+            context, movie, camera, (first, last), check=check, pool=pool, progress=silent
         )  # fmt: skip
     except DataError:  # nothing can be followed at one height
         return ""
-    held = _rejected(moving_table(scene, moving, first)[moving.field.holds(moving.rows.theta)])
+    held = _rejected(moving_table(context, moving, first)[moving.field.holds(moving.rows.theta)])
     if held.size < _ENOUGH or 2 * held.size < free.size or held.mean() > FEW_REJECTED:
         return ""
     return (
         f"{movie.name}: the particles seem to stay at one height, as on a membrane: set "
         f'track.free = "mass"; with heights that are free {free.sum()} of {free.size} fits are '
-        f"rejected, and with all held at particle.height_nm = {scene.model.height_nm:g} it is "
+        f"rejected, and with all held at particle.height_nm = {context.model.height_nm:g} it is "
         f"{held.sum()} of {held.size} in the same frames"
     )
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.extension import LEAST_SHARE
 from iscat_analysis.tracking.frame_search import gaps, link
@@ -123,30 +123,30 @@ def typical(rows: Localizations) -> Localizations:
 
 
 def alone(
-    scene: Scene,
+    context: AnalysisContext,
     rows: Localizations,
     *,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
     """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
-    config = scene.config
+    config = context.config
     if not len(rows.frame):
         return rows
     near = crowded(rows, _BESIDE * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
-    kept = (free >= _least(config, rows, inner)) & seen(scene, rows)
+    kept = (free >= _least(config, rows, inner)) & seen(context, rows)
     return numbered(rows.only(kept[rows.track]))
 
 
-def seen(scene: Scene, rows: Localizations) -> BoolArray:
+def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
     """Tell which tracks are seen in most of the frames in which they are fitted.
 
     Shapes: result (tracks,).
     """
     fitted = rows.only(np.isfinite(rows.snr))
     snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
-    plain = snr > AS_FOUND * scene.templates.threshold
+    plain = snr > AS_FOUND * context.templates.threshold
     tracks = int(rows.track.max(initial=-1)) + 1
     fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
     return np.asarray(2 * sights > fits)

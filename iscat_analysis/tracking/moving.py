@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.species.diffusion import estimate_diffusion
@@ -32,7 +32,7 @@ from iscat_analysis.tracking.joint.common import (
     shared_errors,
     variances_left,
 )
-from iscat_analysis.tracking.joint.joint_fit import MOST_TURNS, settle
+from iscat_analysis.tracking.joint.joint_fit import MOST_TURNS, fit_jointly
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.linking import (
@@ -103,7 +103,7 @@ class Moving:
 
 
 def follow(
-    scene: Scene,
+    context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
@@ -115,8 +115,8 @@ def follow(
     cautious: bool = False,
 ) -> Moving:
     """Find and fit every particle in every frame."""
-    config = scene.config
-    field = load_field(scene, movie, camera, span, check, pool, progress)
+    config = context.config
+    field = load_field(context, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
     follow_level = config.background.method == "tracks"
     ground = opening_ground(config, field)
@@ -128,14 +128,14 @@ def follow(
         before = len(rows.frame)
         enough = round(_FEW * before) if number >= _FULL else 0
         found = search_frames(
-            scene, field, ground, rows, pool, enough=enough, cautious=cautious
+            context, field, ground, rows, pool, enough=enough, cautious=cautious
         )  # fmt: skip
         if number and len(found.frame) <= _FEW * before:
             break
-        rows = _joined(scene, rows, found)
+        rows = _joined(context, rows, found)
         if len(rows.frame) > _SEVERAL * len(np.unique(rows.frame)):  # there will be a choice
             beside(load_linker)
-        rows, ground, done = settle(
+        rows, ground, done = fit_jointly(
             field,
             ground,
             rows,
@@ -144,15 +144,17 @@ def follow(
             turns=_FIRST_TURNS if number < _FULL else 1,
             coarse=True,
         )
-        if scene.mode == "joint" and number < _FIRST_HEIGHTS:
-            rows = _in_their_fringes(scene, field, ground, rows)
+        if context.mode == "joint" and number < _FIRST_HEIGHTS:
+            rows = _in_their_fringes(context, field, ground, rows)
             rows, _, done = field.fit(ground, rows, coarse=True)
-        rows = _credible(scene, field, rows, done)
-        if scene.mode == "joint" and number == 0:  # sharp pictures leave over of gold what is seen
+        rows = _credible(context, field, rows, done)
+        if (
+            context.mode == "joint" and number == 0
+        ):  # sharp pictures leave over of gold what is seen
             rows = linked(config, rows, mass_places(config, rows))
             rows, variances, _ = _moved(config, field, rows)
             field.set_blurs(variances)
-            rows, ground, done = settle(
+            rows, ground, done = fit_jointly(
                 field, ground, rows, follow_power=follow_power, follow_level=follow_level,
                 turns=_NEXT_TURNS, coarse=True,
             )  # fmt: skip
@@ -164,7 +166,7 @@ def follow(
     resolution = config.optics.wavelength_nm / config.optics.na
     for number in range(ROUNDS):
         # at first nothing is only tried, and the search has settled nearly all
-        rows, ground, done = settle(
+        rows, ground, done = fit_jointly(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level,
             turns=_NEXT_TURNS if number else 1, coarse=True,
         )  # fmt: skip
@@ -174,7 +176,7 @@ def follow(
                 field, ground, rows, resolution_nm=resolution, reach_nm=config.track.max_step_nm
             )
         rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
-        rows = alone(scene, rows, inner=inner)
+        rows = alone(context, rows, inner=inner)
         if number < _HELD_ROUNDS and follow_level and not cautious:
             rows, tried = held(config, field, rows)
             added += tried
@@ -185,10 +187,10 @@ def follow(
             break
     rows = _told_apart(config, trimmed(rows))
     for stage in range(2):
-        give_back(scene, field, movie, camera, span[0], ground, rows)
-        if scene.mode == "joint":
-            rows = _in_their_fringes(scene, field, ground, rows)
-        rows, ground, done = settle(
+        give_back(context, field, movie, camera, span[0], ground, rows)
+        if context.mode == "joint":
+            rows = _in_their_fringes(context, field, ground, rows)
+        rows, ground, done = fit_jointly(
             field, ground, without_outliers(rows), follow_power=follow_power,
             follow_level=follow_level, turns=MOST_TURNS if stage else 1, coarse=not stage,
         )  # fmt: skip
@@ -196,12 +198,12 @@ def follow(
         if stage == 0:
             rows, variances, diffusion = _moved(config, field, rows)
             field.set_blurs(variances)
-    there = seen(scene, rows)  # the rings of others, drawn far out, may explain a track
+    there = seen(context, rows)  # the rings of others, drawn far out, may explain a track
     if not there.all():
         numbers = np.cumsum(there) - 1
         rows = rows.only(there[rows.track])
         rows, diffusion = replace(rows, track=numbers[rows.track]), diffusion[there]
-        rows, ground, done = settle(
+        rows, ground, done = fit_jointly(
             field, ground, rows, follow_power=follow_power, follow_level=follow_level, turns=1
         )
     judged = field.judge(ground, rows)
@@ -209,8 +211,8 @@ def follow(
     near = meeting(rows, config.detection.min_separation_nm)
     unlike = shares_mass(rows, judged)
     close = near | unlike
-    if scene.mode == "joint":  # a path along z takes as much of the mass, and must count
-        unlike = unlike & crowded(rows, scene.roi_px * scene.pixel_nm)
+    if context.mode == "joint":  # a path along z takes as much of the mass, and must count
+        unlike = unlike & crowded(rows, context.roi_px * context.pixel_nm)
     counted = done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted)
     progress("track", total, total)
@@ -233,12 +235,12 @@ def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> No
 
 
 def _in_their_fringes(
-    scene: Scene, field: MovingField, ground: BackgroundEstimate, rows: Localizations
+    context: AnalysisContext, field: MovingField, ground: BackgroundEstimate, rows: Localizations
 ) -> Localizations:
     """Put every row into the fringe that its track says."""
     return decide_heights(
         field, ground, rows,
-        fringe_nm=scene.model.fringe_nm, z_range_nm=scene.config.fit.z_range_nm,
+        fringe_nm=context.model.fringe_nm, z_range_nm=context.config.fit.z_range_nm,
     )  # fmt: skip
 
 
@@ -252,10 +254,10 @@ def _told_apart(config: Config, rows: Localizations) -> Localizations:
     return numbered(told)
 
 
-def _joined(scene: Scene, rows: Localizations, found: FrameCandidates) -> Localizations:
+def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidates) -> Localizations:
     """Add candidates to the rows."""
     n = len(found.frame)
-    pixel = scene.pixel_nm
+    pixel = context.pixel_nm
     theta = np.column_stack([
         found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n),
     ])  # fmt: skip
@@ -265,14 +267,14 @@ def _joined(scene: Scene, rows: Localizations, found: FrameCandidates) -> Locali
 
 
 def _credible(
-    scene: Scene, field: MovingField, rows: Localizations, done: BoolArray
+    context: AnalysisContext, field: MovingField, rows: Localizations, done: BoolArray
 ) -> Localizations:
     """Keep the rows that a particle explains, each particle once."""
     # of light that is no picture a fit may be lost
     known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
     rows, done = rows.only(known), done[known]
-    kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * scene.templates.threshold)
-    near = scene.config.optics.wavelength_nm / (4 * scene.config.optics.na)
+    kept = done & (rows.theta[:, 3] > 0) & (rows.snr > AS_FOUND * context.templates.threshold)
+    near = context.config.optics.wavelength_nm / (4 * context.config.optics.na)
     starts = rows.starts(field.frames)
     for t in np.unique(rows.frame[crowded(rows, near)]):
         order = starts[t] + np.argsort(-rows.snr[starts[t] : starts[t + 1]])

@@ -17,7 +17,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.scene import Scene, make_scene
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.tracking.frame_search import FrameCandidates, FrameFilter
 from iscat_analysis.tracking.joint.exposures import Exposures
@@ -51,11 +51,11 @@ def exposure_of(config: Config) -> tuple[float, float]:
 
 def track_scene(
     config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
-) -> Scene:
+) -> AnalysisContext:
     """Make models and matched filter for single frames."""
     fit = config.fit.model_copy(update={"mode": config.track.free})
     tracked = config.model_copy(update={"fit": fit})
-    return make_scene(tracked, field_px, searches=frames, lines=lines)
+    return make_context(tracked, field_px, searches=frames, lines=lines)
 
 
 def opening_ground(config: Config, field: MovingField) -> BackgroundEstimate:
@@ -67,7 +67,7 @@ def opening_ground(config: Config, field: MovingField) -> BackgroundEstimate:
 
 
 def load_field(
-    scene: Scene,
+    context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
     span: tuple[int, int],
@@ -106,18 +106,18 @@ def load_field(
     total, light = exposures.in_electrons(total, frames), exposures.in_electrons(light, 1)
     masked = saturated | find_defects(total, frames * read)
     masked |= _noisy(exposures, light, total / frames + read)
-    nominal = abs(scene.model.scale.amplitude(scene.model.material.mass_kda))
-    free_z = scene.mode == "joint"
+    nominal = abs(context.model.scale.amplitude(context.model.material.mass_kda))
+    free_z = context.mode == "joint"
     return MovingField(
-        exposures, read, ~masked, scene.model, scene.wide,
-        pixel_nm=scene.pixel_nm, roi_px=scene.roi_px,
-        z_range_nm=scene.config.fit.z_range_nm if free_z else None,
+        exposures, read, ~masked, context.model, context.wide,
+        pixel_nm=context.pixel_nm, roi_px=context.roi_px,
+        z_range_nm=context.config.fit.z_range_nm if free_z else None,
         largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
 
 
 def give_back(
-    scene: Scene,
+    context: AnalysisContext,
     field: MovingField,
     movie: CountSource,
     camera: Camera,
@@ -130,7 +130,7 @@ def give_back(
     A particle is part of the light of its lines, and of whatever else each frame was divided by.
     Where it is known, that light is known without it.
     """
-    lines = scene.lines
+    lines = context.lines
     if lines is None or not len(rows.frame):
         return
     signal = field.draw(ground, rows, coarse=False)
@@ -173,7 +173,7 @@ def _noisy(exposures: Exposures, light_e: FloatArray, variance_e2: FloatArray) -
 
 
 def search_frames(
-    scene: Scene,
+    context: AnalysisContext,
     field: MovingField,
     ground: BackgroundEstimate,
     rows: Localizations,
@@ -184,12 +184,12 @@ def search_frames(
     cautious: bool = False,
 ) -> FrameCandidates:
     """Find candidates in what the rows leave over."""
-    side = scene.roi_px
-    if scene.mode == "joint":
-        side += round(2 * RING_SLOPE * scene.config.fit.z_range_nm[1] / field.pixel_nm)
+    side = context.roi_px
+    if context.mode == "joint":
+        side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)
     search = FrameFilter(
-        scene.templates, ground.level, field.read_e2, field.used,
-        polarity=scene.config.detection.sign, roi_px=side, cautious=cautious,
+        context.templates, ground.level, field.read_e2, field.used,
+        polarity=context.config.detection.sign, roi_px=side, cautious=cautious,
     )  # fmt: skip
     if frames is None:
         field.draw(ground, rows)

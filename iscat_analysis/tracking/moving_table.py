@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import gammainc, gammaincc, ndtr
 
 from iscat_analysis.bounds.quantum import quantum_information
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.fit import OUTWARD, POOR_FIT_P
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred
 from iscat_analysis.optics.collected import collected_area_nm2
@@ -31,7 +31,7 @@ _TESTS = 2
 _APART = 0.05  # relative step of a blur
 
 
-def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame:
+def moving_table(context: AnalysisContext, moving: Moving, first_frame: int) -> pd.DataFrame:
     """Make a line of ``fits.csv`` for every row, without its number and its verdict.
 
     Notes
@@ -41,7 +41,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     takes.
     """
     rows, judged, field = moving.rows, moving.judged, moving.field
-    model, pixel, free = scene.model, scene.pixel_nm, moving.field.free[:4]
+    model, pixel, free = context.model, context.pixel_nm, moving.field.free[:4]
     index = np.flatnonzero(free)
     n, amplitude = len(rows.frame), rows.theta[:, 3]
     slope = np.abs(model.scale.slopes(amplitude))
@@ -52,8 +52,8 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
     shift = (small & ~field.on_wall(rows)).astype(float)  # else the expansion means nothing
     estimate = rows.theta[:, :4] - judged.bias * shift[:, None]
     mass = model.scale.mass(estimate[:, 3])
-    losses = losses_to_blur(scene, moving)[rows.group]
-    path = _path_errors(scene, moving, losses) * units
+    losses = losses_to_blur(context, moving)[rows.group]
+    path = _path_errors(context, moving, losses) * units
     sigma, crb = np.hypot(sigma, path), np.hypot(crb, path)
     own = np.sqrt(np.einsum("nii->ni", moving.shared)) * units
     sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
@@ -68,7 +68,7 @@ def moving_table(scene: Scene, moving: Moving, first_frame: int) -> pd.DataFrame
         "contrast": _contrasts(model, estimate[:, 2], estimate[:, 3]),
         "n_scattered": collected, "snr": np.sqrt(2 * np.maximum(judged.gain, 0.0)),
         "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
-        "flags": _flags(scene, moving, sigma, p_value, losses),
+        "flags": _flags(context, moving, sigma, p_value, losses),
     }  # fmt: skip
     quantum = _quantum(model, estimate[:, 2], mass, collected, free)
     for k, name in enumerate(PARAMETERS):
@@ -111,9 +111,9 @@ def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
     return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
 
-def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
+def common_masses(context: AnalysisContext, moving: Moving) -> pd.DataFrame:
     """Give the mass of each track that the exact likelihood of all its frames has."""
-    common, scale = moving.common, scene.model.scale
+    common, scale = moving.common, context.model.scale
     known = np.isfinite(common.amplitude)
     amplitude = np.where(known, common.amplitude, 1.0)
     mass = np.where(known, scale.mass(amplitude), np.nan)
@@ -121,10 +121,10 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     tracks = np.arange(len(mass))
     group = np.zeros(len(mass), dtype=np.int64)
     group[moving.rows.track] = moving.rows.group
-    loss = losses_to_blur(scene, moving)[group] if len(mass) else np.zeros(0)
+    loss = losses_to_blur(context, moving)[group] if len(mass) else np.zeros(0)
     d, sigma_d = np.nan_to_num(moving.diffusion).T if len(mass) else np.zeros((2, 0))
     rows = moving.rows
-    each = _path_errors(scene, moving, losses_to_blur(scene, moving)[rows.group])[:, 3]
+    each = _path_errors(context, moving, losses_to_blur(context, moving)[rows.group])[:, 3]
     strength = np.abs(rows.theta[:, 3])
     share = (each / np.maximum(strength, _FAINTEST * strength.max(initial=1e-9))) ** 2
     count = np.maximum(np.bincount(rows.track, minlength=len(mass)), 1)
@@ -138,12 +138,12 @@ def common_masses(scene: Scene, moving: Moving) -> pd.DataFrame:
     return table.set_index(pd.Index(tracks, name="track"))
 
 
-def losses_to_blur(scene: Scene, moving: Moving) -> FloatArray:
+def losses_to_blur(context: AnalysisContext, moving: Moving) -> FloatArray:
     """Share of the mass that the blur of each group takes, to first order: −d ln m / d ln q.
 
     Shapes: result (groups,).
     """
-    model, grid = scene.model, PixelGrid.centred(scene.roi_px | 1, scene.pixel_nm)
+    model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     z, amplitude = model.height_nm, model.scale.amplitude(model.material.mass_kda)
     out = []
     for q in moving.variances_nm2:
@@ -158,11 +158,11 @@ def losses_to_blur(scene: Scene, moving: Moving) -> FloatArray:
     return np.abs(np.array(out, dtype=np.float64))
 
 
-def _path_errors(scene: Scene, moving: Moving, losses: FloatArray) -> FloatArray:
+def _path_errors(context: AnalysisContext, moving: Moving, losses: FloatArray) -> FloatArray:
     """Errors of (x, y, z, a) of each row that the unknown path of its exposure makes, (n, 4)."""
     out = np.zeros((len(losses), 4))
     if moving.field.free[2]:
-        return np.asarray(np.sqrt(np.einsum("nii->ni", path_covariances(scene, moving))))
+        return np.asarray(np.sqrt(np.einsum("nii->ni", path_covariances(context, moving))))
     out[:, 3] = PATH_SPREAD * losses * np.abs(moving.rows.theta[:, 3])
     return out
 
@@ -178,9 +178,9 @@ def _p_values(
     return np.asarray(-np.expm1(_TESTS * np.log1p(-least)))
 
 
-def _off_line(scene: Scene, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
+def _off_line(context: AnalysisContext, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
     """Tell whose masses a calibration does not tell: by that of the track where it is known."""
-    track, common, scale = moving.rows.track, moving.common, scene.model.scale
+    track, common, scale = moving.rows.track, moving.common, context.model.scale
     own, shared = moving.rows.theta[:, 3], common.amplitude[track]
     known = np.isfinite(shared)
     slope = np.abs(scale.slopes(np.where(known, shared, own)))
@@ -189,7 +189,11 @@ def _off_line(scene: Scene, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
 
 
 def _flags(
-    scene: Scene, moving: Moving, sigma: FloatArray, p_value: FloatArray, losses: FloatArray
+    context: AnalysisContext,
+    moving: Moving,
+    sigma: FloatArray,
+    p_value: FloatArray,
+    losses: FloatArray,
 ) -> NDArray[np.object_]:
     """Join what is to be remarked on each row with semicolons."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
@@ -198,7 +202,7 @@ def _flags(
     field = moving.field
     outside = field.on_wall(rows)
     if moving.field.free[3]:
-        outside |= _off_line(scene, moving, sigma[:, 3])
+        outside |= _off_line(context, moving, sigma[:, 3])
     too_bright = np.zeros(len(rows.frame), dtype=np.bool_)
     if field.saturated.any():
         too_bright[:] = [

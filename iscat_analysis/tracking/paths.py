@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from iscat_analysis.fitting.scene import Scene
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import FloatArray
@@ -34,7 +34,7 @@ _PER_FRINGE = 8  # heights at which errors are computed; linear in between
 _STEP_NM = 2.0  # along z, of differences
 
 
-def path_covariances(scene: Scene, moving: Moving) -> FloatArray:
+def path_covariances(context: AnalysisContext, moving: Moving) -> FloatArray:
     """Give the errors of rows that the unknown paths of their exposures make.
 
     Shapes: result (n, 4, 4).
@@ -47,14 +47,14 @@ def path_covariances(scene: Scene, moving: Moving) -> FloatArray:
         mine = np.flatnonzero(rows.group == number)
         if q == 0 or not mine.size:
             continue
-        model = blurred(scene.model, q, upwards=True)
+        model = blurred(context.model, q, upwards=True)
         z = rows.theta[mine, 2]
         count = max(2, math.ceil(np.ptp(z) / model.fringe_nm * _PER_FRINGE) + 1)
         heights = np.linspace(z.min(), z.max(), count)
         amplitude = float(np.median(rows.theta[mine, 3]))
         share = float(np.median(moving.field.read_e2) / np.median(level))
         table = np.stack([
-            path_covariance(model, scene.roi_px, scene.pixel_nm, h, amplitude, q, share)
+            path_covariance(model, context.roi_px, context.pixel_nm, h, amplitude, q, share)
             for h in heights.tolist()
         ])  # fmt: skip
         for i in range(4):

@@ -18,8 +18,8 @@ import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import unheard
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.instrument.learner import (
@@ -32,7 +32,7 @@ from iscat_analysis.instrument.learner import (
     with_settings,
 )
 from iscat_analysis.instrument.learning import taken, usable
-from iscat_analysis.instrument.microscope import calibrate_sights, with_sign
+from iscat_analysis.instrument.microscope import calibrate_particle_images, with_sign
 from iscat_analysis.instrument.tested_optics import REJECTED_P
 from iscat_analysis.instrument.unknown_heights import learn_with_heights
 from iscat_analysis.records import BoolArray
@@ -84,13 +84,13 @@ class Begun:
     """The first frames of a movie, followed with some optics."""
 
     config: Config
-    scene: Scene
+    context: AnalysisContext
     block: Block
 
     @cached_property
     def left(self) -> LeftOver | None:
         """What the model leaves over of all pictures; None where there is none."""
-        return _left_over(self.block, self.scene)
+        return _left_over(self.block, self.context)
 
     @property
     def described(self) -> bool:
@@ -112,7 +112,7 @@ def learn_from_tracks(
     *,
     name: str,
     pool: ThreadPoolExecutor,
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
     notify: Callable[[str], None] = unheard,
 ) -> tuple[Begun, dict[str, Any]]:
     """Follow the first frames, test the optics on them, and learn better ones where they fail.
@@ -141,7 +141,7 @@ def learn_from_tracks(
             raise trouble
         if trouble is not None:
             raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
-        tell(said)
+        warn(said)
         return begun, tested | {"calibrated": False, "reason": reason}
 
     learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
@@ -158,11 +158,11 @@ def learn_from_tracks(
             found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
             if found is not None:
                 learned, told = taken(
-                    found, config, tested, left.verdict, pictures_of="pictures of tracks", tell=tell
+                    found, config, tested, left.verdict, pictures_of="pictures of tracks", warn=warn
                 )
                 return begin(learned), told
             if trouble is not None and near is not None:
-                tell(f"{left.verdict}; others are used that describe them better, but: {why}")
+                warn(f"{left.verdict}; others are used that describe them better, but: {why}")
                 rest = near.left.share if near.left is not None else 0.0
                 told = {"calibrated": True, "reason": why, "left_over_then": rest}
                 return near, tested | told
@@ -239,17 +239,17 @@ def mass_error(summary: Mapping[str, Any]) -> float:
     return MASS_SHARE * share if rejected else 0.0
 
 
-def _left_over(block: Block, scene: Scene) -> LeftOver | None:
+def _left_over(block: Block, context: AnalysisContext) -> LeftOver | None:
     """Add up what the model leaves over of all pictures; None where there is none."""
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
     tracks = len(np.unique(aligned.track))
-    if scene.mode == "joint":
-        return _left_over_singly(aligned, scene, tracks)
+    if context.mode == "joint":
+        return _left_over_singly(aligned, context, tracks)
     rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
     for number, theta in enumerate(aligned.theta):
-        likelihood = aligned.likelihood(scene, number)
+        likelihood = aligned.likelihood(context, number)
         noise = np.where(likelihood.used, aligned.light_e[number] + aligned.read_e2[number], 0.0)
         rest += theta[3] * np.nan_to_num(likelihood.residuals(theta)) * np.sqrt(noise)
         signal += theta[3] * noise * likelihood.signal(theta)
@@ -262,13 +262,13 @@ def _left_over(block: Block, scene: Scene) -> LeftOver | None:
     return LeftOver(share, float(square.mean()) > REJECTED_CHI2, tracks)
 
 
-def _left_over_singly(aligned: Aligned, scene: Scene, tracks: int) -> LeftOver | None:
+def _left_over_singly(aligned: Aligned, context: AnalysisContext, tracks: int) -> LeftOver | None:
     """Say the same of pictures that no two have in common, as of particles at other heights."""
     excess, power, p_values = 0.0, 0.0, []
     for number, theta in enumerate(aligned.theta):
-        likelihood = aligned.likelihood(scene, number)
+        likelihood = aligned.likelihood(context, number)
         signal = likelihood.signal(theta)
-        chi2, p_value = goodness_of_fit(likelihood, theta, _free(scene))
+        chi2, p_value = goodness_of_fit(likelihood, theta, _free(context))
         excess += (chi2 - 1) * likelihood.n_pixels
         power += float(np.sum(signal**2 * likelihood.signal_information(signal)))
         p_values.append(p_value)
@@ -280,9 +280,9 @@ def _share(excess: float, power: float) -> float:
     return math.sqrt(max(excess, 0.0) / power) if power > 0 else 0.0
 
 
-def _free(scene: Scene) -> BoolArray:
+def _free(context: AnalysisContext) -> BoolArray:
     """Tell what is fitted of a picture, as `Likelihood` has it."""
-    return np.array([True, True, scene.mode == "joint", True, False])
+    return np.array([True, True, context.mode == "joint", True, False])
 
 
 def _brightest(aligned: Aligned, most: int) -> list[int]:
@@ -294,12 +294,12 @@ def _brightest(aligned: Aligned, most: int) -> list[int]:
 
 def _cause(begun: Begun) -> Cause | None:
     """Name the part of the microscope that what is left over looks most like."""
-    aligned, scene = begun.block.aligned, begun.scene
+    aligned, context = begun.block.aligned, begun.context
     if aligned is None:
         return None
     shown = _brightest(aligned, _LOOKED_AT)
-    fits = [(aligned.likelihood(scene, n), aligned.theta[n], _free(scene)) for n in shown]
-    return likely_cause(scene.config, fits)
+    fits = [(aligned.likelihood(context, n), aligned.theta[n], _free(context)) for n in shown]
+    return likely_cause(context.config, fits)
 
 
 def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
@@ -336,12 +336,12 @@ def _measured(
     known: Settings | None = None,
 ) -> OpticsCalibration:
     """Measure the microscope from the pictures of tracks; `known` as in `measure_microscope`."""
-    aligned, scene = begun.block.aligned, begun.scene
+    aligned, context = begun.block.aligned, begun.context
     shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
-    sights = [aligned.sight(scene, n) for n in shown] if aligned is not None else []
+    sights = [aligned.sight(context, n) for n in shown] if aligned is not None else []
     source: Mapping[str, str] = {"movie": name}
-    if scene.mode != "joint":
-        return calibrate_sights(
+    if context.mode != "joint":
+        return calibrate_particle_images(
             sights, (), start, tuple(FREE), source, known=known, mapper=pool.map
         )
     return learn_with_heights(

@@ -17,8 +17,8 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.regions import Region, region_likelihood
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
@@ -94,46 +94,46 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
 
 
 def tracks_of(
-    scene: Scene,
+    context: AnalysisContext,
     fits: pd.DataFrame,
     windows: Windows,
     *,
     masses: pd.DataFrame | None,
     ticks: NDArray[np.int64] | None,
-    tell: Callable[[str], None],
+    warn: Callable[[str], None],
     progress: Progress,
 ) -> tuple[pd.DataFrame, dict[str, Any]]:
     """Describe the tracks of a movie."""
-    setup = replace(track_setup(scene, windows), ticks=ticks)
+    setup = replace(track_setup(context, windows), ticks=ticks)
     setup = replace(setup, change=changes_together(fits, setup.frames))
     with one_thread_algebra():
         tracks = describe_tracks(
             fits,
             setup,
-            correlation=mass_correlation(scene, fits),
+            correlation=mass_correlation(context, fits),
             masses=masses,
-            seed=scene.config.compute.seed,
-            workers=scene.config.compute.workers,
+            seed=context.config.compute.seed,
+            workers=context.config.compute.workers,
             progress=progress,
         )
     if setup.change:
-        tell(
+        warn(
             f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
             "frames, as where the focus drifts: tracks that this puts off by more than their "
             "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
         )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
     if len(met):
-        tell(_crossings(met, setup))
-    cut = cut_steps(tracks, setup, scene.config.track.max_step_nm)
+        warn(_crossings(met, setup))
+    cut = cut_steps(tracks, setup, context.config.track.max_step_nm)
     if cut:
-        tell(cut)
+        warn(cut)
     return tracks, {"tracks": len(tracks), "motion": _summary(tracks, setup)}
 
 
-def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
+def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
     """Gather what all tracks of a movie have in common."""
-    config = scene.config
+    config = context.config
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
     resolution_nm = config.optics.wavelength_nm / config.optics.na
@@ -142,7 +142,7 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
         frame_rate_hz=config.camera.frame_rate_hz,
         exposure_ms=config.camera.exposure_ms,
         frames=windows.frames_after,
-        field_nm=((rows - 1) * scene.pixel_nm, (columns - 1) * scene.pixel_nm),
+        field_nm=((rows - 1) * context.pixel_nm, (columns - 1) * context.pixel_nm),
         near_nm=config.detection.min_separation_nm,
         min_frames=config.track.min_frames,
         volume=config.track.free == "joint",
@@ -155,7 +155,7 @@ def track_setup(scene: Scene, windows: Windows) -> TrackSetup:
     )
 
 
-def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
+def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlation | None:
     """Give the correlation of the masses of frames that share a background recorded before.
 
     A mass is the picture h times the pixels, over Σ h², and of their pictures two frames have
@@ -163,19 +163,21 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
     well, h is what of the picture its derivative along z does not explain.
     """
-    config = scene.config
+    config = context.config
     before = fits["n_before"].median() if len(fits) else 0
     known = (
-        config.background.method == "known" or scene.additive or background_mode(config) == "tracks"
+        config.background.method == "known"
+        or context.additive
+        or background_mode(config) == "tracks"
     )
     if known or not before > 0:
         return None
-    share = scene.background_variance / (scene.background_variance + before)
-    side = scene.roi_px
-    middle = (side - 1) / 2 * scene.pixel_nm
-    grid = PixelGrid.region((0, side), (0, side), scene.pixel_nm)
+    share = context.background_variance / (context.background_variance + before)
+    side = context.roi_px
+    middle = (side - 1) / 2 * context.pixel_nm
+    grid = PixelGrid.region((0, side), (0, side), context.pixel_nm)
     height, mass = (float(fits[name].median()) for name in ("z_nm", "mass_kda"))
-    slopes = scene.model.gradient(grid, middle, middle, height, mass)[1]
+    slopes = context.model.gradient(grid, middle, middle, height, mass)[1]
     picture = slopes[3]
     if fits["sigma_z_nm"].notna().any():
         along = slopes[2]
@@ -185,7 +187,7 @@ def mass_correlation(scene: Scene, fits: pd.DataFrame) -> Correlation | None:
     common /= common[side - 1, side - 1]
 
     def correlation(places_nm: FloatArray) -> FloatArray:
-        apart = (places_nm[:, None] - places_nm) / scene.pixel_nm + (side - 1)
+        apart = (places_nm[:, None] - places_nm) / context.pixel_nm + (side - 1)
         shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
         both = (shared + shared.T) / 2
         return np.asarray((1 - share) * np.eye(len(both)) + share * both)
@@ -248,7 +250,7 @@ def _summary(tracks: pd.DataFrame, setup: TrackSetup) -> dict[str, Any]:
 
 
 def make_films(
-    scene: Scene,
+    context: AnalysisContext,
     movie: FrameSource,
     camera: Camera,
     windows: Sequence[Windows],
@@ -267,26 +269,26 @@ def make_films(
     known = fits["frame"].isin(frames) & fits["mass_kda"].notna()
     there = fits.loc[known, list(_PLACE)]
     frame, x, y, z, mass = (there[name].to_numpy() for name in _PLACE)
-    z = np.clip(z, *scene.wide.z_range_nm)
-    theta = np.column_stack([x, y, z, scene.wide.scale.amplitudes(mass)])
+    z = np.clip(z, *context.wide.z_range_nm)
+    theta = np.column_stack([x, y, z, context.wide.scale.amplitudes(mass)])
     of_row = numbers[known].to_numpy()
     seen = [
         _Seen(model, frame[mine], theta[mine])
-        for track, model in _models(scene, tracks).items()
+        for track, model in _models(context, tracks).items()
         if (mine := of_row == track).any()
     ]
-    return tuple(_film(scene, movie, camera, windows, seen, *film) for film in chosen)
+    return tuple(_film(context, movie, camera, windows, seen, *film) for film in chosen)
 
 
-def _models(scene: Scene, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
+def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
     """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
-    if background_mode(scene.config) != "tracks":
+    if background_mode(context.config) != "tracks":
         known[:] = 0.0
-    _, exposure_s = exposure_of(scene.config)
-    upwards = scene.config.track.free == "joint"
+    _, exposure_s = exposure_of(context.config)
+    upwards = context.config.track.free == "joint"
     return {
-        int(track): blurred(scene.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
+        int(track): blurred(context.wide, path_variance_nm2(d, exposure_s), upwards=upwards)
         for track, d in zip(tracks["track"], known, strict=True)
     }
 
@@ -331,7 +333,7 @@ class _Seen(NamedTuple):
 
 
 def _film(
-    scene: Scene,
+    context: AnalysisContext,
     movie: FrameSource,
     camera: Camera,
     windows: Sequence[Windows],
@@ -341,8 +343,8 @@ def _film(
     shown: pd.DataFrame,
 ) -> Film:
     """Draw data, model and residual of some frames of a track, with all particles in them."""
-    region, frames = _square(scene, windows[0], shown), shown["frame"].to_numpy(int)
-    grid = PixelGrid.region(region.rows, region.columns, scene.pixel_nm)
+    region, frames = _square(context, windows[0], shown), shown["frame"].to_numpy(int)
+    grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
     data, model, residual = np.zeros((3, len(frames), *region.shape))
     for particle in seen:
         here = np.isin(particle.frame, frames)
@@ -350,36 +352,40 @@ def _film(
         model[place] += signals_within(particle.model, grid, particle.theta[here])
     for number, frame in enumerate(frames.tolist()):
         likelihood = region_likelihood(
-            scene, _single(scene, movie, camera, windows, frame), region, None
+            context, _single(context, movie, camera, windows, frame), region, None
         )
         data[number] = likelihood.measured_signal()
         information = likelihood.signal_information(model[number])
         residual[number] = (data[number] - model[number]) * np.sqrt(information)
-        if scene.additive:
+        if context.additive:
             data[number] *= likelihood.data[2]
             model[number] *= likelihood.data[2]
     return Film(track, tuple(frames.tolist()), why, data, model, residual)
 
 
 def _single(
-    scene: Scene, movie: FrameSource, camera: Camera, windows: Sequence[Windows], frame: int
+    context: AnalysisContext,
+    movie: FrameSource,
+    camera: Camera,
+    windows: Sequence[Windows],
+    frame: int,
 ) -> Windows:
     """Give a frame over its background, at its power: as learnt with the tracks, or as it says."""
     here = next((w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0])
     single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
-    if not scene.config.background.power_normalization:
+    if not context.config.background.power_normalization:
         return single
-    if background_mode(scene.config) != "tracks":
+    if background_mode(context.config) != "tracks":
         return start_power(single)
     before, after = np.split(here.power, [here.n_before])
     return replace(single, power_ratio=float(after[frame - here.frames_after[0]] / before.sum()))
 
 
-def _square(scene: Scene, windows: Windows, rows: pd.DataFrame) -> Region:
+def _square(context: AnalysisContext, windows: Windows, rows: pd.DataFrame) -> Region:
     """Place a square in the field around the middle of the places."""
     spans = []
     for name, size in zip(("y_px", "x_px"), windows.after_e.shape, strict=True):
-        side = min(scene.roi_px, size)
+        side = min(context.roi_px, size)
         middle = (rows[name].min() + rows[name].max()) / 2
         low = int(np.clip(round(middle - side / 2), 0, size - side))
         spans.append((low, low + side))

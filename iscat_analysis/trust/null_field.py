@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from iscat_analysis.camera.background import smooth_background
+from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.regions import photons_scale
-from iscat_analysis.fitting.scene import Scene
 from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.split_frames import LENGTHS
 from iscat_analysis.optics.forward import PixelGrid
@@ -39,7 +39,7 @@ _WHOLE = CONTRASTS.index("whole")
 
 
 def taken_places(
-    scene: Scene, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
+    context: AnalysisContext, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
 ) -> BoolArray:
     """Give the pixels so near to a particle that its fit, and not the noise, is seen.
 
@@ -47,7 +47,7 @@ def taken_places(
     """
     taken = np.zeros(shape, dtype=np.bool_)
     for x, y, described in places:
-        reach = scene.roi_px * (_NEAR if described else _NEAR_POOR)
+        reach = context.roi_px * (_NEAR if described else _NEAR_POOR)
         top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
         box = taken[
             top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)
@@ -58,7 +58,7 @@ def taken_places(
 
 
 def taken_by(
-    scene: Scene, windows: Windows, events: Sequence[Event], signal: FloatArray
+    context: AnalysisContext, windows: Windows, events: Sequence[Event], signal: FloatArray
 ) -> BoolArray:
     """Give the pixels that fitted particles take.
 
@@ -66,16 +66,16 @@ def taken_by(
     """
     rows, columns = windows.after_e.shape
     taken = taken_places(
-        scene, (rows, columns),
+        context, (rows, columns),
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
     )  # fmt: skip
-    if scene.additive:
-        taken |= photons_scale(scene, windows) * signal > _OUTSHONE * windows.after_e.mean()
+    if context.additive:
+        taken |= photons_scale(context, windows) * signal > _OUTSHONE * windows.after_e.mean()
     return taken
 
 
 def empty_field(
-    scene: Scene,
+    context: AnalysisContext,
     mean_e: FloatArray,
     read: FloatArray,
     used: BoolArray,
@@ -87,9 +87,9 @@ def empty_field(
 
     Shapes: `mean_e` (y, x), `read` (y, x), `used` (y, x).
     """
-    model, pixel = scene.model, scene.pixel_nm
+    model, pixel = context.model, context.pixel_nm
     theta = np.median([fit.theta for fit in fits], axis=0)
-    grid = PixelGrid.centred(scene.roi_px | 1, pixel)
+    grid = PixelGrid.centred(context.roi_px | 1, pixel)
     _, first = model.amplitude_gradient(grid, 0.0, 0.0, float(theta[2]), float(theta[3]))
     free = fits[0].box.free
     slopes = first[np.flatnonzero(free[:LEVEL])]
@@ -100,44 +100,52 @@ def empty_field(
     spacing = max(1, round(optics.wavelength_nm / (2 * optics.na) / pixel))
     return EmptyField(
         mean_e, read, used, slopes, n_free,
-        additive=scene.additive, spacing_px=spacing, tile_px=max(scene.roi_px // 2, 4),
+        additive=context.additive, spacing_px=spacing, tile_px=max(context.roi_px // 2, 4),
     )  # fmt: skip
 
 
 def background_field(
-    scene: Scene, windows: Windows, power: float, read: FloatArray, fits: Sequence[FitResult]
+    context: AnalysisContext,
+    windows: Windows,
+    power: float,
+    read: FloatArray,
+    fits: Sequence[FitResult],
 ) -> EmptyField:
     """Make the estimator for frames against a background.
 
     Shapes: `read` (y, x).
     """
     mean = windows.before_e
-    if scene.additive:  # counts may be few, and weights must not follow their fluctuations
+    if context.additive:  # counts may be few, and weights must not follow their fluctuations
         mean = smooth_background(mean, windows.read_variance_before_e2, windows.masked)
-    return empty_field(scene, mean / power, read, ~windows.masked, fits, level=False)
+    return empty_field(context, mean / power, read, ~windows.masked, fits, level=False)
 
 
 class FrameNoise:
     """What single frames make of nothing, each against the background, as tracks are fitted."""
 
     def __init__(
-        self, scene: Scene, windows: Windows, read_e2: FloatArray, fits: Sequence[FitResult]
+        self,
+        context: AnalysisContext,
+        windows: Windows,
+        read_e2: FloatArray,
+        fits: Sequence[FitResult],
     ) -> None:
-        self._scene = scene
+        self._context = context
         light = float(max(windows.n_before, 1))
-        self._field = background_field(scene, windows, light, read_e2, fits)
+        self._field = background_field(context, windows, light, read_e2, fits)
         self._light = light
         self._level = windows.before_e / light
         self._before = self._field.errors(windows.before_e, light, None)
         # A background noisier than the mean of its frames is worth less light than they hold.
-        self._worth = light / max(scene.background_variance, _EXACTLY)
+        self._worth = light / max(context.background_variance, _EXACTLY)
         first, last = windows.frames_after
         known = windows.n_before == 0
         self._middle = first - 1.0 if known else (sum(windows.frames_before) - 1) / 2
         near, far = sorted((abs(first - self._middle), abs(last - 1 - self._middle)))
         self._edges = np.geomspace(near, far, min(MOST_DISTANCES, last - first) + 1)[1:-1]
         bins = self._edges.size + 1
-        free = len(FREE_PARAMETERS[scene.mode])
+        free = len(FREE_PARAMETERS[context.mode])
         self._squares = np.zeros((2 + bins, free, self._field.tiles))
         self._counts = np.zeros((2 + bins, self._field.tiles))
         self._distances = np.zeros((2, bins))  # sum, and of how many frames
@@ -148,12 +156,12 @@ class FrameNoise:
 
         Shapes: result (1 + len(LENGTHS).
         """
-        scene, field = self._scene, self._field
+        context, field = self._context, self._field
         shape = (here.after_e.shape[0], here.after_e.shape[1])
         power = here.power_ratio * self._light
-        signal = scene.left(total_signal(scene, shape, events))
-        taken = taken_by(scene, here, events, signal) | here.masked
-        known = signal * (photons_scale(scene, here) / power if scene.additive else self._level)
+        signal = context.left(total_signal(context, shape, events))
+        taken = taken_by(context, here, events, signal) | here.masked
+        known = signal * (photons_scale(context, here) / power if context.additive else self._level)
         errors = field.errors(here.after_e, power, known)
         left = field.left([(e.candidate.x_px, e.candidate.y_px) for e in events])
         apart = field.spread(

@@ -25,7 +25,7 @@ from iscat_analysis.answers.species import find_species
 from iscat_analysis.camera.counts import read_map
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.day.table import read_table
-from iscat_analysis.executors import open_place
+from iscat_analysis.executors import open_executor
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import Template
@@ -207,7 +207,7 @@ def _kept_part(path: Path) -> None:
 
 
 def _outside(path: Path) -> None:
-    with open_place(scheduler_file=path):
+    with open_executor(scheduler_file=path):
         pass
 
 

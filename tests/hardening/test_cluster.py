@@ -194,7 +194,7 @@ def test_chunks_of_a_movie_give_the_same_bytes_when_a_worker_is_killed(
 ) -> None:
     cluster.add(2)
     out, config, told = tmp_path / "far.iscat", ia.configure(LANDING), []
-    with one_killed(cluster), places.open_place(scheduler_file=cluster.file) as place:
+    with one_killed(cluster), places.open_executor(scheduler_file=cluster.file) as place:
         fit_stack(
             landing, config, out=out, command="iscat-fit", place=place,
             progress=lambda *step: told.append(step),
@@ -215,7 +215,7 @@ def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
         if stage == "landing" and done < total:
             raise KeyboardInterrupt
 
-    with places.open_place(scheduler_file=cluster.file) as place:
+    with places.open_executor(scheduler_file=cluster.file) as place:
         with pytest.raises(KeyboardInterrupt):
             fit_stack(landing, config, out=out, progress=stop, place=place)
         with pytest.raises(SchedulerError, match="the work was stopped"):
@@ -251,7 +251,7 @@ def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, mo
 def test_a_worker_does_one_job_at_a_time_with_all_its_threads(cluster: Workers) -> None:
     """Its memory is that of one job, even where others ask it for more at the same time."""
     cluster.add(2)
-    with places.open_place(scheduler_file=cluster.file) as place, ThreadPoolExecutor(5) as pool:
+    with places.open_executor(scheduler_file=cluster.file) as place, ThreadPoolExecutor(5) as pool:
         done = list(pool.map(lambda _: place.call(busy, 0.1), range(5)))
     assert {count for _, count, _, _ in done} == {2}
     for one, other in combinations(done, 2):

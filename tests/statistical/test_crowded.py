@@ -14,8 +14,8 @@ from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting import field
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.events import Event
-from iscat_analysis.fitting.scene import make_scene
 
 SIGMAS = 4.0
 
@@ -142,11 +142,11 @@ def _fitted(instrument: Instrument, landings: Landings) -> tuple[list[Event], np
             "detection.false_alarms_per_movie=1e-3",
         ],
     )
-    scene = make_scene(config, shape[1:])
+    context = make_context(config, shape[1:])
     camera = camera_from_config(config.camera, shape[1:], movie.dtype)
     windows = measure_windows(movie, camera, (0, 1), (1, 2))
     with ThreadPoolExecutor(1) as pool:
-        events, _ = field.fit_field(scene, windows, pool=pool)
+        events, _ = field.fit_field(context, windows, pool=pool)
     found = [e for e in events if "sidelobe" not in e.flags]
     places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in found])
     apart = np.hypot(places[:, :1] - landings.x_px, places[:, 1:] - landings.y_px)

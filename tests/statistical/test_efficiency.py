@@ -177,7 +177,7 @@ def test_a_wrong_likelihood_is_seen_in_the_pulls() -> None:
     known = setting("iscat", "mass", bounds={"n_before": 0})
     wrong = Setting(
         experiment.config,
-        known.scene,
+        known.context,
         experiment.region,
         experiment.experiment,
         experiment.truth,
@@ -208,5 +208,5 @@ def _with_gain(experiment: Setting, gain: float) -> Trials:
             return self.windows(self.level_e() + self.signal_e(truth), random, gain=gain)
 
     e = experiment
-    wrong = Misjudged(e.config, e.scene, e.region, e.experiment, e.truth, e.read_variance_e2)
+    wrong = Misjudged(e.config, e.context, e.region, e.experiment, e.truth, e.read_variance_e2)
     return run_trials(wrong, TRIALS // 2, seed=SEED)

@@ -10,8 +10,8 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.config import load_config
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import Windows
 from iscat_analysis.study.simulate import Movie
 
@@ -46,7 +46,7 @@ def _landing(movies: int) -> list[int]:
 
 def _fixed(movies: int) -> list[int]:
     settings = ["background.method=fixed", "background.frames=[0, 30]", "fit.frames=[30, 60]"]
-    scene = make_scene(load_config(None, [*COMMON, *settings]), FIELD)
+    context = make_context(load_config(None, [*COMMON, *settings]), FIELD)
     nothing, none = np.zeros(FIELD, dtype=bool), np.zeros(FIELD)
     rng, found = np.random.default_rng(3), []
     with ThreadPoolExecutor(1) as pool:
@@ -58,7 +58,7 @@ def _fixed(movies: int) -> list[int]:
                 read_variance_after_e2=none, masked=nothing, saturated=nothing,
                 frames_before=(0, 30), frames_after=(30, 60), power=np.ones(60),
             )  # fmt: skip
-            found.append(len(fit_field(scene, windows, pool=pool)[0]))
+            found.append(len(fit_field(context, windows, pool=pool)[0]))
     return found
 
 

@@ -15,8 +15,8 @@ from instruments import Instrument, InstrumentMovie, draw_landings
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.trust.systematic import systematic
@@ -47,13 +47,13 @@ def _config(*settings: str) -> Config:
 def _learned(movie: InstrumentMovie, config: Config) -> tuple[Config, list[str]]:
     said: list[str] = []
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    learned, _ = learn_optics(movie, config, camera, tell=said.append)
+    learned, _ = learn_optics(movie, config, camera, warn=said.append)
     return learned, said
 
 
 def _analysed(movie: InstrumentMovie, config: Config) -> DetectionResult:
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    return analyse_landings(movie, config, camera, tell=lambda _: None, progress=lambda *_: None)
+    return analyse_landings(movie, config, camera, warn=lambda _: None, progress=lambda *_: None)
 
 
 def _poor(found: DetectionResult) -> int:
@@ -109,4 +109,4 @@ def test_a_moving_focus_is_refused_where_pictures_are_of_one() -> None:
     config = _config("optics.focus_drift_nm=50", "background.method=fixed",
                      "background.frames=[0,10]")  # fmt: skip
     with pytest.raises(ConfigError, match="focus_drift_nm"):
-        make_scene(config, (64, 64))
+        make_context(config, (64, 64))

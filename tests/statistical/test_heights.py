@@ -31,7 +31,7 @@ def _anywhere(experiment: Setting, count: int) -> Trials:
 def test_wrong_fringes_are_flagged_at_3000_photons(mode: str) -> None:
     experiment = setting("iscat", mode, photons=3000.0, z_nm=500.0)
     trials = _anywhere(experiment, TRIALS)
-    wrong = np.abs(trials.estimate - trials.truth)[:, 2] > experiment.scene.model.fringe_nm / 4
+    wrong = np.abs(trials.estimate - trials.truth)[:, 2] > experiment.context.model.fringe_nm / 4
     silent = int(np.sum(wrong & trials.unflagged))
     assert binom.sf(silent - 1, TRIALS, WRONG_FRINGES) > SURPRISE
     assert np.mean(trials.unflagged) > 0.98
@@ -55,7 +55,7 @@ def test_wrong_fringes_exist_and_carry_the_flag() -> None:
     """At 100 photons heights are often wrong; without the flag this study would see them."""
     experiment = setting("iscat", "localize", photons=100.0, z_nm=500.0)
     trials = _anywhere(experiment, TRIALS)
-    wrong = np.abs(trials.estimate - trials.truth)[:, 2] > experiment.scene.model.fringe_nm / 4
+    wrong = np.abs(trials.estimate - trials.truth)[:, 2] > experiment.context.model.fringe_nm / 4
     assert wrong.sum() > 10
     assert np.mean(trials.flagged(Status.AMBIGUOUS_Z)[wrong]) > 0.9
     silent = int(np.sum(wrong & trials.unflagged))

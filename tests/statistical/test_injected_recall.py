@@ -30,12 +30,12 @@ def test_recall_near_the_threshold_is_the_predicted_one(
     ia.simulate_movie(config, tmp_path / "movie.tif", seed=3)
     real, threshold = injection.draw_particles, []
 
-    def faint(scene: Any, *arguments: Any) -> Any:
+    def faint(context: Any, *arguments: Any) -> Any:
         *before, table, seed = arguments
         sigma = float(table["crb_mass_kda"][table["status"] == "ok"].median())
-        threshold.append(scene.templates.threshold)
+        threshold.append(context.templates.threshold)
         mass = 0.95 * sigma * threshold[0]
-        return real(scene, *before, pd.DataFrame({"mass_kda": [mass], "status": ["ok"]}), seed)
+        return real(context, *before, pd.DataFrame({"mass_kda": [mass], "status": ["ok"]}), seed)
 
     monkeypatch.setattr(injection, "draw_particles", faint)
     with ia.open_stack(tmp_path / "movie.tif") as movie:

@@ -13,7 +13,7 @@ from scipy.stats import poisson
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.find import analyse_landings
@@ -79,7 +79,7 @@ def _analyse(config: Config, seed: int) -> pd.DataFrame:
     counts = np.array(list(Movie(config, seed).frames()))
     return analyse_landings(
         Memory(counts), config, Camera(gain_e_per_adu=4.0),
-        tell=lambda _: None, progress=lambda *_: None,
+        warn=lambda _: None, progress=lambda *_: None,
     ).fits  # fmt: skip
 
 
@@ -152,7 +152,7 @@ def _alarms_in(kind: str, movies: int) -> int:
         found += len(
             analyse_landings(
                 Memory(np.clip(counts, 0, 65535).astype(np.uint16)), config,
-                Camera(gain_e_per_adu=4.0), tell=lambda _: None, progress=lambda *_: None,
+                Camera(gain_e_per_adu=4.0), warn=lambda _: None, progress=lambda *_: None,
             ).fits
         )  # fmt: skip
     return found
@@ -277,19 +277,19 @@ def test_frames_lie_in_their_intervals(events: pd.DataFrame) -> None:
 def biases() -> tuple[np.ndarray, np.ndarray]:
     """Relative errors of a faint particle's mass, with and without the correction."""
     config = _config(64, 200)
-    scene = make_scene(config, (64, 64), sliding=True)
-    grid = PixelGrid.region((0, scene.roi_px), (0, scene.roi_px), PIXEL_NM)
+    context = make_context(config, (64, 64), sliding=True)
+    grid = PixelGrid.region((0, context.roi_px), (0, context.roi_px), PIXEL_NM)
     x, y, mass = 15.3, 15.8, 66.0
-    signal = scene.model.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, mass)
+    signal = context.model.image(grid, x * PIXEL_NM, y * PIXEL_NM, 5.0, mass)
     rng = np.random.default_rng(4)
     start = Candidate(x, y, 5.0, mass, 8.0)
     plain, corrected = [], []
     for _ in range(1500):
         before = rng.poisson(WINDOW * LEVEL_E, grid.shape).astype(float)
         after = rng.poisson(WINDOW * LEVEL_E * (1 + signal)).astype(float)
-        likelihood = conditional(scene.model, grid, before, after, 1.0)
+        likelihood = conditional(context.model, grid, before, after, 1.0)
         fit = fit_particle(likelihood, start, "mass", (0.0, 1000.0), level=True)
-        plain.append(fit.theta[3] / scene.model.scale.amplitude(mass) - 1)
+        plain.append(fit.theta[3] / context.model.scale.amplitude(mass) - 1)
         corrected.append(fit.mass_kda / mass - 1)
     return np.array(plain), np.array(corrected)
 

@@ -16,9 +16,9 @@ from scenes import Light, make_config
 from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.config import Config
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import table_of
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.study.simulate import Movie
 
@@ -64,13 +64,13 @@ def _fields(mode: str, gain: float, places: int) -> tuple[pd.DataFrame, int, int
     with ThreadPoolExecutor(2) as pool:
         for place in range(places):
             config = _config(mode, place)
-            scene = make_scene(config, config.simulation.shape)
+            context = make_context(config, config.simulation.shape)
             movie = Movie(config, seed=place)
             light = Light.of(movie, 200)
             for draw in range(DRAWS):
                 rng = np.random.default_rng([place, draw, 77])
-                events, _ = fit_field(scene, light.draw(rng, gain=gain), pool=pool)
-                found = table_of(scene, events)
+                events, _ = fit_field(context, light.draw(rng, gain=gain), pool=pool)
+                found = table_of(context, events)
                 apart = np.hypot(
                     *(found[c].to_numpy()[:, None] - movie.truth[c].to_numpy() for c in
                       ("x_px", "y_px"))

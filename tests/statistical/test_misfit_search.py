@@ -13,9 +13,9 @@ from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
 
@@ -54,7 +54,7 @@ def _analysed(instrument: Instrument, gain: float = 4.0) -> tuple[DetectionResul
     config = _configured("background.method=sliding", gain=gain)
     said: list[str] = []
     camera = camera_from_config(config.camera, (SHAPE[1], SHAPE[2]), movie.dtype)
-    result = analyse_landings(movie, config, camera, tell=said.append, progress=lambda *_: None)
+    result = analyse_landings(movie, config, camera, warn=said.append, progress=lambda *_: None)
     return result, said
 
 
@@ -92,11 +92,11 @@ def test_rings_as_high_as_their_particle_are_none(instrument: Instrument) -> Non
     )
     movie = InstrumentMovie(instrument, shape, landings, seed=SEED)
     config = _configured("background.method=fixed", f"background.frames=[0,{bound}]")
-    scene = make_scene(config, shape[1:])
+    context = make_context(config, shape[1:])
     camera = camera_from_config(config.camera, shape[1:], movie.dtype)
     windows = measure_windows(movie, camera, (0, bound), (bound, shape[0]))
     with ThreadPoolExecutor(1) as pool:
-        events, _ = fit_field(scene, windows, pool=pool)
+        events, _ = fit_field(context, windows, pool=pool)
     kept = [e.candidate for e in events if "sidelobe" not in e.flags]
     for x, y in zip(landings.x_px, landings.y_px, strict=True):
         assert sum(np.hypot(k.x_px - x, k.y_px - y) < 3 for k in kept) == 1, (x, y)

@@ -53,7 +53,7 @@ def _config(*, follows: bool) -> Config:
 def _learned(*, follows: bool) -> tuple[Config, list[str]]:
     movie, config, said = _movie(), _config(follows=follows), []
     camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
-    return learn_optics(movie, config, camera, tell=said.append)[0], said
+    return learn_optics(movie, config, camera, warn=said.append)[0], said
 
 
 def test_optics_are_learned_with_the_motion_divided_out() -> None:
@@ -63,7 +63,7 @@ def test_optics_are_learned_with_the_motion_divided_out() -> None:
     k = learned.optics.covariance.names.index("na")
     assert abs(learned.optics.na - NA) < SIGMAS * np.sqrt(learned.optics.covariance.matrix[k][k])
     camera = camera_from_config(learned.camera, SHAPE[1:], _movie().dtype)
-    found = analyse_landings(_movie(), learned, camera, tell=said.append, progress=lambda *_: None)
+    found = analyse_landings(_movie(), learned, camera, warn=said.append, progress=lambda *_: None)
     good = found.fits["status"] == "ok"
     assert good.sum() >= len(LANDINGS.frame) - 3
     assert good.sum() >= len(found.fits) - 4
@@ -74,7 +74,7 @@ def test_a_stage_that_shakes_is_named_with_what_to_do() -> None:
     assert learned.optics.calibrate == "auto"
     camera = camera_from_config(learned.camera, SHAPE[1:], _movie().dtype)
     said: list[str] = []
-    analyse_landings(_movie(), learned, camera, tell=said.append, progress=lambda *_: None)
+    analyse_landings(_movie(), learned, camera, warn=said.append, progress=lambda *_: None)
     (line,) = (text for text in said if "shakes" in text)
     assert "the gain is not the cause" in line
     assert "set background.drift_correction = true" in line

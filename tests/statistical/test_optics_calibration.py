@@ -16,8 +16,8 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.learner import Measured, build_microscope, maximise, settings_of
 from iscat_analysis.instrument.learner.estimate import optics_limits
 from iscat_analysis.instrument.learner.measure import HELD_OUT_P, _Search, measure_microscope
-from iscat_analysis.instrument.learner.starts import average_sights
-from iscat_analysis.instrument.microscope import calibrate_sights, goodness
+from iscat_analysis.instrument.learner.starts import average_particle_images
+from iscat_analysis.instrument.microscope import calibrate_particle_images, goodness
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 
@@ -67,7 +67,7 @@ def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None
     def build(settings: Mapping[str, Any]) -> ForwardModel:
         return build_microscope(config, reach, settings)
 
-    _, placed = average_sights(sights)
+    _, placed = average_particle_images(sights)
     assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
     found = measure_microscope(
         sights, settings_of(config), build,
@@ -140,7 +140,7 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
 def test_too_few_particles_are_refused_with_what_to_record() -> None:
     sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        calibrate_sights(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
+        calibrate_particle_images(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
 
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
@@ -179,12 +179,12 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
         )
         for s in sights
     ]
-    found = calibrate_sights(stretched, (), larger, ROUND, {"movie": "m.tif"})
+    found = calibrate_particle_images(stretched, (), larger, ROUND, {"movie": "m.tif"})
     assert isinstance(found, OpticsCalibration)
     (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
     guess = float(note.partition("pixels of about ")[2].split()[0])
     assert guess == pytest.approx(pixel, rel=0.02)
-    fine = calibrate_sights(sights, (), said, ROUND, {"movie": "m.tif"})
+    fine = calibrate_particle_images(sights, (), said, ROUND, {"movie": "m.tif"})
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 

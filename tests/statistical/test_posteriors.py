@@ -70,7 +70,7 @@ def _sampled(experiment: Setting, truth: FloatArray, trial: int) -> tuple[Poster
 
 def test_a_height_between_two_fringes_has_two_peaks() -> None:
     experiment = setting("iscat", "localize", photons=150.0, z_nm=500.0, fit=SMALL)
-    fringe = experiment.scene.model.fringe_nm
+    fringe = experiment.context.model.fringe_nm
     for trial in range(100):
         random = trial_generator(SEED, 3, trial)
         likelihood = experiment.likelihood(experiment.draw(experiment.truth, random))

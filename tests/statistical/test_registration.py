@@ -12,7 +12,7 @@ from skimage.registration import phase_cross_correlation
 from iscat_analysis._kernels.scoring import CONDITIONAL
 from iscat_analysis.camera.drift import measure_drift
 from iscat_analysis.instrument.learner.particle_images import ParticleImage
-from iscat_analysis.instrument.learner.starts import average_sights
+from iscat_analysis.instrument.learner.starts import average_particle_images
 from iscat_analysis.optics.forward import PixelGrid
 
 FloatArray = NDArray[np.float64]
@@ -56,7 +56,9 @@ def misplaced(seed: int, snr: float, neighbour: float, number: int = 12) -> Floa
         *(picture(random, snr, neighbour if k else 0.0) for k in range(number)), strict=True
     )
     first = (places[0], *first[1:])
-    placed = average_sights([sight(c, f) for c, f in zip(contrasts, first, strict=True)])[1]
+    placed = average_particle_images([sight(c, f) for c, f in zip(contrasts, first, strict=True)])[
+        1
+    ]
     found = np.array([[one.y_nm, one.x_nm] for one in placed]) / PIXEL_NM
     apart = found - np.array(places)
     return np.hypot(*(apart - np.median(apart, axis=0)).T)

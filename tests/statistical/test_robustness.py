@@ -22,7 +22,7 @@ SAME = 1e-2
 def _data(experiment: Setting, truth: FloatArray, trial: int) -> tuple[Likelihood, Candidate]:
     random = trial_generator(SEED, 0, trial)
     likelihood = experiment.likelihood(experiment.draw(truth, random))
-    pixel = experiment.scene.pixel_nm
+    pixel = experiment.context.pixel_nm
     near = Candidate(truth[0] / pixel, truth[1] / pixel, truth[2], truth[3], 0.0)
     return likelihood, near
 
@@ -78,7 +78,7 @@ def test_contrast_of_either_sign(focus_nm: float) -> None:
 def _sign(focus_nm: float) -> float:
     """Sign of the peak contrast of this microscope."""
     plain = setting("iscat", "mass", optics={"focus_nm": focus_nm}, calibration=None)
-    return float(np.sign(plain.scene.model.peak_contrast(*(float(v) for v in plain.truth[2:]))))
+    return float(np.sign(plain.context.model.peak_contrast(*(float(v) for v in plain.truth[2:]))))
 
 
 @pytest.mark.parametrize("scheme", ["iscat", "cobri", "darkfield"])
@@ -104,7 +104,7 @@ def test_particles_at_the_edge_of_the_field(
     """The main job clips the region to the field; the particle then lies at its side."""
     whole = setting(scheme, mode)
     experiment = replace(whole, region=Region((0, 17), (0, 17)))
-    pixel = experiment.scene.pixel_nm
+    pixel = experiment.context.pixel_nm
     for trial in range(4):
         truth = np.array([corner[0] * pixel, corner[1] * pixel, *experiment.truth[2:]])
         likelihood, near = _data(experiment, truth, trial)

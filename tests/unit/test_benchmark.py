@@ -149,7 +149,7 @@ def test_fits_know_as_much_of_the_background_as_the_bounds(
         scheme, bounds={"n_before": n_before}, background={"method": method, "level_e": 2.0}
     )
     first = make_setting(config, "mass", collected=3000.0)
-    later = make_setting(config, "mass", collected=1000.0, scene=first.scene)
+    later = make_setting(config, "mass", collected=1000.0, context=first.context)
     for made in (first, later):
         likelihood = made.likelihood(made.draw(made.truth, None))
         theta = np.array([*made.truth[:3], likelihood.model.scale.amplitude(made.truth[3]), 0.0])
@@ -187,7 +187,7 @@ def test_baselines_are_exact_without_noise() -> None:
     made = setting("iscat", "mass")
     likelihood = made.likelihood(made.draw(made.truth, None))
     baselines = Baselines.calibrated(made)
-    pixel = made.scene.pixel_nm
+    pixel = made.context.pixel_nm
     start = Candidate(made.truth[0] / pixel, made.truth[1] / pixel, 5.0, made.truth[3], 0.0)
     gauss, peak = baselines.measure(likelihood, start)
     assert gauss[3] == pytest.approx(made.truth[3], rel=1e-6)

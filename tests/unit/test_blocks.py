@@ -301,18 +301,18 @@ def test_a_part_that_is_no_part_of_its_track_does_not_count() -> None:
 def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Give the rows and masses of a movie that is followed as one."""
     stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
-    scene = track_scene(config, (counts.shape[1], counts.shape[2]), len(counts))
+    context = track_scene(config, (counts.shape[1], counts.shape[2]), len(counts))
     with threads(2) as pool:
         moving = follow(
-            scene, stack, camera, (0, len(counts)),
+            context, stack, camera, (0, len(counts)),
             check=_unchecked, pool=pool, progress=lambda *_: None,
         )  # fmt: skip
     inside = moving.field.holds(moving.rows.theta)
     table = table_of_tracks(
-        moving_table(scene, moving, 0), moving.rows.track, inside, config.track.min_frames,
+        moving_table(context, moving, 0), moving.rows.track, inside, config.track.min_frames,
         parted=False,
     )  # fmt: skip
-    return table, common_masses(scene, moving)
+    return table, common_masses(context, moving)
 
 
 @pytest.mark.parametrize(
@@ -330,10 +330,10 @@ def test_frames_are_kept_as_they_are_stored_where_one_gain_is_theirs(
 ) -> None:
     counts = np.random.default_rng(1).integers(90, 110, (30, 24, 24)).astype(stored)
     camera = Camera(gain_e_per_adu=GAIN, offset_adu=offset)
-    scene = track_scene(_config(), (24, 24), len(counts))
+    context = track_scene(_config(), (24, 24), len(counts))
     electrons = camera.to_electrons(counts[4:])
     with threads(2) as pool:
-        field = load_field(scene, Stack(counts), camera, (4, 30), _unchecked, pool, _untold)
+        field = load_field(context, Stack(counts), camera, (4, 30), _unchecked, pool, _untold)
         total, totals = field.total_e, field.frame_totals
     assert field.exposures.counts.dtype == kept
     np.testing.assert_allclose(field.exposures.electrons(slice(None)), electrons, rtol=1e-6)

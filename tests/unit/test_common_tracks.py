@@ -16,7 +16,7 @@ from iscat_analysis.tracking.extension import extended
 from iscat_analysis.tracking.joint import common
 from iscat_analysis.tracking.joint.common import common_amplitudes, shared_errors, variances_left
 from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import settle
+from iscat_analysis.tracking.joint.joint_fit import fit_jointly
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Judged, Localizations
 from iscat_analysis.tracking.joint.track_coupling import Coupling
@@ -106,7 +106,7 @@ def test_common_mass_and_shared_errors_are_right(
     for _ in range(TRIALS):
         field = _field(model, rng.poisson(mean), pool)
         start = BackgroundEstimate(mean.mean(axis=0), np.ones(FRAMES))
-        rows, ground, done = settle(field, start, truth, follow_power=False)
+        rows, ground, done = fit_jointly(field, start, truth, follow_power=False)
         judged = field.judge(ground, rows)
         shared = shared_errors(field, ground, rows, judged)
         found = common_amplitudes(field, ground, rows, judged, done)

@@ -25,8 +25,8 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.regions import photons_scale
-from iscat_analysis.fitting.scene import make_scene
 
 SETTINGS: list[tuple[str, Any]] = [
     ("optics.na", 1.3),
@@ -330,11 +330,11 @@ def test_the_simulation_says_nothing_of_dark_field_masses() -> None:
     scales = []
     for photons in (1e3, 1e5):
         config = configure(dark, settings={"simulation.photons_per_pixel": photons})
-        scene = make_scene(config, (48, 48))
+        context = make_context(config, (48, 48))
         windows = SimpleNamespace(power_ratio=1.0, n_before=10)
-        scales.append(photons_scale(scene, windows))  # type: ignore[arg-type]
+        scales.append(photons_scale(context, windows))  # type: ignore[arg-type]
     assert scales[0] == scales[1] > 0
-    bare = make_scene(configure(dark, settings={"particle.photons_per_frame": None}), (48, 48))
+    bare = make_context(configure(dark, settings={"particle.photons_per_frame": None}), (48, 48))
     with pytest.raises(ConfigError, match=r"particle\.photons_per_frame is needed"):
         photons_scale(bare, windows)  # type: ignore[arg-type]
 

@@ -13,9 +13,9 @@ from scenes import Light, blank, make_config
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import FloodError
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.regions import field_likelihood, noise_cumulants, search_likelihood
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, Windows
 from iscat_analysis.search.templates import (
@@ -63,19 +63,19 @@ def _known(windows: Windows, level: float) -> Windows:
 
 def _alarms(config: Config, level: float, read_noise_e: float, *, lower: float = 1.0) -> int:
     """Count detections in `TRIALS` blank fields, of which one each is allowed."""
-    scene = make_scene(config, FIELD)
-    templates = replace(scene.templates, threshold=lower * scene.templates.threshold)
+    context = make_context(config, FIELD)
+    templates = replace(context.templates, threshold=lower * context.templates.threshold)
     rng = np.random.default_rng(SEED)
     alarms = 0
     for _ in range(TRIALS):
         windows = _windows(level, read_noise_e, rng)
         if config.background.method == "known":
             windows = _known(windows, level)
-        likelihood = search_likelihood(scene, windows, np.zeros(FIELD))
-        cumulants = noise_cumulants(scene, windows, likelihood)
+        likelihood = search_likelihood(context, windows, np.zeros(FIELD))
+        cumulants = noise_cumulants(context, windows, likelihood)
         alarms += len(
             find_particles(
-                likelihood, templates, config.detection, roi_px=scene.roi_px, cumulants=cumulants
+                likelihood, templates, config.detection, roi_px=context.roi_px, cumulants=cumulants
             )
         )
     return alarms
@@ -122,7 +122,9 @@ def test_a_threshold_too_low_is_noticed() -> None:
 
 def test_the_threshold_falls_with_the_alarms_allowed() -> None:
     heights = [
-        make_scene(make_config(detection={"false_alarms_per_movie": n}), FIELD).templates.threshold
+        make_context(
+            make_config(detection={"false_alarms_per_movie": n}), FIELD
+        ).templates.threshold
         for n in (0.01, 0.1, 1.0, 10.0)
     ]
     assert heights == sorted(heights, reverse=True)
@@ -131,7 +133,7 @@ def test_the_threshold_falls_with_the_alarms_allowed() -> None:
 
 def test_places_that_noise_makes_end_a_search_and_others_do_not() -> None:
     """However many they are: particles and their rings pass the threshold as well."""
-    templates = make_scene(make_config(), (256, 256)).templates
+    templates = make_context(make_config(), (256, 256)).templates
     wild, mild = ExcessNoise(8.0, "wild"), ExcessNoise(1.5, "mild")
     many = 2 * FLOOD
     with pytest.raises(FloodError, match=f"^{many} places in frames 0:9 pass .*: wild$"):
@@ -144,7 +146,7 @@ def test_places_that_noise_makes_end_a_search_and_others_do_not() -> None:
 def test_noise_passes_the_threshold_as_often_as_predicted() -> None:
     """A threshold lower by a factor is to noise what more noise is to the threshold."""
     config, ratio = make_config(), 1.5
-    predicted = TRIALS * make_scene(config, FIELD).templates.reached_by(ratio)
+    predicted = TRIALS * make_context(config, FIELD).templates.reached_by(ratio)
     found = _alarms(config, 4e5, 0.0, lower=1 / math.sqrt(ratio))
     assert abs(found - predicted) < SIGMAS * math.sqrt(predicted)
 
@@ -153,10 +155,12 @@ def test_the_ratio_is_of_unit_variance_on_noise() -> None:
     """A signal-to-noise ratio deserves its name at every height, read noise included."""
     for sections in ({}, JOINT):
         config = make_config(**sections)
-        scene = make_scene(config, FIELD)
+        context = make_context(config, FIELD)
         rng = np.random.default_rng(3)
         maps = [
-            signal_to_noise(field_likelihood(scene, _windows(1e4, 60.0, rng)), scene.templates)[0]
+            signal_to_noise(field_likelihood(context, _windows(1e4, 60.0, rng)), context.templates)[
+                0
+            ]
             for _ in range(12)
         ]
         inner = np.array(maps)[:, :, 16:-16, 16:-16]
@@ -170,25 +174,25 @@ def test_the_ratio_is_of_unit_variance_on_noise() -> None:
 
 def _found(
     config: Config, seed: int, *, explained: bool = False
-) -> tuple[Scene, Movie, tuple[Candidate, ...]]:
+) -> tuple[AnalysisContext, Movie, tuple[Candidate, ...]]:
     movie = Movie(config, seed=seed)
-    scene = make_scene(config, config.simulation.shape)
+    context = make_context(config, config.simulation.shape)
     windows = Light.of(movie, 200).draw(np.random.default_rng(seed))
     signal = None
     if explained:
-        grid = PixelGrid.region(*((0, n) for n in config.simulation.shape), scene.pixel_nm)
+        grid = PixelGrid.region(*((0, n) for n in config.simulation.shape), context.pixel_nm)
         signal = sum(
-            scene.wide.image(grid, p.x_px * 84.4, p.y_px * 84.4, p.z_nm, p.mass_kda)
+            context.wide.image(grid, p.x_px * 84.4, p.y_px * 84.4, p.z_nm, p.mass_kda)
             for p in movie.particles
         )
     found = find_particles(
-        field_likelihood(scene, windows),
-        scene.templates,
+        field_likelihood(context, windows),
+        context.templates,
         config.detection,
-        roi_px=scene.roi_px,
+        roi_px=context.roi_px,
         explained=signal,
     )
-    return scene, movie, found
+    return context, movie, found
 
 
 def _event(**event: Any) -> dict[str, Any]:
@@ -202,10 +206,10 @@ def _at(events: list[dict[str, Any]], **sections: Any) -> Config:
 
 def _fitted(config: Config, seed: int) -> list[Candidate]:
     """Search and fit in turns, as the job does."""
-    scene = make_scene(config, config.simulation.shape)
+    context = make_context(config, config.simulation.shape)
     windows = Light.of(Movie(config, seed=seed), 200).draw(np.random.default_rng(seed))
     with ThreadPoolExecutor(1) as pool:
-        return [e.candidate for e in fit_field(scene, windows, pool=pool)[0]]
+        return [e.candidate for e in fit_field(context, windows, pool=pool)[0]]
 
 
 @pytest.mark.parametrize("mass_kda", [300.0, 3000.0, 10000.0])
@@ -288,8 +292,8 @@ def test_polarity(polarity: str, mode: str) -> None:
         _event(frame=0, leave=200, x_px=20.0, y_px=52.0, mass_kda=2000.0),
     ]
     config = _at(events, detection={"polarity": polarity}, **sections)
-    scene, _, found = _found(config, 6)
-    darkens = scene.wide.peak_contrast(5.0, 2000.0) < 0
+    context, _, found = _found(config, 6)
+    darkens = context.wide.peak_contrast(5.0, 2000.0) < 0
     assert darkens
     landed = [c for c in found if math.hypot(c.x_px - 40.3, c.y_px - 31.8) < 1]
     left = [c for c in found if math.hypot(c.x_px - 20.0, c.y_px - 52.0) < 1]
@@ -310,14 +314,16 @@ def test_strongest_first() -> None:
 
 def test_masked_pixels_are_no_particles() -> None:
     config = _at([], detection={"false_alarms_per_movie": 1e-3})
-    scene = make_scene(config, config.simulation.shape)
+    context = make_context(config, config.simulation.shape)
     windows = Light.of(Movie(config, seed=1), 200).draw(np.random.default_rng(1))
     windows = blank(windows, np.random.default_rng(2))
     after, masked = windows.after_e.copy(), windows.masked.copy()
     after[30:33, 40:43] = 0.0
     masked[30:33, 40:43] = True
     windows = replace(windows, after_e=after, masked=masked)
-    likelihood = field_likelihood(scene, windows)
-    assert not find_particles(likelihood, scene.templates, config.detection, roi_px=scene.roi_px)
-    snr, _ = signal_to_noise(likelihood, scene.templates)
+    likelihood = field_likelihood(context, windows)
+    assert not find_particles(
+        likelihood, context.templates, config.detection, roi_px=context.roi_px
+    )
+    snr, _ = signal_to_noise(likelihood, context.templates)
     assert np.isfinite(snr).all()

@@ -29,7 +29,7 @@ def _found(
     config: Config, particles: list[tuple[float, float, float]], *, seen_through: Config
 ) -> FrameCandidates:
     """Search a frame with particles (x, y [pixels], mass), made through some optics."""
-    scene = track_scene(config, (SIDE, SIDE), 1000)
+    context = track_scene(config, (SIDE, SIDE), 1000)
     picture = track_scene(seen_through, (SIDE, SIDE), 1000).wide
     grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
     signal = sum(
@@ -39,8 +39,8 @@ def _found(
     level = np.full((SIDE, SIDE), LEVEL_E)
     counts = np.random.default_rng(1).poisson(level * (1 + signal))
     search = FrameFilter(
-        scene.templates, level, np.zeros_like(level), np.ones(level.shape, dtype=bool),
-        polarity=config.detection.sign, roi_px=scene.roi_px, cautious=False,
+        context.templates, level, np.zeros_like(level), np.ones(level.shape, dtype=bool),
+        polarity=config.detection.sign, roi_px=context.roi_px, cautious=False,
     )  # fmt: skip
     return search.find((counts - level)[None].astype(np.float32), np.ones(1), 0, [np.zeros((0, 3))])
 

@@ -11,7 +11,7 @@ from instruments import Instrument, InstrumentMovie, Pictures, draw_landings
 
 import iscat_analysis as ia
 from iscat_analysis.config import Uncertainty, configure
-from iscat_analysis.diagnosis.causes import bend_warning
+from iscat_analysis.diagnosis.causes import nonlinearity_warning
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.trust.systematic import systematic
@@ -57,15 +57,15 @@ def test_only_what_chance_does_not_hide_is_told() -> None:
     heavy = _table(5000.0, 10.0)
     assert re.match(
         r"1 particle, of up to 5000 kDa, is so heavy .* 4\.\d % too light",
-        bend_warning(scale, heavy),
+        nonlinearity_warning(scale, heavy),
     )
     shared = systematic(config, heavy, scale=scale)["mass_kda"]
     assert 0.04 < shared[1] / 5000 < 0.05
     assert shared[0] < 1.0
     for quiet in (_table(500.0, 10.0), _table(5000.0, 1e3), _table(5000.0, 10.0, "poor_fit")):
-        assert not bend_warning(scale, quiet)
+        assert not nonlinearity_warning(scale, quiet)
         assert not systematic(config, quiet, scale=scale)
-    assert not bend_warning(MassScale(), heavy)  # the absolute model has the square
+    assert not nonlinearity_warning(MassScale(), heavy)  # the absolute model has the square
 
 
 @pytest.mark.parametrize(("sigma_kda", "told", "warned"), [(6, 1, 1), (15, 1, 0), (70, 0, 0)])
@@ -77,7 +77,7 @@ def test_two_megadaltons_are_told_by_their_own_errors(
     off = systematic(configure(settings=SETTINGS), table, scale=scale)
     assert bool(off) == told
     assert not told or off["mass_kda"][1] == pytest.approx(33.0, rel=0.05)
-    assert bool(bend_warning(scale, table)) == warned
+    assert bool(nonlinearity_warning(scale, table)) == warned
 
 
 def test_a_movie_of_heavy_particles_says_so_and_nothing_of_its_noise() -> None:

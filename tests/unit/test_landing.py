@@ -98,7 +98,7 @@ def _run(counts: np.ndarray, config: Config | None = None, **options: Any) -> tu
     told: list[str] = []
     result = analyse_landings(
         Memory(counts), config or _config(), options.pop("camera", Camera(gain_e_per_adu=4.0)),
-        tell=told.append, progress=options.pop("progress", lambda *_: None), **options,
+        warn=told.append, progress=options.pop("progress", lambda *_: None), **options,
     )  # fmt: skip
     return result, told
 
@@ -172,7 +172,7 @@ def test_chunks_change_nothing_but_the_last_digits(
     config = _config("compute.memory_limit_mb=64")
     movie = Memory(np.tile(counts, (4, 1, 1)))
     cut = analyse_landings(
-        movie, config, Camera(gain_e_per_adu=4.0), tell=lambda _: None, progress=lambda *_: None
+        movie, config, Camera(gain_e_per_adu=4.0), warn=lambda _: None, progress=lambda *_: None
     )
     assert cut.summary["chunks"] > 1
     spans = sorted(set(movie.reads))
@@ -321,7 +321,7 @@ def test_stuck_and_dropped_frames_are_left_out(counts: np.ndarray) -> None:
     assert "100, 210" in line
     assert "left out" in line
     assert result.summary["frames_left_out"] == 2
-    spread = summary_of(result.scene, result.fits, result.compared, {})["power_spread"]
+    spread = summary_of(result.context, result.fits, result.compared, {})["power_spread"]
     assert 0.005 < spread < 0.02, "of the other frames, whose light has 1 % of noise"
 
 
@@ -510,7 +510,7 @@ def test_windows_that_do_not_fit_into_memory() -> None:
     )
     config = _config("compute.memory_limit_mb=64", "background.window_frames=5")
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
-        analyse_landings(large, config, Camera(), tell=lambda _: None, progress=lambda *_: None)
+        analyse_landings(large, config, Camera(), warn=lambda _: None, progress=lambda *_: None)
 
 
 @pytest.mark.parametrize(

@@ -43,7 +43,7 @@ def _learn(
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
-    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
     return learned == config, summary, said
 
 
@@ -105,7 +105,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
-    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
     assert learned == config
     assert (summary["median_p"] > REJECTED_P) == fits
     assert summary["tested"] == (11 if not fits else 5)
@@ -160,7 +160,7 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
     )
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
-    learned, summary = learn_optics(MOVIE, config, camera, tell=said.append)
+    learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
     phase = learned.optics.reference_phase_deg
     assert summary["calibrated"]
     assert abs(learned.optics.focus_nm - focus_nm) < 50
@@ -196,7 +196,7 @@ def test_always_is_told_where_nothing_is_learned_from_such_movies(
     for calibrate in ("always", "auto"):
         config = ia.configure(settings={"optics.calibrate": calibrate, **settings})
         said: list[str] = []
-        assert learn_optics(MOVIE, config, camera, tell=said.append) == (config, {})
+        assert learn_optics(MOVIE, config, camera, warn=said.append) == (config, {})
         assert len(said) == (calibrate == "always")
         assert not said or reason in said[0]
 
@@ -238,7 +238,7 @@ def test_neither_rings_of_neighbours_nor_the_gain_condemn_the_optics(
     camera = camera_from_config(unsaturated.camera, grid.shape, counts.dtype)
     said: list[str] = []
     movie: Any = Stack(counts)
-    _, summary = learn_optics(movie, unsaturated, camera, tell=said.append)
+    _, summary = learn_optics(movie, unsaturated, camera, warn=said.append)
     assert summary["tested"] == 6
     assert summary["calibrated"] is False
     assert len(said) == bool(said_first)
@@ -257,9 +257,9 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
-    assert learn_optics(MOVIE, free, camera, tell=said.append) == (free, {})
+    assert learn_optics(MOVIE, free, camera, warn=said.append) == (free, {})
     assert not said
-    learn_optics(MOVIE, config, camera, tell=said.append)  # the control: one height for all
+    learn_optics(MOVIE, config, camera, warn=said.append)  # the control: one height for all
     assert len(said) == 1
 
 
@@ -279,7 +279,7 @@ def test_edges_of_a_pattern_that_moved_are_not_learned_from(moved_px: float, why
     said: list[str] = []
     movie: Any = Stack(counts)
     _, summary = learn_optics(
-        movie, unsaturated, camera_from_config(camera, (64, 64), counts.dtype), tell=said.append
+        movie, unsaturated, camera_from_config(camera, (64, 64), counts.dtype), warn=said.append
     )
     assert not summary["calibrated"]
     assert len(said) == 1

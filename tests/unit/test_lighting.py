@@ -13,7 +13,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lighting import Surface, find_surface
 from iscat_analysis.camera.lines import Lines
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.study.simulate import Movie
 
@@ -190,9 +190,9 @@ def test_a_pattern_that_moves_is_not_taken_for_light(grain_px: float) -> None:
 
 def test_what_is_left_of_a_particle_is_foreseen() -> None:
     """The polynomial takes a part of its light; frames say the same as the model."""
-    scene = make_scene(make_config(), SHAPE)
+    context = make_context(make_config(), SHAPE)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
-    signal = scene.wide.image(grid, 9 * PIXEL_NM, 7 * PIXEL_NM, 5.0, 1000.0)
+    signal = context.wide.image(grid, 9 * PIXEL_NM, 7 * PIXEL_NM, 5.0, 1000.0)
     lines = Lines(_light(), (0.0, 0.0), Surface(_light(), 10))
     changed = 1 + 0.01 * X * Y
     frames = _light() * changed * np.stack([np.ones(SHAPE), 1 + signal])

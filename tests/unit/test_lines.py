@@ -12,7 +12,7 @@ from scenes import PIXEL_NM, Stack, make_config
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 
 Array = NDArray[np.float64]
@@ -79,9 +79,9 @@ def test_what_is_left_of_a_particle_is_foreseen() -> None:
 
     That of an ideal spot; this one is cut by the height, and a third larger or smaller.
     """
-    scene = make_scene(make_config(), SHAPE)
+    context = make_context(make_config(), SHAPE)
     grid = PixelGrid.region((0, SHAPE[0]), (0, SHAPE[1]), PIXEL_NM)
-    signal = scene.wide.image(grid, 30 * PIXEL_NM, 24 * PIXEL_NM, 5.0, 1000.0)
+    signal = context.wide.image(grid, 30 * PIXEL_NM, 24 * PIXEL_NM, 5.0, 1000.0)
     lines = Lines(_light(), (0.3, 0.0))
     left = lines.left(signal)
     rng = np.random.default_rng(4)
@@ -91,7 +91,7 @@ def test_what_is_left_of_a_particle_is_foreseen() -> None:
     gained = np.average(1 + signal, weights=_light())
     np.testing.assert_allclose(after / before * gained - 1, left, atol=1e-6)
     peak = np.unravel_index(int(np.abs(signal).argmax()), SHAPE)
-    optics = scene.model.optics
+    optics = context.model.optics
     spot = 2 * optics.wavelength_nm / (math.pi * optics.na * SHAPE[1] * PIXEL_NM)
     taken = 1 - left[peak] / signal[peak]
     weight = _light()[peak[0]]

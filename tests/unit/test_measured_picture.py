@@ -14,7 +14,11 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.instrument.learner import ParticleImage
-from iscat_analysis.instrument.learner.measured_picture import fit_own, fit_picture, place_sights
+from iscat_analysis.instrument.learner.measured_picture import (
+    fit_own,
+    fit_picture,
+    place_particle_images,
+)
 from iscat_analysis.instrument.microscope import goodness
 from iscat_analysis.optics.forward import (
     ForwardModel,
@@ -108,7 +112,7 @@ def test_a_template_describes_what_the_model_does_not() -> None:
     rng = np.random.default_rng(5)
     size = 8e-3 / peak_per_amplitude(truth)
     masses = size * rng.choice([0.5, 1.0, 1.5], 44)
-    sights = place_sights(_sights(truth, masses, 6), nominal)
+    sights = place_particle_images(_sights(truth, masses, 6), nominal)
     made, held = sights[:30], sights[30:]
     found = fit_picture(made, nominal, roi_nm=ROI, step_nm=_step(), level=False)
     assert found.template.sights == 30

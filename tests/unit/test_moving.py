@@ -32,9 +32,9 @@ from iscat_analysis.tracking.extension import extended
 from iscat_analysis.tracking.frame_search import gaps, link
 from iscat_analysis.tracking.joint import frame_fits
 from iscat_analysis.tracking.joint import joint_fit as settling
-from iscat_analysis.tracking.joint.ascent import climb, log_likelihood
+from iscat_analysis.tracking.joint.ascent import ascend, log_likelihood
 from iscat_analysis.tracking.joint.exposures import Exposures
-from iscat_analysis.tracking.joint.joint_fit import first_background, settle
+from iscat_analysis.tracking.joint.joint_fit import first_background, fit_jointly
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.joint.newton import Response
@@ -165,14 +165,14 @@ def test_particles_that_hardly_move_end_at_the_maximum(
     field = _field(counts, pool)
 
     def height(by: float) -> float:
-        rows, found, _ = settle(field, ground, _stretched(truth, by), follow_power=True)
+        rows, found, _ = fit_jointly(field, ground, _stretched(truth, by), follow_power=True)
         return log_likelihood(field, found, rows)
 
     starts = (0.7, 1.0, 1.4)
     ends = [height(by) for by in starts]
     assert np.ptp(ends) < 2
     assert min(ends) > log_likelihood(field, ground, truth)
-    rows, found, _ = climb(field, ground, truth, follow_power=True)
+    rows, found, _ = ascend(field, ground, truth, follow_power=True)
     assert abs(log_likelihood(field, found, rows) - ends[1]) < 2
     monkeypatch.setattr(settling, "AMPLIFIED", np.inf)
     assert min(height(by) for by in starts) < min(ends) - 5
@@ -193,7 +193,7 @@ def test_background_takes_nothing_of_particles(
     field = _field(counts, pool)
     start = first_background(field, follow_power=True)
     over_median, _, _ = field.fit(start, truth)
-    rows, found, done = settle(field, start, truth, follow_power=True)
+    rows, found, done = fit_jointly(field, start, truth, follow_power=True)
     taken = 1 - over_median.theta[:, 3] / truth.theta[:, 3]
     left = rows.theta[:, 3] / truth.theta[:, 3] - 1
     assert done.all()
@@ -207,7 +207,7 @@ def test_fixed_point_is_the_maximum_of_the_multinomial(pool: ThreadPoolExecutor)
     counts, _, truth = _movie(_paths(40.0), noise=True)
     field = _field(counts, pool)
     start = first_background(field, follow_power=True)
-    rows, ground, _ = settle(field, start, truth, follow_power=True)
+    rows, ground, _ = fit_jointly(field, start, truth, follow_power=True)
     for _ in range(3):  # beyond what is asked of it
         rows, found, _ = field.fit(ground, rows)
         ground = BackgroundEstimate(found.level, ground.power)

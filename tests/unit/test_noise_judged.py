@@ -15,7 +15,7 @@ from wanderers import wander
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import Noise, judge_beside
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.regions import SATURATION_NM
@@ -99,14 +99,14 @@ def test_a_wrong_gain_is_named(way: str, wandering: Counts) -> None:
 def test_particles_that_go_everywhere_leave_nothing_to_judge(wandering: Counts) -> None:
     """Their motion alone would be taken for noise; where none comes near, it is judged."""
     config = _config("track", TOO_LARGE * GAIN)
-    scene, used = make_scene(config, SHAPE), np.ones(SHAPE, dtype=bool)
+    context, used = make_context(config, SHAPE), np.ones(SHAPE, dtype=bool)
     camera = camera_from_config(config.camera, SHAPE, np.uint16)
     frame = np.repeat(np.arange(60), 20)
     everywhere = np.random.default_rng(1).uniform(0, 40 * PIXEL_NM, (frame.size, 2))
     with open_stack(wandering) as movie:
         said = [
             judge_beside(
-                scene, movie, camera, (0, 60), (frame, places), used,
+                context, movie, camera, (0, 60), (frame, places), used,
                 lambda count: camera.to_electrons(wandering[:count]),
             ).messages
             for places in (everywhere, everywhere + 1e5)

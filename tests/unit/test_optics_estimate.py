@@ -22,7 +22,7 @@ from iscat_analysis.instrument.learner import (
     with_settings,
 )
 from iscat_analysis.instrument.learner.estimate import _Point, _walls
-from iscat_analysis.instrument.learner.starts import average_sights, search_starts
+from iscat_analysis.instrument.learner.starts import average_particle_images, search_starts
 from iscat_analysis.optics.grid import PixelGrid
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
@@ -124,7 +124,7 @@ def test_a_particle_beyond_its_wall_does_not_keep_the_others_from_converging() -
 def test_the_average_of_shifted_pictures() -> None:
     sights, truth, _ = make_sights({}, 6, seed=7)
     jolted = [replace(s, x_nm=s.x_nm + 90.0, y_nm=s.y_nm - 60.0) for s in sights]
-    (average,), placed = average_sights(jolted)
+    (average,), placed = average_particle_images(jolted)
     assert average.grid.shape == GRID.shape
     found = np.array([(s.x_nm, s.y_nm) for s in placed])
     true = np.array([(s.x_nm, s.y_nm) for s in truth])
@@ -135,7 +135,7 @@ def test_the_average_of_shifted_pictures() -> None:
 def test_every_focus_is_tried() -> None:
     """A start 600 nm from the truth is not needed: the coarse search finds its neighbourhood."""
     sights, _, build = make_sights({"focus_nm": 310.0, "reference_phase_deg": 40.0}, 6, seed=8)
-    averages, _ = average_sights(sights)
+    averages, _ = average_particle_images(sights)
     now = settings_of(configuration())
     candidates = [{**now, "focus_nm": f} for f in np.arange(-1000.0, 1000.0, 80.0)]
     best = search_starts(averages, build, candidates, most=2)[0]

@@ -39,7 +39,7 @@ class Movie:
         return self.counts[start:stop].copy()
 
 
-def scene(rng: np.random.Generator, level: float = 1e4, contrast: float = 0.15) -> NDArray[Any]:
+def context(rng: np.random.Generator, level: float = 1e4, contrast: float = 0.15) -> NDArray[Any]:
     speckle = gaussian_filter(rng.standard_normal(SHAPE), 2)
     return level * (1 + contrast * speckle / speckle.std())
 
@@ -75,7 +75,7 @@ def test_a_dark_and_a_movie_give_the_camera() -> None:
     pulls = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(seed)
-        light = scene(rng)
+        light = context(rng)
         found = measure_camera([record(light, 120, rng)], dark=record(0 * light, 80, rng))
         pulls.append(
             [
@@ -92,7 +92,7 @@ def test_a_flickering_laser_gives_the_offset_without_a_dark() -> None:
     pulls = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(100 + seed)
-        found = measure_camera([record(scene(rng), 200, rng, power=0.05, read_e=60.0)])
+        found = measure_camera([record(context(rng), 200, rng, power=0.05, read_e=60.0)])
         assert found.offset_from == "flicker"
         truth = math.hypot(60.0, GAIN / math.sqrt(12))
         pulls.append(
@@ -109,7 +109,7 @@ def test_levels_of_one_scene_give_the_offset() -> None:
     pulls = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(200 + seed)
-        light = scene(rng)
+        light = context(rng)
         stacks = [record(f * light, 60, rng, power=0.0) for f in (0.2, 0.6, 1.0)]
         found = measure_camera(stacks)
         assert found.offset_from == "flicker"
@@ -121,7 +121,7 @@ def test_a_steady_laser_leaves_only_where_the_line_ends() -> None:
     pulls = []
     for seed in range(SEEDS):
         rng = np.random.default_rng(300 + seed)
-        found = measure_camera([record(scene(rng), 200, rng, power=0.0)])
+        found = measure_camera([record(context(rng), 200, rng, power=0.0)])
         assert found.offset_from == "line"
         assert found.read_noise_e is None
         assert any("cannot be told apart" in note for note in found.notes)
@@ -132,7 +132,7 @@ def test_a_steady_laser_leaves_only_where_the_line_ends() -> None:
 
 def test_control_without_power_normalisation_the_gain_is_wrong() -> None:
     rng = np.random.default_rng(1)
-    movie = record(scene(rng), 200, rng, power=0.05)
+    movie = record(context(rng), 200, rng, power=0.05)
     counts = movie.counts.astype(float)
     mean, variance = counts.mean(axis=0).ravel(), counts.var(axis=0, ddof=1).ravel()
     naive = float(mean.mean() - OFFSET) / float(variance.mean())
@@ -144,7 +144,7 @@ def test_control_without_power_normalisation_the_gain_is_wrong() -> None:
 
 def test_small_read_noise_has_an_upper_limit() -> None:
     rng = np.random.default_rng(2)
-    found = measure_camera([record(scene(rng), 200, rng, power=0.05, read_e=1.0)])
+    found = measure_camera([record(context(rng), 200, rng, power=0.05, read_e=1.0)])
     assert found.read_noise_e is None
     assert found.read_noise_below_e is not None
     assert math.hypot(1.0, GAIN / math.sqrt(12)) < found.read_noise_below_e < 50
@@ -174,7 +174,7 @@ def test_a_dark_alone_gives_counts_only() -> None:
 
 def with_noise(rng: np.random.Generator, kind: str, frames: int = 160) -> Movie:
     """Record with pixels that leak into their neighbours, or rows or columns that flicker."""
-    light = np.broadcast_to(scene(rng), (frames, *SHAPE))
+    light = np.broadcast_to(context(rng), (frames, *SHAPE))
     electrons = rng.poisson(light).astype(float)
     if kind == "leaky":
         kernel = (0.1, 0.8, 0.1)
@@ -215,7 +215,7 @@ def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
         found = []
         for seed in range(SEEDS):
             rng = np.random.default_rng(seed)
-            light = scene(rng, level=2e4) * np.where(third, 2e-4, 1.0)
+            light = context(rng, level=2e4) * np.where(third, 2e-4, 1.0)
             electrons = rng.poisson(light, (160, *SHAPE)) + 5 * rng.standard_normal((160, *SHAPE))
             counts = np.clip(np.rint(electrons / GAIN), 0, 65535).astype(np.uint16)
             calibration = measure_camera([Movie(counts)])
@@ -233,14 +233,14 @@ def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_dark_that_reaches_zero_is_noticed() -> None:
     rng = np.random.default_rng(1)
     dark = Movie(np.clip(np.rint(3 * rng.standard_normal((60, *SHAPE))), 0, 9).astype(np.uint16))
-    light = record(scene(rng), 60, rng)
+    light = record(context(rng), 60, rng)
     notes = measure_camera([light], dark=dark).notes
     assert any("reach zero counts" in note for note in notes)
 
 
 def test_bad_pixels_are_left_out_and_reported() -> None:
     rng = np.random.default_rng(5)
-    movie = record(scene(rng), 100, rng)
+    movie = record(context(rng), 100, rng)
     movie.counts[50, 10, 11] = 65535
     movie.counts[:, 20, 21] = 100
     movie.counts[::4, 30, 31] += 4000
@@ -278,7 +278,7 @@ def verdict_of(movie: Movie) -> CameraCalibration:
 
 def test_noise_falls_as_shot_noise_does() -> None:
     rng = np.random.default_rng(7)
-    found = verdict_of(record(scene(rng), 512, rng, read_e=5.0))
+    found = verdict_of(record(context(rng), 512, rng, read_e=5.0))
     noise = found.noise
     assert found.shot_limited_frames == noise["n_frames"].max() == 256
     assert np.all(np.abs(noise["excess"] - 1) < 5 * noise["excess_se"] + 0.01)
@@ -289,7 +289,7 @@ def test_noise_falls_as_shot_noise_does() -> None:
 
 def test_drift_ends_the_shot_noise_limit() -> None:
     rng = np.random.default_rng(8)
-    light = scene(rng)
+    light = context(rng)
     counts = np.concatenate(
         [record(np.roll(light, k // 64, axis=1), 1, rng, read_e=5.0).counts for k in range(512)]
     )
@@ -302,7 +302,7 @@ def test_drift_ends_the_shot_noise_limit() -> None:
 
 def test_read_noise_ends_it_at_once() -> None:
     rng = np.random.default_rng(9)
-    light = scene(rng, level=500.0)
+    light = context(rng, level=500.0)
     found = measure_camera(
         [record(light, 128, rng, read_e=30.0)], dark=record(0 * light, 64, rng, read_e=30.0)
     )
@@ -312,7 +312,7 @@ def test_read_noise_ends_it_at_once() -> None:
 
 def test_a_curved_transfer_is_noticed() -> None:
     rng = np.random.default_rng(10)
-    light = scene(rng, contrast=0.3)
+    light = context(rng, contrast=0.3)
     movie = record(light, 300, rng, power=0.0)
     bent = movie.counts * (1 - movie.counts / 16000.0)
     found = measure_camera([Movie(bent.astype(np.float32))])
@@ -330,14 +330,14 @@ def test_a_curved_transfer_is_noticed() -> None:
 )
 def test_what_is_no_raw_movie_is_refused(change: Any, message: str) -> None:
     rng = np.random.default_rng(11)
-    movie = record(scene(rng), 16, rng)
+    movie = record(context(rng), 16, rng)
     with pytest.raises(DataError, match=message):
         measure_camera([Movie(change(movie.counts))])
 
 
 def test_dropped_and_stuck_frames_are_left_out() -> None:
     rng = np.random.default_rng(13)
-    good = record(scene(rng), 200, rng).counts
+    good = record(context(rng), 200, rng).counts
     harmed = good.copy()
     harmed[50:52] = 0
     harmed[120:140] = harmed[119]
@@ -357,14 +357,14 @@ def test_dropped_and_stuck_frames_are_left_out() -> None:
 
 def test_hardly_any_frame_differs() -> None:
     rng = np.random.default_rng(14)
-    few = record(scene(rng), 5, rng).counts
+    few = record(context(rng), 5, rng).counts
     with pytest.raises(DataError, match=r"movie.tif: only 5 of 20 frames are neither zero"):
         measure_camera([Movie(np.repeat(few, 4, axis=0))])
 
 
 def test_stacks_must_agree_in_shape() -> None:
     rng = np.random.default_rng(12)
-    movie = record(scene(rng), 16, rng)
+    movie = record(context(rng), 16, rng)
     other = Movie(movie.counts[:, :40], "dark.tif")
     with pytest.raises(DataError, match=r"dark.tif: is 40 x 48 pixels but movie.tif is 48 x 48"):
         measure_camera([movie], dark=other)
@@ -377,7 +377,7 @@ def reported_read_noise(truth_e: float, trials: int) -> NDArray[Any]:
     found = []
     for seed in range(trials):
         rng = np.random.default_rng(7000 + seed)
-        light = np.maximum(scene(rng), 0.0)
+        light = np.maximum(context(rng), 0.0)
         movie = record(light, 60, rng, power=0.0, read_e=truth_e)
         read = measure_camera([movie], offset_adu=OFFSET).read_noise_e
         if read is not None:

@@ -14,7 +14,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
-from iscat_analysis.executors import LocalExecutor, open_place
+from iscat_analysis.executors import LocalExecutor, open_executor
 from iscat_analysis.movie import open_stack
 from iscat_analysis.search.sliding.chunks import Reader
 from iscat_analysis.threads import allotted, threads
@@ -27,7 +27,7 @@ def _job(number: int, *, progress: object = None) -> int:
 
 
 def test_here_is_one_after_the_other() -> None:
-    with open_place() as place:
+    with open_executor() as place:
         assert isinstance(place, LocalExecutor)
         assert not place.distant
         assert list(place.each(lambda n: place.call(_job, n), [3, 4])) == [(0, 6), (1, 8)]
@@ -71,7 +71,7 @@ def test_a_cluster_needs_dask(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(ia.ConfigError, match=r'pip install "iscat-analysis\[dask\]"'),
-        open_place("tcp://127.0.0.1:1"),
+        open_executor("tcp://127.0.0.1:1"),
     ):
         pass
 

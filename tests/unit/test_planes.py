@@ -18,7 +18,7 @@ from scenes import Stack, make_config
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.causes import plane_warning
+from iscat_analysis.diagnosis.causes import fixed_height_warning
 from iscat_analysis.fitting.ranges import checked
 from iscat_analysis.study.simulate import Movie
 from iscat_analysis.tracking.held_height import held_height_warning
@@ -43,7 +43,7 @@ JOINT = make_config(fit={"mode": "track"}, track={"free": "joint"})
 
 
 def test_a_membrane_is_recognised() -> None:
-    said = plane_warning(JOINT, _table(0.0).sample(frac=1, random_state=3))
+    said = fixed_height_warning(JOINT, _table(0.0).sample(frac=1, random_state=3))
     assert 'set track.free = "mass" and particle.height_nm = 400' in said
     across, along = (float(part.split()[0]) for part in said.split(" by ")[1:3])
     assert across == pytest.approx(STEP_NM, rel=0.2)
@@ -53,15 +53,15 @@ def test_a_membrane_is_recognised() -> None:
 @pytest.mark.parametrize("along", [1.0, 0.15])
 def test_particles_that_move_along_z_are_none(along: float) -> None:
     """Near the coverslip they move less along z than along it."""
-    assert plane_warning(JOINT, _table(along)) == ""
+    assert fixed_height_warning(JOINT, _table(along)) == ""
 
 
 def test_nothing_is_said_where_little_is_known() -> None:
-    assert plane_warning(JOINT, _table(0.0, frames=12)) == ""
-    assert plane_warning(JOINT, _table(0.0).assign(status="poor_fit")) == ""
-    assert plane_warning(JOINT, _table(0.0).assign(frame=np.arange(120) * 2)) == ""
+    assert fixed_height_warning(JOINT, _table(0.0, frames=12)) == ""
+    assert fixed_height_warning(JOINT, _table(0.0).assign(status="poor_fit")) == ""
+    assert fixed_height_warning(JOINT, _table(0.0).assign(frame=np.arange(120) * 2)) == ""
     held = make_config(fit={"mode": "track"}, track={"free": "mass"})
-    assert plane_warning(held, _table(0.0)) == ""
+    assert fixed_height_warning(held, _table(0.0)) == ""
 
 
 MOVIE = {

@@ -408,12 +408,12 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
     mass = 150.0 + np.hypot(7.5, 2.0) * norm.ppf((np.arange(120) + 0.5) / 120)
     poor = {"status": "poor_fit", "flags": "poor_fit", "p_value": 1e-9}
     table = table.assign(mass_kda=mass, sigma_mass_kda=2.0, **poor)
-    scene = SimpleNamespace(config=SimpleNamespace(compute=SimpleNamespace(seed=1)))
-    (one,) = _across(scene, table, {"species": []})  # type: ignore[arg-type]
+    context = SimpleNamespace(config=SimpleNamespace(compute=SimpleNamespace(seed=1)))
+    (one,) = _across(context, table, {"species": []})  # type: ignore[arg-type]
     assert one["width_low"] < 7.5 < one["width_high"]
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
     fine = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
-    assert _across(scene, fine, {"species": []}) == []  # type: ignore[arg-type]
+    assert _across(context, fine, {"species": []}) == []  # type: ignore[arg-type]
 
 
 def test_a_long_movie_is_looked_at_in_as_many_windows_as_tell_its_noise() -> None:

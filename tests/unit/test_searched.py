@@ -89,7 +89,7 @@ def _analysed(counts: np.ndarray) -> tuple[Any, list[str]]:
     told: list[str] = []
     result = analyse_landings(
         _Memory(counts), _config(vesicle=True), Camera(gain_e_per_adu=4.0),
-        tell=told.append, progress=lambda *_: None,
+        warn=told.append, progress=lambda *_: None,
     )  # fmt: skip
     return result, told
 

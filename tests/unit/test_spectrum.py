@@ -15,8 +15,8 @@ from scipy.ndimage import convolve1d
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.regions import search_likelihood
-from iscat_analysis.fitting.scene import make_scene
 from iscat_analysis.records import Windows
 from iscat_analysis.search.templates import find_particles, signal_to_noise
 
@@ -147,15 +147,17 @@ def searched(request: pytest.FixtureRequest) -> tuple[Array, int, int]:
     """SNR maps of 40 blank fields, false alarms in them, and those of a filter that knows less."""
     config = make_config(detection=ONE)
     noise = _measured(**COLOURED[request.param])
-    white = make_scene(config, (SIDE, SIDE))
-    scene = make_scene(config, (SIDE, SIDE), noise=noise)
+    white = make_context(config, (SIDE, SIDE))
+    context = make_context(config, (SIDE, SIDE), noise=noise)
     maps, alarms = [], [0, 0]
     for seed in range(FIELDS):
         windows = _windows(_movie(100 + seed, frames=8, **COLOURED[request.param]))
-        likelihood = search_likelihood(scene, windows, np.zeros((SIDE, SIDE)))
-        maps.append(signal_to_noise(likelihood, scene.templates)[0][0])
-        for kind, one in enumerate((scene, white)):
-            found = find_particles(likelihood, one.templates, config.detection, roi_px=scene.roi_px)
+        likelihood = search_likelihood(context, windows, np.zeros((SIDE, SIDE)))
+        maps.append(signal_to_noise(likelihood, context.templates)[0][0])
+        for kind, one in enumerate((context, white)):
+            found = find_particles(
+                likelihood, one.templates, config.detection, roi_px=context.roi_px
+            )
             alarms[kind] += len(found)
     return np.array(maps), alarms[0], alarms[1]
 

@@ -219,7 +219,7 @@ def test_rounds_end_where_the_first_four_describe_nothing(
     monkeypatch.setattr(tracked_optics, "usable", lambda *_: (None, "not yet"))
     with ThreadPoolExecutor(1) as pool:
         config = Config.model_validate({"optics": {"calibrate": "auto"}})
-        _, summary = learn_from_tracks(config, begin, name="m", pool=pool, tell=told.append)
+        _, summary = learn_from_tracks(config, begin, name="m", pool=pool, warn=told.append)
     assert len(measured) == 2 * rounds  # of all particles, and of those that stand alone
     assert not summary["calibrated"]
     assert "other optics were not learned: not yet" in told[0]

@@ -19,7 +19,7 @@ from wanderers import SETTINGS, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.scene import make_scene
+from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline import analyse, fit_stack
@@ -108,8 +108,8 @@ def test_frames_share_the_noise_of_their_background(tmp_path: Path) -> None:
     _movie(tmp_path / "movie.tif")
     with open_stack(tmp_path / "movie.tif") as movie:
         table = analyse(movie, _config()).table
-    scene = make_scene(_config(), SHAPE)
-    correlation = mass_correlation(scene, table)
+    context = make_context(_config(), SHAPE)
+    correlation = mass_correlation(context, table)
     assert correlation is not None
     reach = np.array([0.0, 1.0, 150.0, 900.0])
     found = correlation(np.stack([reach, np.zeros(4)], axis=1))
@@ -120,7 +120,7 @@ def test_frames_share_the_noise_of_their_background(tmp_path: Path) -> None:
     assert abs(found[0, 2]) < share
     assert abs(found[0, 3]) < 0.2 * share
     known = make_config(background={"method": "known", "frames": None, "level_e": 1e5})
-    assert mass_correlation(replace(scene, config=known), table) is None
+    assert mass_correlation(replace(context, config=known), table) is None
 
 
 def test_films_show_what_the_fits_explain(tmp_path: Path) -> None:

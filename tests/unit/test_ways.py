@@ -19,9 +19,9 @@ from iscat_analysis.fitting.background_mode import (
     background_mode,
     describe_background_mode,
 )
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, remarks, standing_out
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.scene import Scene, make_scene
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import FIND, analyse
@@ -123,29 +123,29 @@ def test_frames_that_are_not_there_are_refused_alike(way: BackgroundMode, tmp_pa
         assert "has 100 frames, but fit.frames asks for 50:900" in str(refused.value)
 
 
-def _event() -> tuple[Scene, Event]:
+def _event() -> tuple[AnalysisContext, Event]:
     """Fit a particle at the first of `PLACES` to counts without noise."""
     config = _config("fixed")
-    scene = make_scene(config, (SIDE, SIDE))
+    context = make_context(config, (SIDE, SIDE))
     grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
     place = (PIXEL_NM * axis for axis in PLACES[0])
     before, none = np.full((SIDE, SIDE), 8e6), np.zeros((SIDE, SIDE))
     windows = Windows(
         before_e=before,
-        after_e=before * (1 + scene.wide.image(grid, *place, scene.model.height_nm, 480.0)),
+        after_e=before * (1 + context.wide.image(grid, *place, context.model.height_nm, 480.0)),
         n_before=40, n_after=40, power_ratio=1.0,
         read_variance_before_e2=none, read_variance_after_e2=none,
         masked=none > 0, saturated=none > 0,
         frames_before=(0, 40), frames_after=(40, 80), power=np.ones(80),
     )  # fmt: skip
     with ThreadPoolExecutor(1) as pool:
-        (event,) = fit_field(scene, windows, pool=pool)[0]
-    return scene, event
+        (event,) = fit_field(context, windows, pool=pool)[0]
+    return context, event
 
 
 def test_remarks_on_surroundings_are_put_in_order() -> None:
     """A saturated pixel beside the particle, and one too far away to matter."""
-    scene, event = _event()
+    context, event = _event()
     assert Status.SATURATED not in event.flags
     top, left = event.region.rows[0], event.region.columns[0]
     column, row = (round(axis) for axis in PLACES[0])
@@ -153,7 +153,7 @@ def test_remarks_on_surroundings_are_put_in_order() -> None:
         saturated = np.zeros(event.region.shape, dtype=bool)
         saturated[row + away - top, column - left] = True
         windows = replace(event.windows, saturated=saturated)
-        said = remarks(scene, event, windows, sidelobe=True, too_close=True)
+        said = remarks(context, event, windows, sidelobe=True, too_close=True)
         assert said[0] == Status.SIDELOBE
         assert Status.TOO_CLOSE in said
         assert (Status.SATURATED in said) is spoiled
@@ -211,11 +211,11 @@ def test_a_background_of_all_frames_is_their_mean_or_their_median(method: str) -
     assert len(found.tracks) == len(PLACES)
     assert (found.tracks["mass_kda"] < 480).all()  # of which a part is in the background
     camera = camera_from_config(config.camera, counts.shape[1:], counts.dtype)
-    scene = track_scene(config, counts.shape[1:], len(counts))
+    context = track_scene(config, counts.shape[1:], len(counts))
     with ThreadPoolExecutor(1) as pool:
         span = (0, len(counts))
         field = load_field(
-            scene, Stack(counts), camera, span, lambda *_: None, pool, lambda *_: None
+            context, Stack(counts), camera, span, lambda *_: None, pool, lambda *_: None
         )
         ground = opening_ground(config, field)
     light = counts * 8.0 / ground.power[:, None, None]

@@ -26,7 +26,7 @@ from iscat_analysis.instrument.learner.settings import (
     free_names,
     is_term,
 )
-from iscat_analysis.instrument.learner.starts import average_sights, with_masses
+from iscat_analysis.instrument.learner.starts import average_particle_images, with_masses
 from iscat_analysis.instrument.learner.states import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.threads import one_thread_algebra
@@ -166,7 +166,7 @@ class _Search:
 
     def run(self, sights: Sequence[ParticleImage]) -> Measured:
         if self.known is None:
-            best, held_out = self._best_state(*average_sights(sights))
+            best, held_out = self._best_state(*average_particle_images(sights))
         else:
             best, held_out = self._of_known_kind(sights, self.known)
         best, held_out = self._cleared(best, held_out)

@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.learner.particle_images import ParticleImage
-from iscat_analysis.instrument.learner.starts import average_sights
+from iscat_analysis.instrument.learner.starts import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude, with_template
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FloatArray, Mapper
@@ -149,9 +149,11 @@ def fit_own(sight: ParticleImage, model: ForwardModel, *, level: bool) -> Partic
     return sight.moved(found)
 
 
-def place_sights(sights: Sequence[ParticleImage], nominal: ForwardModel) -> list[ParticleImage]:
+def place_particle_images(
+    sights: Sequence[ParticleImage], nominal: ForwardModel
+) -> list[ParticleImage]:
     """Register pictures on their average, and say how much of it each shows."""
-    (average,), placed = average_sights(sights)
+    (average,), placed = average_particle_images(sights)
     scale = peak_per_amplitude(nominal)
     shown = average.data[0] / (average.data[1] - average.data[0]) - 1
     top = float(np.abs(shown).max())

@@ -51,7 +51,7 @@ class Start:
     explained: float
 
 
-def average_sights(
+def average_particle_images(
     sights: Sequence[ParticleImage],
 ) -> tuple[tuple[ParticleImage, ...], tuple[ParticleImage, ...]]:
     """Average the pictures of each focus, registered on each other, with the sign of each."""

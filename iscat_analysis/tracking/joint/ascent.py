@@ -27,7 +27,7 @@ _MOST_STEPS = 40
 _DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
 
 
-def climb(
+def ascend(
     field: MovingField, ground: BackgroundEstimate, rows: Localizations, *, follow_power: bool
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
     """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from iscat_analysis.medians import middle
 from iscat_analysis.records import BoolArray
-from iscat_analysis.tracking.joint.ascent import AMPLIFIED, climb
+from iscat_analysis.tracking.joint.ascent import AMPLIFIED, ascend
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 
@@ -47,7 +47,7 @@ def first_background(field: MovingField, *, follow_power: bool) -> BackgroundEst
     return BackgroundEstimate(np.maximum(level, 1e-3), power)
 
 
-def settle(
+def fit_jointly(
     field: MovingField,
     ground: BackgroundEstimate,
     rows: Localizations,
@@ -78,7 +78,7 @@ def settle(
         damping *= _STIFFER if length > last else _SOFTER if length < last / 2 else 1.0
         step = field.where_turns_end(move, damping)
         if not coarse and np.linalg.norm(step / sigma) > AMPLIFIED * length:
-            return climb(field, ground, rows, follow_power=follow_power)
+            return ascend(field, ground, rows, follow_power=follow_power)
         before, change = change, float(np.abs(step / sigma)[field.used].max(initial=0.0))
         level = np.where(field.used, ground.level * np.exp(step), found.level)
         ground = BackgroundEstimate(level, power)

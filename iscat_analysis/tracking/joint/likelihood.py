@@ -10,7 +10,7 @@ score with the background that is most likely given the particles,
 put in (envelope theorem), so that fitting the particles over B̂ and B̂ under the particles in turn
 ends at its maximum, and nothing is left of the particles in their background.  Turns alone converge
 as slowly as the particles move.  How the rows follow a change of the background is known from their
-informations, so that Newton's method sees where the turns would end (`settle`).
+informations, so that Newton's method sees where the turns would end (`fit_jointly`).
 """
 
 from __future__ import annotations

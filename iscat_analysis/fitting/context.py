@@ -31,7 +31,7 @@ _VARIANCE_OF_BACKGROUND = {
 
 
 @dataclass(frozen=True)
-class Scene:
+class AnalysisContext:
     """What a configuration fixes for every field of a movie: model, templates, scale."""
 
     config: Config
@@ -94,7 +94,7 @@ class Scene:
         return self.model.rho == 0
 
 
-def make_scene(
+def make_context(
     config: Config,
     field_px: tuple[int, int],
     *,
@@ -102,7 +102,7 @@ def make_scene(
     noise: NoiseSpectrum | None = None,
     lines: Lines | None = None,
     sliding: bool = False,
-) -> Scene:
+) -> AnalysisContext:
     """Build the models and the matched filter for a field."""
     pixel, roi_px = square_of(config, field_px)
     darkfield = config.optics.scheme == "darkfield"
@@ -125,7 +125,7 @@ def make_scene(
     moving = None
     if config.optics.focus_drift_nm:
         moving = MovingFocus(config, model), MovingFocus(config, wide)
-    return Scene(
+    return AnalysisContext(
         config=config,
         model=model,
         wide=wide,
@@ -174,9 +174,9 @@ def search_both(detection: Detection, *, searches: int = 1) -> Detection:
     return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
 
 
-def reported_steps(scene: Scene) -> int:
+def reported_steps(context: AnalysisContext) -> int:
     """Give which steps of a landing movie have the polarity that is reported."""
-    return scene.config.detection.sign * int(scene.templates.signs[0])
+    return context.config.detection.sign * int(context.templates.signs[0])
 
 
 def variance_of_background(config: Config) -> float:
