@@ -385,7 +385,18 @@ class Particle(Section):
         return USUAL_HEIGHT_NM if self.height_nm == "auto" else self.height_nm
 
     def held_at(self, height_nm: float) -> Particle:
-        """Give a particle whose height is known."""
+        """Give a particle whose height is known.
+
+        Parameters
+        ----------
+        height_nm : float
+            Above the coverslip [nm].
+
+        Returns
+        -------
+        Particle
+            Without a prior of heights.
+        """
         update = {
             "height_nm": height_nm, "linker_nm": 0.0, "height_sd_nm": 0.0,
             "learned_height_nm": None,

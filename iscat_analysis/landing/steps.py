@@ -147,7 +147,8 @@ class ChunkFitter:
         if core is not None and self._last is not None:
             self.searched = searched_shares(
                 self._chunk, core, steps, *self._last,
-                window=self._window, roi_px=self._roi_px, threshold=self._context.templates.threshold,
+                window=self._window, roi_px=self._roi_px,
+                threshold=self._context.templates.threshold,
             )  # fmt: skip
         self._last = None
         del maps  # fits need their memory
