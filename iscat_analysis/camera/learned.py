@@ -174,13 +174,16 @@ def _sample(
     """
     total = movie.shape[0]
     looks = np.unique(np.linspace(span[0], span[1] - 1, _LOOKS).astype(int)).tolist()
-    usual = float(np.quantile([movie.read(k, k + 1).mean() for k in looks], 0.75))
-    opening = movie.read(0, min(_FIRST, total))
+    levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
+    opening = _finite(movie.read(0, min(_FIRST, total)))
+    if not levels or not len(opening):
+        return opening, None
+    usual = float(np.quantile(levels, 0.75))
     means = opening.mean(axis=(1, 2))
     dim = (means < _DARK * usual) & (means > 0)
     dim &= means - means.min() < _LEAST * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
-    counts = movie.read(span[0], min(span[1], span[0] + most))
+    counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
     lit = counts.mean(axis=(1, 2)) > _DARK * usual
     repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
     counts = counts[lit & ~repeats]
@@ -188,6 +191,15 @@ def _sample(
         return counts, None
     dark = opening[dim]
     return counts, dark if _is_dark(dark, counts) else None
+
+
+def _finite(frames: NDArray[Any]) -> NDArray[Any]:
+    """Leave out frames that have a pixel without a number; they are refused, or left out, later.
+
+    Shapes: `frames` and result (t, y, x).
+    """
+    whole: NDArray[Any] = frames[np.isfinite(frames).all(axis=(1, 2))]
+    return whole
 
 
 def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:

@@ -128,9 +128,9 @@ def _bands(rows: int, columns: int) -> tuple[BoolArray, BoolArray]:
 def _spectrum(
     movie: FrameSource, camera: Camera, start: int, region: tuple[slice, slice]
 ) -> FloatArray | None:
-    """Give the power of the noise of two frames; None where they are dark or the same."""
+    """Give the power of the noise of two frames; None where they are dark, odd or the same."""
     counts = movie.read(start, start + 2)
-    if np.array_equal(counts[0], counts[1]):
+    if np.array_equal(counts[0], counts[1]) or not np.isfinite(counts).all():
         return None
     before, after = camera.to_electrons(counts)[(slice(None), *region)]
     powers = float(before.mean()), float(after.mean())

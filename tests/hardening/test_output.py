@@ -34,7 +34,7 @@ KILLS = 50
 """Runs that are killed, where all of the large tests are run."""
 
 SEED = 20_261_121
-REQUIRED = OUTPUT_NAMES - {"posterior.nc", "tracks.csv", "tracks.parquet"}
+REQUIRED = OUTPUT_NAMES - {"posterior.nc", "response.csv", "tracks.csv", "tracks.parquet"}
 SETUP = """
 [optics]
 na = 1.3
