@@ -31,7 +31,6 @@ FOCUS_STEP_NM = 80.0
 
 _FOCI = 7  # of a scan, whose averages are searched
 _ROUNDS = 3  # of registration
-_WINDOWS = 5  # standard deviations of the window of registration in a picture
 _PARTS = 20  # of a pixel, to which it is found
 _UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
 _TURNS = 24  # of half a circle of phases, for strong particles
@@ -126,20 +125,17 @@ def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
 
 
 def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> FloatArray:
-    """Shift of a picture from a template of either sign; the window about the last leaves others.
+    """Shift of a picture from a template of either sign; the last one, where it is far from that.
 
-    It pulls towards the last shift, and less in every round.
+    A window about the last shift would leave neighbours out, and the rings that tell aberrations.
     """
     from skimage.registration import phase_cross_correlation  # only the learner needs it
 
-    along = (
-        np.exp(-0.5 * ((np.arange(n) - (n - 1) / 2 - at) * _WINDOWS / n) ** 2)
-        for n, at in zip(contrast.shape, shift, strict=True)
-    )
     found, *_ = phase_cross_correlation(
-        template, contrast * np.outer(*along), normalization=None, upsample_factor=_PARTS
+        template, contrast, normalization=None, upsample_factor=_PARTS
     )
-    return np.asarray(-found)
+    near = np.abs(found + shift).max() <= _SHIFT_PX
+    return np.asarray(-found if near else shift)
 
 
 def with_masses(
