@@ -46,6 +46,7 @@ def _scan(seed: int, attenuation: float) -> tuple[Instrument, OpticsCalibration]
         settings={
             "optics.wavelength_nm": 525.0, "optics.na": 1.42, "optics.attenuation": attenuation,
             "optics.focus_nm": FOCI_NM[0] + 150.0, "camera.pixel_size_nm": PIXEL_NM,
+            "camera.gain_e_per_adu": 1.0,
             "fit.roi_nm": 2000.0, "compute.workers": 1,
             "particle.kind": "gold", "particle.diameter_nm": 20.0, "particle.height_nm": 10.0,
         }

@@ -282,7 +282,7 @@ def test_a_series_of_concentrations_has_its_equilibrium(finished: Path, capsys) 
     row = found.kd.iloc[0]
     assert _described(found)["kd"][0]["kd_nm"] == row["kd_nm"]
     assert (row["condition"], row["movies"], row["model"]) == ("pH 7", 3, "dimer")
-    assert row["kd_low"] < 2.0 < row["kd_high"] < 1.4 * row["kd_low"]
+    assert row["kd_low"] < 2.0 < row["kd_high"] < 2.3 * row["kd_low"]  # the exponent is free
     assert row["p_value"] > 1e-3
     page = found.page.read_text(encoding="utf-8")
     assert "K_D, pH 7" in page
