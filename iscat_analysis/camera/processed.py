@@ -30,6 +30,7 @@ _OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no
 _SIGNIFICANT = 6.0  # standard errors
 _UNEVEN = 0.1  # of the finest noise, by which it must change from frame to frame
 _WEAK, _STRONG = 0.5, 2.0  # finest noise over that at coarser patterns
+_MEDIAN_ERROR = 2.33  # √n times the relative error of a variance by the median deviation of n
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
 
 Kind = Literal["interpolated", "smoothed", "sharpened"]
@@ -102,9 +103,14 @@ def find_processing(movie: FrameSource, camera: Camera, span: tuple[int, int]) -
 
 
 def _uneven(values: FloatArray, chance: float) -> float:
-    """Say by how much of their mean values scatter beyond chance; 0 where that may be chance."""
-    excess = float(np.var(values / values.mean(), ddof=1)) - chance
-    significant = excess > _SIGNIFICANT * chance * math.sqrt(2 / (len(values) - 1))
+    """Say by how much of their median values scatter beyond chance; 0 where that may be chance.
+
+    Some that lie far off do not count, as of frames that are cut off.
+    """
+    middle = float(np.median(values))
+    scatter = _NORMAL * float(np.median(np.abs(values - middle))) / middle
+    excess = scatter**2 - chance
+    significant = excess > _SIGNIFICANT * chance * _MEDIAN_ERROR / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
 
 

@@ -49,6 +49,12 @@ def raw(
     return np.round(frames)
 
 
+def cut_off(counts: Movie) -> Movie:
+    """Lose half of every thirtieth frame."""
+    counts[::30, SIDE // 2 :] = 0
+    return counts
+
+
 def aligned(counts: Movie, px_per_frame: float) -> Movie:
     """Take a drift out by bilinear interpolation."""
     out = np.empty_like(counts[:, 1:, 1:])
@@ -84,6 +90,7 @@ def test_raw_counts_are_raw(seed: int, vibration_px: float) -> None:
         pytest.param(lambda counts: counts / counts.mean((1, 2), keepdims=True) * 250, id="power"),
         pytest.param(lambda counts: np.repeat(counts[::2], 2, axis=0), id="each frame twice"),
         pytest.param(lambda counts: np.roll(counts, 3, axis=2), id="whole pixels"),
+        pytest.param(cut_off, id="frames cut off"),
     ],
 )
 def test_what_leaves_the_noise_of_pixels_alone_is_no_processing(

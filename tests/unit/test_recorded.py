@@ -144,7 +144,7 @@ def test_settings_that_cannot_be_settings_are_refused(tmp_path: Path) -> None:
     _refused(tmp_path / "movie.bin", "does not say save/frame/shape")
     with (tmp_path / "movie_settings.dat").open("wb") as file:
         file.truncate(2**30)
-    _refused(tmp_path / "movie.bin", "too long for settings")
+    _refused(tmp_path / "movie.bin", "has 10000000 at most")
 
 
 def test_the_name_of_piscats_movies_tells_their_shape(tmp_path: Path) -> None:
