@@ -77,7 +77,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
 
 
 def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
-    """Put what the movie says of its optics in the place of defaults, which nobody gave."""
+    """Put what the movie says of its optics in the place of what is as by default."""
     found: dict[str, float] = {}
     notes = []
     for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
@@ -86,10 +86,13 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
         if read is None:
             continue
         where = f"in the movie's {metadata.source} metadata"
-        if key not in optics.model_fields_set:
+        if given == read:
+            continue
+        if given == type(optics).model_fields[key].default:
             found[key] = read
             notes.append(
-                f"the {words} is {read:g}{unit}, as {where}; optics.{key} would win over it"
+                f"the {words} is {read:g}{unit}, as {where}, and not {given:g}{unit}, which is "
+                f"the default of optics.{key}"
             )
         elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
             notes.append(
@@ -99,7 +102,7 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
     if not found:
         return optics, notes
     try:
-        return Optics(**{**optics.model_dump(exclude_unset=True), **found}), notes
+        return Optics(**{**optics.model_dump(), **found}), notes
     except ConfigError as error:
         raise DataError(
             f"the movie's {metadata.source} metadata do not suit the configuration: {error}"

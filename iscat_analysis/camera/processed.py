@@ -75,8 +75,13 @@ class Processing:
         return {"kind": self.kind, "finest": self.finest, "uneven": self.uneven}
 
 
-def find_processing(movie: FrameSource, camera: Camera, span: tuple[int, int]) -> Processing | None:
-    """Compare the noise of the finest patterns with that of coarser ones and between frames."""
+def find_processing(
+    movie: FrameSource, camera: Camera, span: tuple[int, int], *, moving: bool = False
+) -> Processing | None:
+    """Compare the noise of the finest patterns with that of coarser ones and between frames.
+
+    Where particles move, coarser patterns are of them, and do not tell what was smoothed.
+    """
     rows, columns = (_middle(length) for length in movie.shape[1:])
     fine, coarse = _bands(rows.stop - rows.start, columns.stop - columns.start)
     found = []
@@ -97,6 +102,8 @@ def find_processing(movie: FrameSource, camera: Camera, span: tuple[int, int]) -
     ratio = float(np.quantile(finest / coarser, _STILL))
     if uneven > _UNEVEN:
         return Processing("interpolated", ratio, uneven)
+    if moving:
+        return None
     if ratio < _WEAK:
         return Processing("smoothed", ratio, uneven)
     return Processing("sharpened", ratio, uneven) if ratio > _STRONG else None

@@ -74,10 +74,6 @@ def configure(
         if not settings and not arguments:
             return source
         values = source.model_dump(exclude_none=True)
-        given = source.optics.model_fields_set
-        for key in ("wavelength_nm", "na"):  # a default stays one: a movie may know better
-            if key not in given:
-                del values["optics"][key]
         where = "arguments" if called else "settings"
     elif source is None:
         values, where = {}, "configuration"

@@ -71,7 +71,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.warn(f"{movie.name}: {text}")
     if auto:
         run.notify(f"{movie.name}: {known.said}")
-    processing = find_processing(movie, camera, span)
+    processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
     stop = min(stop, start + _OPENING, movie.shape[0])

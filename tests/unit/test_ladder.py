@@ -165,7 +165,10 @@ def test_a_table_without_errors_or_snr_says_what_it_takes(oligomers: pd.DataFram
         oligomers["mass_kda"].abs().min(), rel=1e-4
     )
     assert bare.efficiency(oligomers["mass_kda"].abs()).min() == pytest.approx(1.0)
-    assert [word in " ".join(bare.notes) for word in ("errors", "lightest")] == [True, True]
+    assert [word in " ".join((*bare.notes, *bare.remarks)) for word in ("errors", "lightest")] == [
+        True,
+        True,
+    ]
     assert np.all(event_table(oligomers, sigma_kda=9.0).sigma_kda == 9.0)
     limited = event_table(oligomers, limit_kda=65.0, limit_sigma_kda=13.0).efficiency
     assert limited == EFFICIENCY
@@ -213,7 +216,7 @@ def test_impossible_options_are_refused(options: dict, said: str, oligomers) -> 
         ("mass_kda\nx\n", "no number"),
         ("mass_kda,status\n66,poor_fit\n", "status ok"),
         ("mass_kda\n66\n67\n", "too few"),
-        ("mass_kda,sigma_mass_kda\n66,0\n", "a mass and an error"),
+        ("mass_kda,sigma_mass_kda\n66,0\n", "too few"),
     ],
 )
 def test_wrong_tables_are_refused_with_what_to_do(text: str, said: str, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def _learn(
     config = _config(calibrate)
     sights, _, _ = make_sights(changes, count, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: noise_differs)
-    monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
     learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
@@ -102,7 +102,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     singles, _, _ = make_sights(changes, 5, seed=3)
     sights = [*_pairs(changes, 6, 4), *singles]
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
     said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
@@ -154,7 +154,7 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
     """Beyond focus particles are bright; the control is on the configured side."""
     sights, _, _ = make_sights({"focus_nm": focus_nm}, 16, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
     config = _config("auto").model_copy(
         update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
     )
@@ -254,7 +254,7 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
     sights, _, _ = make_sights({"focus_nm": -450.0}, 8, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_sights", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
     assert learn_optics(MOVIE, free, camera, warn=said.append) == (free, {})

@@ -22,6 +22,7 @@ from iscat_analysis.calibration.mass import (
 from iscat_analysis.config import Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.trust.budget import budget_of, explained_kda, width_warning
@@ -210,7 +211,7 @@ def _refitted(config: Config, key: str, mass: float, step: float) -> float:
     signal = truth.amplitude_image(seen, 0.0, 0.0, z_nm, amplitude)
     light = np.full(grid.shape, 1e8)
     likelihood = counts_likelihood(
-        model, grid, light, light * (1 + signal), 1.0, background=1.0, use_conditional=True
+        model, grid, light, light * (1 + signal), 1.0, background=1.0, noise=CONDITIONAL
     )
     start = np.array([0.0, 0.0, 5.0, amplitude, 0.0])
     width = np.array([150.0, 150.0, 0.0, 0.5 * abs(amplitude), 0.1])
