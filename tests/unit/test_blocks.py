@@ -20,6 +20,7 @@ import iscat_analysis.pipeline.finish as finish_module
 import iscat_analysis.tracking.blocks as blocks_module
 import iscat_analysis.tracking.find as tracking_module
 from iscat_analysis import pipeline
+from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -347,7 +348,7 @@ def test_a_movie_that_fits_and_stands_still_is_followed_as_one(
     with open_stack(movie) as stack:
         found = analyse(stack, _config())
     assert found.summary["blocks"]["number"] == 1
-    table, masses = _whole(wanderers.counts, _config())
+    table, masses = _whole(wanderers.counts, with_standards(_config()))
     pd.testing.assert_frame_equal(found.table[table.columns], table, check_exact=True)
     assert found.tracks is not None
     for row in found.tracks.itertuples():

@@ -252,12 +252,12 @@ def test_optics_of_the_file_take_the_place_of_defaults_only(path: Path) -> None:
     used, notes = resolve_metadata(configure({"camera.pixel_size_nm": 84.4}), read)
     assert (used.optics.na, used.optics.wavelength_nm) == (1.3, 445)
     assert [note.split(",")[0] for note in notes] == ["the wavelength is 445 nm", "the NA is 1.3"]
-    given = configure({"camera.pixel_size_nm": 84.4, "optics.na": 1.42})
+    given = configure({"camera.pixel_size_nm": 84.4, "optics.na": 1.4})
     given = configure(given, settings={"optics.wavelength_nm": 450.0})
     used, notes = resolve_metadata(given, read)
-    assert (used.optics.na, used.optics.wavelength_nm) == (1.42, 450)
+    assert (used.optics.na, used.optics.wavelength_nm) == (1.4, 450)
     assert len(notes) == 1
-    assert "the NA is 1.42 in the configuration (optics.na) but 1.3 in" in notes[0]
+    assert "the NA is 1.4 in the configuration (optics.na) but 1.3 in" in notes[0]
 
 
 def test_a_default_stays_one_when_other_keys_change() -> None:
