@@ -327,6 +327,8 @@ def test_movies_of_a_day_give_the_same_bytes_when_a_worker_is_killed(
     records = [day / which / ".batch" / "movies" for which in ("here", "far")]
     for name in NAMES:
         ours, theirs = (json.loads((r / f"{name}.json").read_text()) for r in records)
+        for record in (ours, theirs):  # the hash of a summary, which has times
+            del record["results"]["summary.json"]
         assert ours == theirs
 
 

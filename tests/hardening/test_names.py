@@ -93,7 +93,7 @@ def test_messages_reach_a_terminal_as_text(tmp_path: Path, capsys) -> None:
     assert not {"\x1b", "\x07", "\u202e"} & set(said)
 
 
-@pytest.mark.usefixtures("all_sketched")
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize("name", ["fits.parquet", "summary.json", "config.toml"])
 @pytest.mark.parametrize("share", [0.0, 0.7])
 def test_a_damaged_result_costs_only_itself(lab: Path, name: str, share: float) -> None:
@@ -115,7 +115,7 @@ def test_a_damaged_result_costs_only_itself(lab: Path, name: str, share: float) 
     assert ia.batch(lab, out=out, config=SETUP).analysed == ()
 
 
-@pytest.mark.usefixtures("all_sketched")
+@pytest.mark.usefixtures("sketched")
 def test_watching_goes_on_beside_a_name_that_is_no_text(lab: Path) -> None:
     for path in lab.iterdir():
         if path.stem not in ("plain", NAMES[-2]):

@@ -198,15 +198,18 @@ def test_a_template_larger_than_the_field_is_cut() -> None:
 # ---- what the user is told -------------------------------------------------------------------
 
 
+_KNOWN = {
+    "camera.gain_e_per_adu": GAIN, "camera.read_noise_e": 0.0, "optics.calibrate": "never",
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("method", ["fixed", "sliding"])
 def test_the_user_is_told(method: str) -> None:
     counts = _movie(5, x=LEAKY, y=LEAKY, frames=160).astype(np.uint16)
     config = make_config(background={"frames": None, "method": method}, fit={"frames": None})
     if method == "fixed":
         config = make_config(background={"frames": [0, 80]}, fit={"frames": [80, 160]})
-    result = ia.fit_movie(
-        counts, config=config, settings={"camera.gain_e_per_adu": GAIN, "optics.calibrate": "never"}
-    )
+    result = ia.fit_movie(counts, config=config, settings=_KNOWN)
     about = result.summary["background" if method == "fixed" else "landing"]["noise_spectrum"]
     assert about["neighbour_correlation"] == pytest.approx([0.24, 0.24], abs=0.02)
     assert any("neighbouring pixels is correlated" in text for text in result.warnings)
