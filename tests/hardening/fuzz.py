@@ -157,7 +157,7 @@ def build(number: int, seed: int, originals: dict[str, list[Seed]]) -> tuple[str
     kind = KINDS[number % len(KINDS)]
     if kind == "call":
         names = calls.names()
-        return names[int(rng.integers(len(names)))], {}
+        return names[number // len(KINDS) % len(names)], {}
     kept = originals[kind]
     files = dict(kept[int(rng.integers(len(kept)))])
     name = list(files)[int(rng.integers(len(files)))]
