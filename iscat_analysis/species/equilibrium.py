@@ -34,6 +34,7 @@ import numpy as np
 from iminuit import Minuit
 from scipy.special import chdtrc
 
+from iscat_analysis.errors import DataError
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.intervals import interval
@@ -49,6 +50,7 @@ from iscat_analysis.species.series import Free, Series
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
 _SIGMAS = 1.959964
+_ABOVE = 0.1  # of log-likelihood, by which no point of the profile may exceed the maximum
 _FIRST_STEP = 0.1  # of ln K_D towards an end of its interval
 _PROFILE = 9  # points of the profile between the ends of the interval
 _STEP = 1e-4  # of ln K_D and of β, for their slopes
@@ -235,6 +237,11 @@ def _interval(found: Minuit) -> tuple[float, float, FloatArray]:
     def deviance(ln_kd: float) -> float:
         found.values["ln_kd"] = ln_kd
         found.migrad()  # from where the last one ended
+        if found.fval < top - _ABOVE:
+            raise DataError(
+                "K_D: the fit did not end at the largest likelihood, which lies near "
+                f"{math.exp(ln_kd):.3g} nM: give the masses, or hold the landing exponent"
+            )
         return 2 * max(float(found.fval) - top, 0.0)
 
     found.fixed["ln_kd"] = True
