@@ -141,7 +141,14 @@ def test_the_work_of_a_lost_process_is_done_again(place: Path) -> None:
     assert contents(place / "lost") == contents(place / "alone")
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        pytest.param(signal.SIGTERM, marks=pytest.mark.large),
+        signal.SIGKILL,
+    ],
+)
 def test_the_second_process_ends_with_the_first(place: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(
         command(SHARED, f"ended-{number}"), cwd=place, stderr=subprocess.PIPE, text=True

@@ -108,8 +108,12 @@ def bare_fit(seed: int, landing_power: float | None = None, **world: float) -> E
 
 @pytest.mark.parametrize(
     "world",
-    [{"tail": 12.0}, {"dirt": 0.25}, {"limit": 65.0}, {"power": 0.0}],
-    ids=["tail", "dirt", "limit", "landing"],
+    [
+        pytest.param({"tail": 12.0}, id="tail"),
+        pytest.param({"dirt": 0.25}, id="dirt", marks=pytest.mark.large),
+        pytest.param({"limit": 65.0}, id="limit"),
+        pytest.param({"power": 0.0}, id="landing", marks=pytest.mark.large),
+    ],
 )
 def test_masses_without_errors_give_kd(
     world: dict[str, float], repetitions: Callable[[int, int], int]
