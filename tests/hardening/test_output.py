@@ -269,7 +269,7 @@ def landing(
     return order, whole["seconds"], contents(place / "result")
 
 
-@pytest.mark.parametrize("chunks", [1, 3])
+@pytest.mark.parametrize("chunks", [pytest.param(1, marks=pytest.mark.large), 3])
 def test_a_landing_movie_killed_between_chunks_resumes(
     runner: Runner, landing: tuple[dict[str, Any], float, dict[str, bytes]], chunks: int
 ) -> None:
@@ -308,8 +308,16 @@ def test_a_landing_movie_killed_at_random_moments_resumes(
             assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
 
 
-@pytest.mark.parametrize("word", ["before", "after"])
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize(
+    ("number", "word"),
+    [
+        (1, "after"),
+        *(
+            pytest.param(*case, marks=pytest.mark.large)
+            for case in ((1, "before"), (2, "before"), (2, "after"))
+        ),
+    ],
+)
 def test_killed_between_two_renamings(runner: Runner, place: Path, word: str, number: int) -> None:
     """The one moment at which neither result has the final name: the next run puts one back."""
     shutil.copytree(runner.bench / "result", place / "result")
@@ -328,7 +336,13 @@ def test_killed_between_two_renamings(runner: Runner, place: Path, word: str, nu
     assert names(place) == ["movie.tif", "result", "setup.toml"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGINT,
+        *(pytest.param(n, marks=pytest.mark.large) for n in (signal.SIGTERM, signal.SIGHUP)),
+    ],
+)
 def test_asked_to_end(runner: Runner, place: Path, number: int) -> None:
     rng = np.random.default_rng(SEED)
     for _ in range(3):
@@ -372,7 +386,9 @@ def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> No
 # ---- disks ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("limit", [600, 8_000, 30_000])
+@pytest.mark.parametrize(
+    "limit", [8_000, *(pytest.param(n, marks=pytest.mark.large) for n in (600, 30_000))]
+)
 def test_a_file_that_cannot_grow(runner: Runner, place: Path, limit: int) -> None:
     (answer,) = runner.run({"run": FIT, "cwd": str(place), "limit": limit})
     assert answer["status"] == 1
@@ -456,7 +472,11 @@ NAMES = [
 ]
 
 
-@pytest.mark.parametrize("name", NAMES, ids=range(len(NAMES)))
+@pytest.mark.parametrize(
+    "name",
+    [NAMES[0], *(pytest.param(name, marks=pytest.mark.large) for name in NAMES[1:])],
+    ids=range(len(NAMES)),
+)
 def test_names(runner: Runner, tmp_path: Path, name: str) -> None:
     folder = tmp_path / (name if len(name) < 200 else "y" * 200)
     folder.mkdir()

@@ -20,6 +20,8 @@ from iscat_analysis.config import load_config
 from iscat_analysis.second_process import SecondProcess
 from iscat_analysis.study.simulate import write_stack
 
+pytestmark = pytest.mark.large
+
 SETUP = """
 [optics]
 na = 1.3

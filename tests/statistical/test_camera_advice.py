@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 import iscat_analysis as ia
 
+pytestmark = pytest.mark.large
+
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_configs" / "landing.toml"
 CAMERA = {
     "camera.gain_e_per_adu": "auto",

@@ -18,6 +18,8 @@ from iscat_analysis.species import Efficiency
 from iscat_analysis.species.equilibrium import EquilibriumFit
 from iscat_analysis.species.mass_action import LANDING_POWER, at_equilibrium
 
+pytestmark = pytest.mark.large
+
 EFFICIENCY = Efficiency(5.0, 13.0)  # 54 % of 66 kDa are seen
 KD_NM = 10.0
 TOTALS: NDArray[np.float64] = np.repeat([1.0, 3.0, 10.0, 30.0, 60.0, 100.0], 3)[:, None]

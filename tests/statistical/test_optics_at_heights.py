@@ -16,6 +16,8 @@ from iscat_analysis.config import load_config
 from iscat_analysis.instrument import crowded
 from iscat_analysis.instrument.learner import OpticsCalibration
 
+pytestmark = pytest.mark.large
+
 SIGMAS = 4.0
 PIXEL_NM, LEVEL_E, FRAMES, SIDE = 84.0, 2e7, 2, 140
 TRUTH = Instrument(emission="reciprocal", focus_nm=-560.0, na=1.40)

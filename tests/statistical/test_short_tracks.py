@@ -9,6 +9,8 @@ from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
 
+pytestmark = pytest.mark.large
+
 MASS_KDA, D_UM2_S = 400.0, 0.05
 SEEDS = range(20, 30)
 
