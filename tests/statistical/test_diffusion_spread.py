@@ -30,6 +30,8 @@ import iscat_analysis as ia
 from iscat_analysis.species import motion
 from iscat_analysis.species.displacements import Displacements, gather
 
+pytestmark = pytest.mark.large
+
 RATE_HZ = 331.0
 SIGMAS = 4.0
 BIAS = 0.03

@@ -21,6 +21,8 @@ from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.trust.systematic import systematic
 
+pytestmark = pytest.mark.large
+
 SHAPE = (1400, 176, 160)
 LANDINGS = draw_landings(SHAPE, 36, seed=21, masses=(480.0, 480.0, 146.0), apart_px=20.0)
 FOCUS_NM = -300.0

@@ -13,6 +13,8 @@ from iscat_analysis.config import configure, load_config
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.study.simulate import write_stack
 
+pytestmark = pytest.mark.large
+
 MASS_KDA, COUNT, HIGHEST_NM = 205.0, 16, 20.0
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_configs" / "landing.toml"
 

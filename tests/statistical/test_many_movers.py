@@ -13,6 +13,8 @@ from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
 
+pytestmark = pytest.mark.large
+
 NEAR_NM = 300.0
 SPECIES = ((200.0, 0.15, 3), (200.0, 0.8, 2), (400.0, 0.15, 3), (400.0, 0.8, 2))
 

@@ -19,6 +19,8 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
 
+pytestmark = pytest.mark.large
+
 SHAPE = (500, 128, 128)
 COUNT = 12
 SEED = 11

@@ -18,6 +18,8 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
 
+pytestmark = pytest.mark.large
+
 SHAPE = (900, 144, 136)
 LANDINGS = draw_landings(SHAPE, 30, seed=31, masses=(480.0,), apart_px=16.0, margin_px=20.0)
 NA = 1.38
