@@ -8,6 +8,33 @@ import numpy as np
 
 import iscat_analysis as ia
 
+LANDING = """
+[optics]
+na = 1.3
+attenuation = 1.0
+focus_nm = -300.0
+[camera]
+pixel_size_nm = 84.4
+gain_e_per_adu = 4.0
+[background]
+window_frames = 20
+[fit]
+roi_nm = 1300.0
+[posterior]
+enabled = false
+[compute]
+workers = 1
+[calibration]
+gradient_per_kda = -3.1e-5
+[simulation]
+shape = [64, 64]
+frames = 480
+photons_per_pixel = 1e5
+count = 6
+species = [600.0]
+"""
+"""Configuration of a small landing movie, and how to simulate it."""
+
 SETUP = {
     "optics.focus_nm": -300.0,
     "optics.calibrate": "never",

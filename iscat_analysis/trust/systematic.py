@@ -139,16 +139,6 @@ def total(found: Sequence[Contribution], rows: int) -> dict[str, FloatArray]:
     return {name: np.where(sigma > _NOTHING, sigma, 0.0) for name, sigma in sums.items()}
 
 
-def systematic(
-    config: Config,
-    table: pd.DataFrame,
-    mass_share: float = 0.0,
-    scale: MassScale | None = None,
-) -> dict[str, FloatArray]:
-    """Add up the errors that all events of a movie share."""
-    return total(contributions(config, table, mass_share, scale), len(table))
-
-
 def _of_held(name: str, shift_kda: FloatArray) -> Source:
     """Make a source of heights or extensions that were held although particles differ in them."""
     remedy = {

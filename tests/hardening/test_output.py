@@ -22,6 +22,7 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 from report_factory import make_analysis
+from small_movies import LANDING
 
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import DataError
@@ -55,31 +56,6 @@ workers = 1
 shape = [48, 48]
 frames = 40
 events = [{frame = 20, x_px = 23.2, y_px = 24.4, mass_kda = 3000.0}]
-"""
-LANDING = """
-[optics]
-na = 1.3
-attenuation = 1.0
-focus_nm = -300.0
-[camera]
-pixel_size_nm = 84.4
-gain_e_per_adu = 4.0
-[background]
-window_frames = 20
-[fit]
-roi_nm = 1300.0
-[posterior]
-enabled = false
-[compute]
-workers = 1
-[calibration]
-gradient_per_kda = -3.1e-5
-[simulation]
-shape = [64, 64]
-frames = 480
-photons_per_pixel = 1e5
-count = 6
-species = [600.0]
 """
 FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
 

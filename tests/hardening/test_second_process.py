@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from jobs import warn
+from small_movies import LANDING
 
 from iscat_analysis.config import load_config
 from iscat_analysis.second_process import SecondProcess
@@ -22,31 +23,7 @@ from iscat_analysis.study.simulate import write_stack
 
 pytestmark = pytest.mark.large
 
-SETUP = """
-[optics]
-na = 1.3
-attenuation = 1.0
-focus_nm = -300.0
-[camera]
-pixel_size_nm = 84.4
-gain_e_per_adu = 4.0
-[background]
-window_frames = 20
-[fit]
-roi_nm = 1300.0
-[posterior]
-enabled = false
-[compute]
-workers = 2
-[calibration]
-gradient_per_kda = -3.1e-5
-[simulation]
-shape = [64, 64]
-frames = 480
-photons_per_pixel = 1e5
-count = 6
-species = [600.0]
-"""
+SETUP = LANDING.replace("workers = 1", "workers = 2")
 
 # Jobs that are sent are named on stderr, with the process that does them; a small movie is cut into
 # as many chunks as a large one, and shared where it has more bytes than the first argument.

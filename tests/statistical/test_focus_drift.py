@@ -11,6 +11,7 @@ from functools import cache
 import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
+from shared_errors import systematic
 
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, load_config
@@ -19,7 +20,6 @@ from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
-from iscat_analysis.trust.systematic import systematic
 
 pytestmark = pytest.mark.large
 

@@ -28,11 +28,10 @@ def particle(y_px: float, x_px: float) -> FloatArray:
     return -np.exp(-(r**2) / 4.5) + 0.35 * np.exp(-((r - 4.5) ** 2) / 2.5)
 
 
-def picture(random: np.random.Generator, snr: float, neighbour: float) -> tuple[FloatArray, ...]:
+def picture(random: np.random.Generator, snr: float) -> tuple[FloatArray, ...]:
     """Draw a contrast, where its particle is, and where it is first thought to be [px]."""
     place = random.uniform(-2, 2, 2)
-    beside = particle(*(10 * random.choice([-1, 1], 2)))
-    signal = random.choice([-1, 1]) * particle(*place) + neighbour * beside
+    signal = random.choice([-1, 1]) * particle(*place)
     noise = math.sqrt(2 / PHOTONS)
     scale = snr * noise / np.linalg.norm(particle(0, 0))
     contrast = scale * signal + noise * random.standard_normal(signal.shape)
@@ -49,12 +48,10 @@ def sight(contrast: FloatArray, first: FloatArray) -> ParticleImage:
     )
 
 
-def misplaced(seed: int, snr: float, neighbour: float, number: int = 12) -> FloatArray:
+def misplaced(seed: int, snr: float, number: int = 12) -> FloatArray:
     """Distances of pictures from where they are [px], but for what all have in common."""
     random = np.random.default_rng([31, seed])
-    contrasts, places, first = zip(
-        *(picture(random, snr, neighbour if k else 0.0) for k in range(number)), strict=True
-    )
+    contrasts, places, first = zip(*(picture(random, snr) for _ in range(number)), strict=True)
     first = (places[0], *first[1:])
     placed = average_particle_images([sight(c, f) for c, f in zip(contrasts, first, strict=True)])[
         1
@@ -64,14 +61,17 @@ def misplaced(seed: int, snr: float, neighbour: float, number: int = 12) -> Floa
     return np.hypot(*(apart - np.median(apart, axis=0)).T)
 
 
-def test_pictures_are_registered_as_well_as_their_light_tells(
+def test_pictures_are_registered_to_half_a_pixel(
     repetitions: Callable[[int, int], int],
 ) -> None:
-    """The error of a place by its gradient is 1/(snr·g), with g from the drawn particle."""
+    """A start for the fit of the optics: some twice of what the light tells, 1/(snr·g).
+
+    Here g is the gradient of the drawn particle, relative to its size.
+    """
     steps = [(particle(h, 0) - particle(-h, 0)) / (2 * h) for h in (1e-3,)]
     gradient = np.linalg.norm(steps[0]) / np.linalg.norm(particle(0, 0))
     for snr in (15.0, 40.0):
-        apart = np.concatenate([misplaced(seed, snr, 0.0) for seed in range(repetitions(10, 60))])
+        apart = np.concatenate([misplaced(seed, snr) for seed in range(repetitions(10, 60))])
         assert np.mean(apart > 1) < 0.02
         bound = math.sqrt(2) / (snr * gradient)
         assert 0.8 * bound < np.sqrt(np.mean(apart[apart < 1] ** 2)) < 0.5  # pixels: a start

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from shared_errors import systematic
 
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import mass_calibration
@@ -26,7 +27,7 @@ from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_analysis.trust.budget import budget_of, explained_kda, width_warning
-from iscat_analysis.trust.systematic import contributions, misfit_error, systematic, total
+from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 GRADIENT, MASS, LIGHT, FRAMES = -3.1e-5, 205.0, 3e6, 100
 PIXEL_NM = 84.4

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from shared_errors import systematic
 
 from iscat_analysis.bounds import joint_information
 from iscat_analysis.config import (
@@ -25,7 +26,6 @@ from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner import settings_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
-from iscat_analysis.trust.systematic import systematic
 
 NAMES = ("focus_nm", "na", "z8", "z11")
 SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
