@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from instruments import Instrument, InstrumentMovie, Pictures, draw_landings
+from shared_errors import systematic
 
 import iscat_analysis as ia
 from iscat_analysis.config import Uncertainty, configure
 from iscat_analysis.diagnosis.causes import nonlinearity_warning
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.trust.systematic import systematic
 
 GRADIENT = -3.1e-5
 INSTRUMENT = Instrument(emission="reciprocal")

@@ -13,6 +13,7 @@ import pandas as pd
 import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from shared_errors import systematic
 
 from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.calibration.mass import (
@@ -27,7 +28,6 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration
 from iscat_analysis.species import describe
 from iscat_analysis.species.tables import event_table
-from iscat_analysis.trust.systematic import systematic
 
 STANDARDS = (66.0, 146.0, 480.0)
 GRADIENT, OFFSET = -3.1e-5, 2e-4
