@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -253,6 +254,10 @@ def with_options(text: str) -> str:
     return text
 
 
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What the system says where a file cannot grow; a write does not tell which file it was."""
+
+
 def _interrupted(error: Exception) -> bool:
     """Whether an interrupt hides behind an error, as it does where it meets compiled code."""
     return isinstance(error, SystemError) and isinstance(
@@ -269,6 +274,8 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
         return "interrupted", INTERRUPTED
     if isinstance(error, OSError) and error.filename and error.strerror:
         return f"{error.filename}: cannot be read or written ({error.strerror})", UNEXPECTED
+    if isinstance(error, OSError) and error.errno in _NO_ROOM:
+        return f"a file cannot be written ({error.strerror})", UNEXPECTED
     said = f": {error}" if str(error) else ""
     hint = "" if debug else "; run again with --debug for the traceback"
     return f"unexpected {type(error).__name__}{said}{hint}", UNEXPECTED

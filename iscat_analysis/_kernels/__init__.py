@@ -59,13 +59,13 @@ NO_ROOM = checksums.refusal(FOLDER)
 
 checksums.remove_damaged(FOLDER)
 
-_COMPILED = checksums.Compiled()
+_COMPILED = checksums.Compiled(FOLDER)
 event.register("numba:compile", _COMPILED)
 
 
 def record_checksums() -> None:
     """Vouch for what this process compiled, so that the next one takes it."""
-    checksums.record(FOLDER, _COMPILED.taken())
+    _COMPILED.record()
 
 
 atexit.register(record_checksums)

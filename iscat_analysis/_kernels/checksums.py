@@ -25,14 +25,24 @@ _KINDS = (".nbi", ".nbc")  # Numba's indices and its compiled code
 
 
 class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
-    """Notes how the files of the functions begin that this process compiles."""
+    """Notes how the files of the functions begin that this process compiles, and lists them.
 
-    def __init__(self) -> None:
+    Numba writes a function's files right after it has compiled it.  They are listed when the next
+    one is compiled, so that a process that lives for hours has little that others do not trust.
+    """
+
+    def __init__(self, folder: str) -> None:
+        self._folder = folder
         self._begin: set[str] = set()
+        self._running: list[object] = []  # a function that others call is compiled within them
 
     def on_start(self, event: event.Event) -> None:
         """Note a function, by what Numba names its files after."""
-        function = event.data["dispatcher"].py_func
+        if not self._running:
+            self.record()
+        dispatcher = event.data["dispatcher"]
+        self._running.append(dispatcher)
+        function = dispatcher.py_func
         code = getattr(function, "__code__", None)
         if code is None:  # nothing that has a file
             return
@@ -41,12 +51,13 @@ class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
         self._begin.add(f"{name}-{code.co_firstlineno}.")
 
     def on_end(self, event: event.Event) -> None:
-        """Do nothing more."""
+        """Leave a function."""
+        self._running.remove(event.data["dispatcher"])
 
-    def taken(self) -> tuple[str, ...]:
-        """Give what was noted since this was last asked."""
-        taken, self._begin = tuple(self._begin), set()
-        return taken
+    def record(self) -> None:
+        """List what this process compiled since it last did."""
+        compiled, self._begin = tuple(self._begin), set()
+        record(self._folder, compiled)
 
 
 def refusal(folder: str) -> str:

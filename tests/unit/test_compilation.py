@@ -160,6 +160,24 @@ def test_the_list_keeps_what_others_wrote_into_it(tmp_path):
     assert [path.name for path in tmp_path.glob("*.nbc")] == ["b.g-1.py311.1.nbc"]
 
 
+def test_a_process_that_lives_on_lists_what_it_compiled(tmp_path):
+    """Others that start meanwhile would compile it again."""
+    code = """
+import json, pathlib, sys
+import numpy as np
+from iscat_analysis._kernels.lines import largest
+for values in (np.zeros(3), np.zeros(3, np.float32)):
+    largest(values)
+(listed,) = pathlib.Path(sys.argv[1]).glob("*/checksums.json")
+print(*json.loads(listed.read_text()))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True,
+        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
+    )  # fmt: skip
+    assert "lines.largest-" in done.stdout
+
+
 def test_processes_that_end_together_lose_no_entry(tmp_path):
     code = """
 import sys
