@@ -27,11 +27,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from iminuit import Minuit
 from scipy.special import chdtrc
 
 from iscat_analysis.errors import DataError
@@ -45,7 +44,8 @@ from iscat_analysis.species.mass_action import (
     Model,
     landing_logits,
 )
-from iscat_analysis.species.series import Free, Series
+from iscat_analysis.species.maximum import Maximum, Problem, maximise
+from iscat_analysis.species.series import Series
 
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
@@ -99,34 +99,31 @@ def fit_equilibrium(
 
     Shapes: `totals_nm` (n, 1) or (n, 2).
     """
-    masses = np.array(masses_kda, float)
-    free_series = Free(tables, COMPOSITION[model], masses)
-    free_fit = free_series.maximum(free_series.first)
-    free, free_value = np.array(free_fit.values), -float(free_fit.fval)
-    series = _Equilibrium(tables, totals_nm, model, masses, power, inactive)
-    found = series.fit(free)
-    best, best_value = np.array(found.values), -float(found.fval)
-    chi2 = max(2 * (free_value - best_value), 0.0)
+    series = Series(tables, COMPOSITION[model], np.array(masses_kda, float))
+    free = maximise(series.problem(), series.first)
+    equilibrium = _Equilibrium(series, totals_nm, model, power, inactive)
+    found = equilibrium.fit(free.theta)
+    other = _Equilibrium(series, totals_nm, model, power, not inactive).fit(found.theta)
+    gain = max(2 * (found.value - other.value) * (1 if inactive else -1), 0.0)
+    chi2 = max(2 * (free.value - found.value), 0.0)
     dof = len(tables) * (series.kinds - 1) - 1 - int(inactive)
-    logits, errors, complexes = _observed(free_series, free)
-    other = _Equilibrium(tables, totals_nm, model, masses, power, not inactive)
-    other_value = -float(other.fit(best).fval)
-    gain = max(2 * (best_value - other_value) * (1 if inactive else -1), 0.0)
-    found.hesse()
-    constants = found.values.to_dict(), found.errors.to_dict()
-    low, high, points = _interval(found)
-    shared, landed = series.shared(best), series.logits(best)
+    logits, errors, complexes = _observed(series, free)
+    low, high, points = _interval(equilibrium, found)
+    full = equilibrium.full(found.theta)
+    shared, landed = series.shared(full), series.logits(full)
     predicted = _share(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
     reach = _SIGMAS * errors
+    constants = equilibrium.constants(found.theta)
+    constant_errors = equilibrium.constants(np.sqrt(np.diag(found.covariance())))
     return EquilibriumFit(
-        kd_nm=math.exp(constants[0]["ln_kd"]),
+        kd_nm=math.exp(constants["ln_kd"]),
         kd_low=low,
         kd_high=high,
-        inactive=constants[0].get("inactive", 0.0),
-        inactive_se=constants[1].get("inactive", math.nan),
+        inactive=constants.get("inactive", 0.0),
+        inactive_se=constant_errors.get("inactive", math.nan),
         inactive_p=float(chdtrc(1, gain)) / 2,
-        landing_power=constants[0].get("power", power),
-        landing_power_se=constants[1].get("power", 0.0),
+        landing_power=constants.get("power", power),
+        landing_power_se=constant_errors.get("power", 0.0),
         masses_kda=shared.mean,
         width_kda=math.sqrt(float(shared.variance[0])),
         tail_kda=shared.tail,
@@ -139,86 +136,124 @@ def fit_equilibrium(
         complexes_high=_share(logits + reach),
         predicted=predicted,
         pull=(logits - np.log(predicted / (1 - predicted))) / errors,
-        background=series.weights(best, landed)[:, -1],
+        background=series.weights(full)[:, -1],
         profile_ln_kd=points[:, 0],
         profile_deviance=points[:, 1],
     )
 
 
-class _Equilibrium(Series):
+class _Equilibrium:
     """A series whose weights are those of an equilibrium.
 
-    ln K_D, the landing exponent where it is not known, and β where it is fitted follow the other
-    parameters.
+    In place of the logits stand ln K_D, the landing exponent where it is not known, and β where it
+    is fitted.
     """
 
     def __init__(
         self,
-        tables: Sequence[Events],
+        series: Series,
         totals_nm: FloatArray,
         model: Model,
-        masses: FloatArray,
         power: float | None,
         inactive: bool,
     ) -> None:
-        super().__init__(tables, COMPOSITION[model], masses)
-        self.totals, self.model, self.power = totals_nm, model, power
+        self.series, self.totals, self.model, self.power = series, totals_nm, model, power
         middle = np.log(totals_nm[totals_nm > 0])
         added = [("ln_kd", middle.min() - _REACH, middle.max() + _REACH, middle.mean(), 1.0)]
         if power is None:
             added.append(("power", -1.0, 1.0, LANDING_POWER, LANDING_POWER_SIGMA))
         if inactive:
             added.append(("inactive", 0.0, _MOST_INACTIVE, 0.05, 0.1))
-        names, *numbers = zip(*added, strict=True)
-        self.names += names
+        self.names, *numbers = zip(*added, strict=True)
+        self.at = series.own
         self.low, self.high, self.first, self.scale = (
-            np.append(old, new)
-            for old, new in zip((self.low, self.high, self.first, self.scale), numbers, strict=True)
+            np.append(old[: self.at], new)
+            for old, new in zip(
+                (series.low, series.high, series.first, series.scale), numbers, strict=True
+            )
         )
 
-    def logits(self, theta: FloatArray) -> FloatArray:
-        """Give the logits of the species, as the constants want them."""
-        values = dict(zip(self.names[self.own :], theta[self.own :], strict=True))
-        return landing_logits(
+    def constants(self, theta: FloatArray) -> dict[str, float]:
+        """Name what stands in place of the logits."""
+        return dict(zip(self.names, theta[self.at :].tolist(), strict=True))
+
+    def full(self, theta: FloatArray) -> FloatArray:
+        """Give the parameters of the series, with the logits that the constants want."""
+        return np.concatenate([theta[: self.at], self._logits(theta[self.at :])])
+
+    def _logits(self, constants: FloatArray) -> FloatArray:
+        values = dict(zip(self.names, constants.tolist(), strict=True))
+        found = landing_logits(
             self.model, self.totals, math.exp(values["ln_kd"]), values.get("inactive", 0.0),
-            self.masses, values["power"] if self.power is None else self.power,
+            self.series.masses, values["power"] if self.power is None else self.power,
         )  # fmt: skip
+        return found[:, 1:].ravel()
+
+    def _rise(self, constants: FloatArray) -> FloatArray:
+        """Slopes of the logits in the constants.
+
+        Shapes: `constants` (c,), result (c, tables (k - 1)).
+        """
+        steps = _STEP * np.eye(constants.size)
+        rises = [self._logits(constants + step) - self._logits(constants - step) for step in steps]
+        return np.array(rises) / (2 * _STEP)
 
     def height(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Log-likelihood and its slope."""
-        total, slope, by_logits = self.value(theta, self.logits(theta))
-        slope = np.append(slope, np.zeros(theta.size - self.own))
-        for place in range(self.own, theta.size):
-            step = np.zeros(theta.shape)
-            step[place] = _STEP
-            rise = self.logits(theta + step) - self.logits(theta - step)
-            slope[place] = float(np.sum(by_logits * rise)) / (2 * _STEP)
+        total, slope = self.series.likelihood(self.full(theta))
+        slope = np.append(slope[: self.at], self._rise(theta[self.at :]) @ slope[self.at :])
         if self.power is None:
-            away = (theta[self.own + 1] - LANDING_POWER) / LANDING_POWER_SIGMA
+            away = (theta[self.at + 1] - LANDING_POWER) / LANDING_POWER_SIGMA
             total -= 0.5 * away**2
-            slope[self.own + 1] -= away / LANDING_POWER_SIGMA
+            slope[self.at + 1] -= away / LANDING_POWER_SIGMA
         return total, slope
 
-    def fit(self, free: FloatArray) -> Minuit:
-        """Maximise over everything, from the best of a grid of K_D."""
-        begun = np.concatenate([free[: self.own], self.first[self.own :]])
+    def curvature(self, theta: FloatArray) -> FloatArray:
+        """Minus the second derivatives of the height.
+
+        Shapes: `theta` (p,), result (p, p).
+        """
+        at, constants = self.at, theta[self.at :]
+        full = self.full(theta)
+        information, by_logit = self.series.information(full), self.series.likelihood(full)[1][at:]
+        change = np.zeros((theta.size, full.size))
+        change[:at, :at] = np.eye(at)
+        change[at:, at:] = self._rise(constants)
+        found = change @ information @ change.T
+        for place, step in enumerate(_STEP * np.eye(constants.size)):
+            bend = (self._rise(constants + step) - self._rise(constants - step)) / (2 * _STEP)
+            found[at + place, at:] -= bend @ by_logit
+        if self.power is None:
+            found[at + 1, at + 1] += LANDING_POWER_SIGMA**-2
+        return np.asarray((found + found.T) / 2)
+
+    def problem(self) -> Problem:
+        """Give what is maximised."""
+        return Problem(self.height, self.curvature, self.low, self.high, self.scale)
+
+    def fit(self, near: FloatArray) -> Maximum:
+        """Maximise over everything, from the best of a grid of K_D.
+
+        Shapes: `near` (at least own,), parameters of which the shared ones are taken.
+        """
+        begun = np.concatenate([near[: self.at], self.first[self.at :]])
         starts = []
-        for ln_kd in np.linspace(self.low[self.own], self.high[self.own], _GRID)[1:-1]:
+        for ln_kd in np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]:
             theta = begun.copy()
-            theta[self.own] = ln_kd
+            theta[self.at] = ln_kd
             starts.append((self.height(theta)[0], theta))
-        return self.maximum(max(starts, key=lambda one: one[0])[1])
+        return maximise(self.problem(), max(starts, key=lambda one: one[0])[1])
 
 
-def _observed(series: Free, free: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Logit of the complexes of each table, its standard error, and their fraction."""
-    covariance = np.linalg.pinv(series.information(free))
-    part = np.exp(series.logits(free))
+    covariance = free.covariance()
+    part = np.exp(series.logits(free.theta))
     part /= part.sum(axis=1, keepdims=True)
     logits, errors = np.empty(series.number), np.empty(series.number)
     for number, one in enumerate(part):
         logits[number] = math.log(one[-1] / (1 - one[-1]))
-        slope = np.zeros(free.size)
+        slope = np.zeros(free.theta.size)
         begin = series.own + number * (series.kinds - 1)
         # d logit(f_k)/dl_k = 1; of another: −f_j/(1 − f_k)
         slope[begin : begin + series.kinds - 1] = -one[1:] / (1 - one[-1])
@@ -227,25 +262,29 @@ def _observed(series: Free, free: FloatArray) -> tuple[FloatArray, FloatArray, F
     return logits, errors, _share(logits)
 
 
-def _interval(found: Minuit) -> tuple[float, float, FloatArray]:
+def _interval(equilibrium: _Equilibrium, found: Maximum) -> tuple[float, float, FloatArray]:
     """Give the interval of K_D, and points of the profile of ln K_D between its ends."""
-    best, (least, most) = float(found.values["ln_kd"]), found.limits["ln_kd"]
-
-    top = float(found.fval)
+    at = equilibrium.at
+    problem = equilibrium.problem()
+    best, least, most = float(found.theta[at]), problem.low[at], problem.high[at]
+    along = {best: found}
 
     @cache
     def deviance(ln_kd: float) -> float:
-        found.values["ln_kd"] = ln_kd
-        found.migrad()  # from where the last one ended
-        if found.fval < top - _ABOVE:
+        nearest = along[min(along, key=lambda place: abs(place - ln_kd))]
+        low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
+        low[at] = high[at] = start[at] = ln_kd
+        held = maximise(replace(problem, low=low, high=high), start, nearest.curvature)
+        along[ln_kd] = held
+        if held.value > found.value + _ABOVE:
             raise DataError(
                 "K_D: the fit did not end at the largest likelihood, which lies near "
                 f"{math.exp(ln_kd):.3g} nM: give the masses, or hold the landing exponent"
             )
-        return 2 * max(float(found.fval) - top, 0.0)
+        return 2 * max(found.value - held.value, 0.0)
 
-    found.fixed["ln_kd"] = True
-    low, high = interval(deviance, best, least, most, step=_FIRST_STEP)
+    first = _SIGMAS * math.sqrt(float(found.covariance()[at, at]))
+    low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])
     return (

@@ -22,19 +22,18 @@ density, K_D of skewed peaks was 0.79 of the truth and no interval held it.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
-from iminuit import Minuit
+from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from iscat_analysis._kernels.tailed_mixture import tailed_score
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
+from iscat_analysis.species.maximum import Problem
 from iscat_analysis.species.structure import LOGIT_REACH
 
 _MASS_RANGE = 0.2  # of the masses that were given
@@ -52,9 +51,7 @@ _NODES = 64
 _KINDS = 8  # of noise, in each table
 _NEAR = 0.4  # of the lightest mass: events of a peak
 _MAD = 1.4826
-_FAST = 0  # strategy of Minuit without second derivatives, which take n²/2 values
-_TOLERANCE = 0.01  # of Minuit: 1e-5 of the log-likelihood
-_INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
+_DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +84,12 @@ class Shared:
     limit: tuple[float, float]
 
 
-class Series(ABC):
-    """Tables of species that share masses and shape; their weights are told apart.
+class Series:
+    """Tables of species that share masses and shape, and have weights of their own.
 
     The parameters are the masses, the offset, the variances of the lightest and of the heaviest
     species, the tail, the background's shape, the limit of detection and its spread where they are
-    learned, and the shares of background; those that weights depend on follow.
+    learned; each table's share of background; each table's logits of the species but the first.
     """
 
     def __init__(
@@ -115,9 +112,6 @@ class Series(ABC):
         self.learned = any(table.learned for table in self.tables)
         own = max(self.width**2 - typical, 0.05 * self.width**2)
         widest = (_WIDEST * lightest) ** 2
-        names = [f"mass {part}" for part in range(self.parts)]
-        names += ["offset", "variance", "variance of the heaviest", "tail"]
-        names += [f"background {place}" for place in range(1, self.knots.size)]
         low = [*((1 - _MASS_RANGE) * masses), -0.3 * lightest, 0.0, 0.0, -_LONGEST * lightest]
         high = [*((1 + _MASS_RANGE) * masses), 0.3 * lightest, widest, widest, _LONGEST * lightest]
         start = [*masses, 0.0, min(own, widest / 2), min(own, widest / 2), 0.2 * self.width]
@@ -128,21 +122,23 @@ class Series(ABC):
         start += [0.0] * bends
         scale += [1.0] * bends
         if self.learned:
-            names += ["limit", "spread of the limit"]
             edge = np.concatenate([t.x for t in self.tables if t.learned])
             rise = float(np.quantile(edge, _RISING)) if edge.size else self.ends[0]
             low += [self.ends[0] - 3 * self.width, 0.25 * self.width]
             high += [max(1.3 * lightest, rise + self.width), 1.6 * self.width]
             start += [rise, _SOFT * self.width]
             scale += [self.width, self.width]
-        self.shares = len(names)
-        names += [f"share {number}" for number in range(self.number)]
+        self.shares = len(start)
         low += [-LOGIT_REACH] * self.number
         high += [LOGIT_REACH] * self.number
         start += [_FIRST_BACKGROUND] * self.number
         scale += [1.0] * self.number
-        self.own = len(names)
-        self.names = names
+        self.own = len(start)
+        free = self.number * (self.kinds - 1)
+        low += [-LOGIT_REACH] * free
+        high += [LOGIT_REACH] * free
+        start += [0.0] * free
+        scale += [1.0] * free
         self.low, self.high, self.first, self.scale = map(np.array, (low, high, start, scale))
         self._priors()
 
@@ -237,118 +233,108 @@ class Series(ABC):
             limit = float(theta[self.shares - 2]), float(theta[self.shares - 1])
         return Shared(mean, variance, float(tail), shape / shape.sum(), limit)
 
-    def weights(self, theta: FloatArray, logits: FloatArray) -> FloatArray:
+    def logits(self, theta: FloatArray) -> FloatArray:
+        """Give the logits of the species of each table, the first 0.
+
+        Shapes: result (tables, k).
+        """
+        found = theta[self.own :].reshape(self.number, self.kinds - 1)
+        return np.hstack([np.zeros((self.number, 1)), found])
+
+    def weights(self, theta: FloatArray) -> FloatArray:
         """Shares of the species and of the background, among the particles that came.
 
         The background's logit counts from all species together.
 
-        Shapes: `logits` (tables, k), result (tables, k + 1).
+        Shapes: result (tables, k + 1).
         """
+        logits = self.logits(theta)
         species = np.exp(logits - np.logaddexp.reduce(logits, axis=1)[:, None])
         odds = np.exp(theta[self.shares : self.own])[:, None]
         return np.asarray(np.hstack([species, odds]) / (1 + odds))
 
-    def value(self, theta: FloatArray, logits: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood with its priors, its slope, and that in the logits of the species.
+    def _places(self, number: int) -> NDArray[np.intp]:
+        """Tell where the parameters of one table are: common ones, its share, its logits."""
+        logits = self.own + number * (self.kinds - 1) + np.arange(self.kinds - 1)
+        return np.concatenate([np.arange(self.shares), [self.shares + number], logits])
 
-        Shapes: `theta` (at least `own`,), `logits` (tables, k), slopes (own,) and (tables, k).
+    def _scores(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Log-likelihood of each table, and its slopes in the parameters of `_places`.
+
+        Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
-        now, weights = self.shared(theta), self.weights(theta, logits)
-        distance = self.prior_design @ theta[: self.own] - self.prior_middle
-        total = -0.5 * float(distance @ distance)
-        slope = -self.prior_design.T @ distance
-        by_logits = np.zeros(logits.shape)
+        now, weights = self.shared(theta), self.weights(theta)
+        values, slopes = np.zeros(self.number), np.zeros((self.number, self.shares + self.kinds))
         place = self.parts
         limit, spread = now.limit
         for number, table in enumerate(self.tables):
-            seen = table.seen
+            seen, slope = table.seen, slopes[number]
             if table.learned:
                 at_nodes = (table.nodes - limit) / spread
                 seen = np.tile(table.steps * ndtr(at_nodes), (table.size.size, 1))
-            found, by_weight, by_peak, by_shape, by_seen = tailed_score(
+            values[number], by_weight, by_peak, by_shape, by_seen = tailed_score(
                 table.x, table.noise, table.background, table.size, table.kind_noise,
                 table.nodes, table.node_background, seen,
                 weights[number], now.mean, now.variance, now.tail, now.shape,
             )  # fmt: skip
-            total += found
-            slope[:place] += by_peak[0] @ self.composition
-            slope[place] += by_peak[0].sum()
-            slope[place + 1] += by_peak[1] @ (1 - self.along)
-            slope[place + 2] += by_peak[1] @ self.along
-            slope[place + 3] += by_peak[2].sum()
+            slope[:place] = by_peak[0] @ self.composition
+            slope[place] = by_peak[0].sum()
+            slope[place + 1] = by_peak[1] @ (1 - self.along)
+            slope[place + 2] = by_peak[1] @ self.along
+            slope[place + 3] = by_peak[2].sum()
             bends = by_shape - by_shape.sum() * now.shape
-            slope[place + 4 : place + 3 + self.knots.size] += bends[1:]
-            back = weights[number, -1]
-            slope[self.shares + number] += by_weight[-1] * (1 - back)
-            slope[self.shares + number] -= by_weight[:-1].sum() * back
-            part = weights[number, :-1] / weights[number, :-1].sum()
-            by_logits[number] = by_weight[:-1] - by_weight[:-1].sum() * part
+            slope[place + 4 : place + 3 + self.knots.size] = bends[1:]
+            species, back = by_weight[:-1].sum(), weights[number, -1]
+            slope[self.shares] = by_weight[-1] * (1 - back) - species * back
+            part = weights[number, :-1] / (1 - back)
+            slope[self.shares + 1 :] = (by_weight[:-1] - species * part)[1:]
             if table.learned:
                 at = (table.x - limit) / spread
                 log_seen = log_ndtr(at)
-                total += float(log_seen.sum())
+                values[number] += float(log_seen.sum())
                 rise = np.exp(-0.5 * at**2 - log_seen) / math.sqrt(2 * math.pi)
                 bell = table.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
                 by_node = by_seen.sum(axis=0) * bell
-                slope[self.shares - 2] -= (rise.sum() + by_node.sum()) / spread
-                slope[self.shares - 1] -= (rise @ at + by_node @ at_nodes) / spread
-        return total, slope, by_logits
+                slope[self.shares - 2] = -(rise.sum() + by_node.sum()) / spread
+                slope[self.shares - 1] = -(rise @ at + by_node @ at_nodes) / spread
+        return values, slopes
 
-    @abstractmethod
-    def height(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Log-likelihood of all parameters, with its priors, and its slope."""
+    def likelihood(self, theta: FloatArray) -> tuple[float, FloatArray]:
+        """Log-likelihood with its priors, and its slope.
 
-    def maximum(self, start: FloatArray) -> Minuit:
-        """Maximise the height from a start."""
-        last = lru_cache(maxsize=1)(lambda theta: self.height(np.frombuffer(theta)))
-        inner = _INSIDE * (self.high - self.low)
-        search = Minuit(
-            lambda theta: -last(theta.tobytes())[0],
-            np.clip(start, self.low + inner, self.high - inner),
-            grad=lambda theta: -last(theta.tobytes())[1],
-            name=self.names,
-        )
-        search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
-        search.limits = list(zip(self.low, self.high, strict=True))
-        search.errors = self.scale / math.sqrt(max(self.events, 1))
-        return search.migrad()
-
-
-class Free(Series):
-    """A series whose weights are free in every table: their logits follow the other parameters."""
-
-    def __init__(
-        self, tables: Sequence[Events], composition: FloatArray, masses: FloatArray
-    ) -> None:
-        super().__init__(tables, composition, masses)
-        free = self.number * (self.kinds - 1)
-        self.names += [f"logit {place}" for place in range(free)]
-        self.low = np.append(self.low, np.full(free, -LOGIT_REACH))
-        self.high = np.append(self.high, np.full(free, LOGIT_REACH))
-        self.scale = np.append(self.scale, np.ones(free))
-        self.first = np.append(self.first, np.zeros(free))
-
-    def logits(self, theta: FloatArray) -> FloatArray:
-        """Give the logits of the species, the first 0."""
-        found = theta[self.own :].reshape(self.number, self.kinds - 1)
-        return np.hstack([np.zeros((self.number, 1)), found])
-
-    def height(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Log-likelihood and its slope."""
-        total, slope, by_logits = self.value(theta, self.logits(theta))
-        return total, np.append(slope, by_logits[:, 1:])
+        Shapes: `theta` (p,), slope (p,).
+        """
+        values, slopes = self._scores(theta)
+        distance = self.prior_design @ theta[: self.own] - self.prior_middle
+        slope = np.zeros(theta.shape)
+        slope[: self.own] = -self.prior_design.T @ distance
+        for number, found in enumerate(slopes):
+            slope[self._places(number)] += found
+        return float(values.sum()) - 0.5 * float(distance @ distance), slope
 
     def information(self, theta: FloatArray) -> FloatArray:
-        """Minus the second derivatives of the height.
+        """Minus the second derivatives of `likelihood`, by differences of its slopes.
+
+        Tables share no share and no logit, so that one step in each table's serves all of them.
 
         Shapes: `theta` (p,), result (p, p).
         """
-        rows = []
-        for place, step in enumerate(0.1 * self.scale / math.sqrt(max(self.events, 1))):
-            above, below = theta.copy(), theta.copy()
-            above[place] = min(theta[place] + step, self.high[place])
-            below[place] = max(theta[place] - step, self.low[place])
-            rise = self.height(above)[1] - self.height(below)[1]
-            rows.append(-rise / (above[place] - below[place]))
-        found = np.array(rows)
-        return np.asarray((found + found.T) / 2)
+        here = self._scores(theta)[1]
+        places = np.array([self._places(number) for number in range(self.number)])
+        found = np.zeros((theta.size, theta.size))
+        size = _DIFFERENCE * self.scale / math.sqrt(max(self.events, 1))
+        for column in range(places.shape[1]):
+            moved, at = theta.copy(), np.unique(places[:, column])
+            step = np.where(theta[at] + size[at] > self.high[at], -size[at], size[at])
+            moved[at] += step
+            steps = moved[places[:, column]] - theta[places[:, column]]
+            rise = (here - self._scores(moved)[1]) / steps[:, None]
+            for number, row in enumerate(rise):
+                found[places[number, column], places[number]] += row
+        found = (found + found.T) / 2
+        found[: self.own, : self.own] += self.prior_design.T @ self.prior_design
+        return found
+
+    def problem(self) -> Problem:
+        """Give what is maximised where every table's weights are free."""
+        return Problem(self.likelihood, self.information, self.low, self.high, self.scale)
