@@ -33,7 +33,6 @@ from functools import cache
 import numpy as np
 from scipy.special import chdtrc
 
-from iscat_analysis.errors import DataError
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.intervals import interval
@@ -50,7 +49,9 @@ from iscat_analysis.species.series import Series
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
 _SIGMAS = 1.959964
-_ABOVE = 0.1  # of log-likelihood, by which no point of the profile may exceed the maximum
+_TURNED = 0.6  # of a peak's width: tails from which other maxima are sought
+_HIGHER = 1e-3  # of log-likelihood: another maximum than the one that was found
+_SAME = 1e-4  # of log-likelihood: two ways to one maximum
 _FIRST_STEP = 0.1  # of ln K_D towards an end of its interval
 _PROFILE = 9  # points of the profile between the ends of the interval
 _STEP = 1e-4  # of ln K_D and of β, for their slopes
@@ -102,14 +103,14 @@ def fit_equilibrium(
     series = Series(tables, COMPOSITION[model], np.array(masses_kda, float))
     free = maximise(series.problem(), series.first)
     equilibrium = _Equilibrium(series, totals_nm, model, power, inactive)
-    found = equilibrium.fit(free.theta)
-    other = _Equilibrium(series, totals_nm, model, power, not inactive).fit(found.theta)
+    found, (low, high, points) = _profiled(equilibrium, equilibrium.maxima(free))
+    full = equilibrium.full(found.theta)
+    free = maximise(series.problem(), full)
+    other = _Equilibrium(series, totals_nm, model, power, not inactive).near(found.theta)
     gain = max(2 * (found.value - other.value) * (1 if inactive else -1), 0.0)
     chi2 = max(2 * (free.value - found.value), 0.0)
     dof = len(tables) * (series.kinds - 1) - 1 - int(inactive)
     logits, errors, complexes = _observed(series, free)
-    low, high, points = _interval(equilibrium, found)
-    full = equilibrium.full(found.theta)
     shared, landed = series.shared(full), series.logits(full)
     predicted = _share(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
     reach = _SIGMAS * errors
@@ -231,18 +232,30 @@ class _Equilibrium:
         """Give what is maximised."""
         return Problem(self.height, self.curvature, self.low, self.high, self.scale)
 
-    def fit(self, near: FloatArray) -> Maximum:
-        """Maximise over everything, from the best of a grid of K_D.
+    def near(self, theta: FloatArray) -> Maximum:
+        """Climb from shared parameters and a K_D that are about right.
 
-        Shapes: `near` (at least own,), parameters of which the shared ones are taken.
+        Shapes: `theta` (at least own + 1,).
         """
-        begun = np.concatenate([near[: self.at], self.first[self.at :]])
-        starts = []
-        for ln_kd in np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]:
-            theta = begun.copy()
-            theta[self.at] = ln_kd
-            starts.append((self.height(theta)[0], theta))
-        return maximise(self.problem(), max(starts, key=lambda one: one[0])[1])
+        added = self.first[self.at + 1 :]
+        return maximise(self.problem(), np.concatenate([theta[: self.at + 1], added]))
+
+    def maxima(self, free: Maximum) -> list[Maximum]:
+        """Give maxima, the highest first, from what was found with free weights.
+
+        A tail, the background's bends and a limit of detection can stand for each other: there may
+        be one maximum for tails of either sign.  Of K_D the start is the best of a grid.
+        """
+        logits = free.theta[self.at :]
+        grid = np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]
+        others = self.first[self.at + 1 :]
+        far = [np.sum(np.abs(self._logits(np.append(one, others)) - logits)) for one in grid]
+        theta = np.append(free.theta[: self.at], grid[int(np.argmin(far))])
+        found = [self.near(theta)]
+        for tail in (-_TURNED, _TURNED):
+            turned = self.series.turned(found[0].theta, tail * self.series.width)
+            found.append(maximise(self.problem(), turned))
+        return sorted(found, key=lambda one: -one.value)
 
 
 def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -262,36 +275,56 @@ def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, Fl
     return logits, errors, _share(logits)
 
 
-def _interval(equilibrium: _Equilibrium, found: Maximum) -> tuple[float, float, FloatArray]:
-    """Give the interval of K_D, and points of the profile of ln K_D between its ends."""
-    at = equilibrium.at
-    problem = equilibrium.problem()
-    best, least, most = float(found.theta[at]), problem.low[at], problem.high[at]
-    along = {best: found}
+def _profiled(
+    equilibrium: _Equilibrium, maxima: list[Maximum]
+) -> tuple[Maximum, tuple[float, float, FloatArray]]:
+    """Give the highest maximum, and the interval of K_D about it.
+
+    A profile may lead to yet another maximum that is higher; then it is done again from there.
+    """
+    while True:
+        interval_of_kd, reached = _interval(equilibrium, maxima)
+        if reached.value < maxima[0].value + _HIGHER:
+            return maxima[0], interval_of_kd
+        maxima = [maximise(equilibrium.problem(), reached.theta), *maxima]
+
+
+def _interval(
+    equilibrium: _Equilibrium, maxima: list[Maximum]
+) -> tuple[tuple[float, float, FloatArray], Maximum]:
+    """Give the interval of K_D with points of the profile of ln K_D, and its highest point.
+
+    The profile is followed from every maximum, and the highest counts.
+    """
+    at, found, problem = equilibrium.at, maxima[0], equilibrium.problem()
+    best, least, most = float(found.theta[at]), float(problem.low[at]), float(problem.high[at])
+    different: list[Maximum] = []
+    for one in maxima:
+        if all(abs(one.value - other.value) > _SAME for other in different):
+            different.append(one)
+    branches = [{float(one.theta[at]): one} for one in different]
 
     @cache
     def deviance(ln_kd: float) -> float:
-        nearest = along[min(along, key=lambda place: abs(place - ln_kd))]
-        low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
-        low[at] = high[at] = start[at] = ln_kd
-        held = maximise(replace(problem, low=low, high=high), start, nearest.curvature)
-        along[ln_kd] = held
-        if held.value > found.value + _ABOVE:
-            raise DataError(
-                "K_D: the fit did not end at the largest likelihood, which lies near "
-                f"{math.exp(ln_kd):.3g} nM: give the masses, or hold the landing exponent"
-            )
-        return 2 * max(found.value - held.value, 0.0)
+        for branch in branches:
+            nearest = branch[min(branch, key=lambda place: abs(place - ln_kd))]
+            low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
+            low[at] = high[at] = start[at] = ln_kd
+            held = replace(problem, low=low, high=high)
+            branch[ln_kd] = maximise(held, start, nearest.curvature)
+        return 2 * max(found.value - max(branch[ln_kd].value for branch in branches), 0.0)
 
     first = _SIGMAS * math.sqrt(float(found.covariance()[at, at]))
     low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])
-    return (
+    reached = (point for branch in branches for point in branch.values())
+    ends = (
         math.exp(low) if low > least else 0.0,
         math.exp(high) if high < most else math.inf,
         points,
     )
+    return ends, max(reached, key=lambda one: one.value)
 
 
 def _share(logits: FloatArray) -> FloatArray:

@@ -108,16 +108,21 @@ def _newton(
     """
     scale = problem.scale
     down, up = (problem.low - theta) / scale, (problem.high - theta) / scale
-    rise, curve = slope * scale, bend * np.outer(scale, scale)
-    step, free = np.zeros(theta.shape), ~_held(problem, theta, slope)
+    rise, free = slope * scale, ~_held(problem, theta, slope)
+    size, axes = np.linalg.eigh((bend * np.outer(scale, scale))[np.ix_(free, free)])
+    curve = np.eye(theta.size)
+    curve[np.ix_(free, free)] = (axes * np.maximum(np.abs(size), _FLATTEST)) @ axes.T
+    step, straight = np.zeros(theta.shape), None
     while free.any():
-        size, axes = np.linalg.eigh(curve[np.ix_(free, free)])
         wanted = rise[free] - curve[np.ix_(free, ~free)] @ step[~free]
-        step[free] = axes @ (axes.T @ wanted / np.maximum(np.abs(size), _FLATTEST))
+        step[free] = np.linalg.solve(curve[np.ix_(free, free)], wanted)
+        straight = step.copy() if straight is None else straight
         beyond = free & ((step < down) | (step > up))
         if not beyond.any():
             break
         step[beyond] = np.clip(step, down, up)[beyond]
         free = free & ~beyond
+    if straight is not None and step @ rise <= 0:  # the limits turned it round
+        step = straight
     step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), _FARTHEST))
     return step * scale, 0.5 * float(step @ rise)

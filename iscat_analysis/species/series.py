@@ -43,7 +43,8 @@ _LONGEST = 0.4  # of the lightest: a tail
 _UNEQUAL = 0.5  # of the squared width: how the widths of species differ
 _SKEW = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
 _BEND = 1.5  # of the logarithm of the background's density from one middle to another
-_FIRST_BACKGROUND, _BACKGROUND = -5.0, 2.0  # its logit
+_FIRST_BACKGROUND, _BACKGROUND = -5.0, 2.0  # logit of its share: of the series
+_UNLIKE = 1.0  # of one table about that
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
 _LIMIT = 0.5  # of the lightest mass: where the limit may lie about the lower end of the events
 _RISING = 0.02  # quantile of the events where their edge is sought
@@ -51,6 +52,7 @@ _NODES = 64
 _KINDS = 8  # of noise, in each table
 _NEAR = 0.4  # of the lightest mass: events of a peak
 _MAD = 1.4826
+_NARROW = 0.1  # of the squared width: what a start leaves beside the tail
 _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 
 
@@ -211,14 +213,19 @@ class Series:
             at = self.shares - 2
             rows.append(({at: 1.0}, float(self.first[at]), _LIMIT * lightest))
             rows.append(({at + 1: 1.0}, _SOFT * self.width, _SOFTNESS * self.width))
-        rows += [
-            ({self.shares + n: 1.0}, _FIRST_BACKGROUND, _BACKGROUND) for n in range(self.number)
-        ]
         self.prior_design = np.zeros((len(rows), self.own))
         for row, (parts, _, width) in enumerate(rows):
             for at, value in parts.items():
                 self.prior_design[row, at] = value / width
         self.prior_middle = np.array([middle / width for _, middle, width in rows])
+        # Shares of background scatter about a level that they have in common.
+        covariance = np.full((self.number, self.number), _BACKGROUND**2)
+        covariance += _UNLIKE**2 * np.eye(self.number)
+        apart = np.zeros((self.number, self.own))
+        apart[:, self.shares :] = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.prior_design = np.vstack([self.prior_design, apart])
+        level = np.full(self.number, _FIRST_BACKGROUND)
+        self.prior_middle = np.append(self.prior_middle, apart[:, self.shares :] @ level)
 
     def shared(self, theta: FloatArray) -> Shared:
         """Give what parameters stand for."""
@@ -333,6 +340,20 @@ class Series:
                 found[places[number, column], places[number]] += row
         found = (found + found.T) / 2
         found[: self.own, : self.own] += self.prior_design.T @ self.prior_design
+        return found
+
+    def turned(self, theta: FloatArray, tail: float) -> FloatArray:
+        """Give peaks as wide and in the same places with another tail, on a level background.
+
+        Shapes: `theta` (at least own,), result the same.
+        """
+        found, at = theta.copy(), self.parts
+        least = _NARROW * self.width**2
+        found[at] += theta[at + 3] - tail
+        found[at + 1 : at + 3] += theta[at + 3] ** 2 - tail**2
+        found[at + 1 : at + 3] = np.maximum(found[at + 1 : at + 3], least)
+        found[at + 3] = tail
+        found[at + 4 : at + 3 + self.knots.size] = 0.0
         return found
 
     def problem(self) -> Problem:
