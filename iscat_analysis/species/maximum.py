@@ -18,11 +18,11 @@ import numpy as np
 from iscat_analysis.records import BoolArray, FloatArray
 
 _MOST_STEPS = 100
-_PRECISE = 1e-6  # of the height that is left to gain
+_PRECISE = 1e-5  # of the height that is left to gain: 0.005 standard errors of a log-likelihood
 _FARTHEST = 3.0  # scales of a parameter that a step may go
 _ENOUGH = 1e-4  # of the rise along the slope (Armijo)
 _SHORTEST = 1e-6  # of a step
-_CONTRACTS = 0.1  # of what was left to gain, after a step whose second derivatives were right
+_CONTRACTS = 0.3  # of what was left to gain, after a step whose second derivatives were right
 _FLATTEST = 1e-6  # second derivative, in units of the scales
 
 

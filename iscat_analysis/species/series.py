@@ -42,9 +42,10 @@ _WIDEST = 0.35  # of the lightest: standard deviation of a species
 _LONGEST = 0.4  # of the lightest: a tail
 _UNEQUAL = 0.5  # of the squared width: how the widths of species differ
 _SKEW = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
-_BEND = 1.5  # of the logarithm of the background's density from one middle to another
-_FIRST_BACKGROUND, _BACKGROUND = -5.0, 2.0  # logit of its share: of the series
-_UNLIKE = 1.0  # of one table about that
+_SLOPE = 0.7  # of the logarithm of the background's density over the window
+_BEND = 0.15  # of the same between its middles, away from the line between their neighbours
+_FIRST_BACKGROUND, _BACKGROUND = -6.0, 3.0  # logit of its share: of the series
+_UNLIKE = 0.7  # of one table about that
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
 _LIMIT = 0.5  # of the lightest mass: where the limit may lie about the lower end of the events
 _RISING = 0.02  # quantile of the events where their edge is sought
@@ -207,8 +208,12 @@ class Series:
         rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
         rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _UNEQUAL * self.width**2))
         rows.append(({place + 3: 1.0}, 0.0, _SKEW * self.width))
-        bends = self.knots.size - 1
-        rows += [({place + 4 + bend: 1.0}, 0.0, _BEND) for bend in range(bends)]
+        last = self.shares - (2 if self.learned else 0) - 1
+        rows.append(({last: 1.0}, 0.0, _SLOPE))
+        for knot in range(1, self.knots.size - 1):
+            at = place + 3 + knot  # the first knot's logarithm is 0 and no parameter
+            below = {at - 1: -0.5} if knot > 1 else {}
+            rows.append(({**below, at: 1.0, at + 1: -0.5}, 0.0, _BEND))
         if self.learned:
             at = self.shares - 2
             rows.append(({at: 1.0}, float(self.first[at]), _LIMIT * lightest))
