@@ -2,13 +2,13 @@
 
     python benchmarks/equilibria.py [--trials N] [--only KIND]
 
-A series is six tables of 600 events, 1 to 300 nM of a monomer of 66 kDa with K_D = 10 nM.  Each kind
-has one thing that a table of another laboratory may have: see `KINDS`.  The fit is told that the
-monomer has about 64 kDa.  The landing exponent is fitted with what is known of it, −1/6 ± 1/6.
+A series is six tables of 600 events, 1 to 300 nM of a monomer of 66 kDa with K_D = 10 nM.  In each
+kind there is one thing that the tables of a laboratory may have: see `KINDS`.  The fit is told that
+the monomer has about 64 kDa.  The landing exponent is fitted with what is known of it, −1/6 ± 1/6.
 
-A series' K_D is off by its logarithm over the truth.  Beside the mean over series stand its standard
-error, the scatter of the series, and the standard error that the intervals claim, which includes
-that of the exponent: series of which all have the same exponent scatter less.
+A series' K_D is off by its logarithm over the truth.  Beside the mean over series stand its
+standard error, the scatter of the series, and the standard error that the intervals claim, which
+includes that of the exponent: series of which all have the same exponent scatter less.
 """
 
 from __future__ import annotations
@@ -128,7 +128,9 @@ def main() -> int:
         )
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "equilibria.json").write_text(json.dumps(found, indent=2) + "\n")
-    return int(any(one["covered"] < LEAST_COVERED - 4 * one["covered_se"] for one in found.values()))
+    return int(
+        any(one["covered"] < LEAST_COVERED - 4 * one["covered_se"] for one in found.values())
+    )
 
 
 if __name__ == "__main__":

@@ -125,7 +125,7 @@ def fit_equilibrium(
         inactive_p=float(chdtrc(1, gain)) / 2,
         landing_power=constants.get("power", power),
         landing_power_se=constant_errors.get("power", 0.0),
-        masses_kda=shared.mean,
+        masses_kda=series.modes(full),
         width_kda=math.sqrt(float(shared.variance[0])),
         tail_kda=shared.tail,
         limit_kda=shared.limit[0],

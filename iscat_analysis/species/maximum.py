@@ -19,6 +19,7 @@ from iscat_analysis.records import BoolArray, FloatArray
 
 _MOST_STEPS = 100
 _PRECISE = 1e-5  # of the height that is left to gain: 0.005 standard errors of a log-likelihood
+_AT_REST = 1e-9  # the same on a saddle, which a step doubles the distance from
 _FARTHEST = 3.0  # scales of a parameter that a step may go
 _ENOUGH = 1e-4  # of the rise along the slope (Armijo)
 _SHORTEST = 1e-6  # of a step
@@ -70,11 +71,11 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
     bend, fresh = (problem.curvature(theta), True) if near is None else (near, False)
     before = np.inf
     for _ in range(_MOST_STEPS):
-        step, left = _newton(problem, theta, slope, bend)
-        if not fresh and left > max(_CONTRACTS * before, _PRECISE):
+        step, left, peaked = _newton(problem, theta, slope, bend)
+        if not fresh and (left > max(_CONTRACTS * before, _PRECISE) or not peaked):
             bend, fresh = problem.curvature(theta), True
-            step, left = _newton(problem, theta, slope, bend)
-        if left < _PRECISE:
+            step, left, peaked = _newton(problem, theta, slope, bend)
+        if left < (_PRECISE if peaked else _AT_REST):
             break
         reach = 1.0
         while reach > _SHORTEST:
@@ -101,8 +102,8 @@ def _held(problem: Problem, theta: FloatArray, slope: FloatArray) -> BoolArray:
 
 def _newton(
     problem: Problem, theta: FloatArray, slope: FloatArray, bend: FloatArray
-) -> tuple[FloatArray, float]:
-    """Give the step to the maximum of the parabola within limits, and its rise along the slope / 2.
+) -> tuple[FloatArray, float, bool]:
+    """Give the step to the parabola's maximum within limits, half its rise, and if it is one.
 
     Shapes: `theta, slope` (p,), `bend` (p, p), step (p,).
     """
@@ -125,4 +126,4 @@ def _newton(
     if straight is not None and step @ rise <= 0:  # the limits turned it round
         step = straight
     step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), _FARTHEST))
-    return step * scale, 0.5 * float(step @ rise)
+    return step * scale, 0.5 * float(step @ rise), bool(np.all(size > -_FLATTEST))

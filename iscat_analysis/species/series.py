@@ -27,8 +27,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr
+from scipy.special import erfcx, log_ndtr, ndtr
 
 from iscat_analysis._kernels.tailed_mixture import tailed_score
 from iscat_analysis.records import FloatArray
@@ -54,6 +55,7 @@ _KINDS = 8  # of noise, in each table
 _NEAR = 0.4  # of the lightest mass: events of a peak
 _MAD = 1.4826
 _NARROW = 0.1  # of the squared width: what a start leaves beside the tail
+_NO_TAIL = 1e-3  # of a peak's width
 _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 
 
@@ -109,6 +111,7 @@ class Series:
         self.events = everything.size
         total = self._width(everything) ** 2 if self.events else (0.1 * lightest) ** 2
         typical = float(np.median(noise)) if self.events else 1.0
+        self.noise = typical
         self.width = math.sqrt(max(total, typical))
         self.knots = self._middles()
         self.tables = [self._window(table) for table in tables]
@@ -244,6 +247,30 @@ class Series:
         if self.learned:
             limit = float(theta[self.shares - 2]), float(theta[self.shares - 1])
         return Shared(mean, variance, float(tail), shape / shape.sum(), limit)
+
+    def modes(self, theta: FloatArray) -> FloatArray:
+        """Give the masses at which the peaks are highest, for the median noise of events.
+
+        There the density of the peak is that of its normal part alone; of what a tail moves, means
+        and their offset, it is what the events tell.
+
+        Shapes: result (k,).
+        """
+        now = self.shared(theta)
+        tail = abs(now.tail)
+        found = now.mean.copy()
+        for number, width in enumerate(np.sqrt(now.variance + self.noise)):
+            shift = tail
+            if tail > _NO_TAIL * width:
+                level = math.sqrt(2 / math.pi) * tail / width
+
+                def excess(away: float, width: float = width, level: float = level) -> float:
+                    at = (width / tail - away / width) / math.sqrt(2)
+                    return float(erfcx(at)) - level
+
+                shift = float(scipy.optimize.brentq(excess, 0.0, tail))
+            found[number] += math.copysign(shift, now.tail)
+        return found
 
     def logits(self, theta: FloatArray) -> FloatArray:
         """Give the logits of the species of each table, the first 0.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from iscat_analysis.species.mass_action import (
     at_equilibrium,
     landing_logits,
 )
-from iscat_analysis.species.series import Free, Series
+from iscat_analysis.species.maximum import Problem, maximise
+from iscat_analysis.species.series import Series
 from iscat_analysis.species.tables import event_table
 
 EFFICIENCY = Efficiency(5.0, 13.0)
@@ -69,7 +71,7 @@ def test_landings_follow_the_power() -> None:
 @pytest.mark.parametrize("model", ["dimer", "ab"])
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("weights", ["free", "equilibrium"])
-def test_the_likelihood_has_the_slope_that_differences_give(
+def test_the_likelihood_has_the_slope_and_bend_that_differences_give(
     model: Model, known: bool, weights: str
 ) -> None:
     random = np.random.default_rng(5)
@@ -79,17 +81,52 @@ def test_the_likelihood_has_the_slope_that_differences_give(
     events = [event_table(table).events for table in tables]
     if not known:  # neither the errors nor what was missed
         events = [Events(one.x, np.ones(one.x.size), None) for one in events]
-    series: Series = (
-        Free(events, COMPOSITION[model], np.array(masses))
-        if weights == "free"
-        else _Equilibrium(events, totals, model, np.array(masses), None, True)
-    )
-    theta = series.first + 0.02 * series.scale * random.normal(size=series.first.size)
-    value, slope = series.height(theta)
-    steps = np.diag(1e-4 * series.scale)
-    numerical = [(series.height(theta + h)[0] - series.height(theta - h)[0]) / 2e-4 for h in steps]
+    series = Series(events, COMPOSITION[model], np.array(masses))
+    equilibrium = _Equilibrium(series, totals, model, None, True)
+    problem = series.problem() if weights == "free" else equilibrium.problem()
+    first = series.first if weights == "free" else equilibrium.first
+    theta = first + 0.02 * problem.scale * random.normal(size=first.size)
+    value, slope = problem.height(theta)
     assert np.isfinite(value)
-    assert slope * series.scale == pytest.approx(np.array(numerical), rel=1e-5, abs=1e-4)
+    step = 1e-4
+    steps = np.diag(step * problem.scale)
+    moved = [(problem.height(theta + h), problem.height(theta - h)) for h in steps]
+    numerical = [(above[0] - below[0]) / (2 * step) for above, below in moved]
+    assert slope * problem.scale == pytest.approx(np.array(numerical), rel=1e-5, abs=1e-4)
+    bends = np.array([(below[1] - above[1]) / (2 * step) for above, below in moved])
+    scale = np.outer(problem.scale, problem.scale)
+    expected = bends * problem.scale
+    size = np.sqrt(np.outer(np.abs(np.diag(expected)), np.abs(np.diag(expected))))
+    assert np.all(np.abs(problem.curvature(theta) * scale - expected) < 2e-3 * size + 1e-3)
+
+
+def test_a_maximum_at_limits_and_from_a_saddle_is_found() -> None:
+    """Rosenbrock's valley with a wall across it, and two peaks from the saddle between them."""
+
+    def valley(theta):
+        x, y = theta
+        slope = np.array([2 * (1 - x) + 400 * x * (y - x * x), -200 * (y - x * x)])
+        return -((1 - x) ** 2) - 100 * (y - x * x) ** 2, slope
+
+    def valley_bend(theta):
+        x, y = theta
+        return np.array([[2 - 400 * (y - 3 * x * x), -400 * x], [-400 * x, 200.0]])
+
+    one = np.ones(2)
+    problem = Problem(valley, valley_bend, -5 * one, 5 * one, one)
+    found = maximise(problem, np.array([-1.2, 1.0]))
+    assert found.theta == pytest.approx([1, 1], abs=1e-2)
+    walled = maximise(replace(problem, high=np.array([0.5, 5.0])), np.array([-1.2, 1.0]))
+    assert walled.theta == pytest.approx([0.5, 0.25], abs=1e-4)
+    assert walled.free.tolist() == [False, True]
+    assert walled.covariance() == pytest.approx(np.diag([0, 1 / 200]))
+
+    def peaks(theta):
+        x, y = theta
+        return -((x**2 - 1) ** 2) - y**2, np.array([-4 * x * (x**2 - 1), -2 * y])
+
+    both = Problem(peaks, lambda at: np.diag([12 * at[0] ** 2 - 4, 2.0]), -5 * one, 5 * one, one)
+    assert maximise(both, np.array([1e-3, 3.0])).theta == pytest.approx([1, 0], abs=1e-2)
 
 
 @pytest.mark.parametrize("tail", [0.01, 0.3, 2.0, 12.0, -12.0])
