@@ -115,7 +115,7 @@ class Kd(Document):
     inactive: float = key("Part of monomers, or of A, that does not bind; 0 where not fitted")
     inactive_se: Number = key("Its standard error; null where it was not fitted")
     inactive_p: Share = key("Chance of such a gain by an inactive part if there is none")
-    masses_kda: list[float] = key("Masses of the species [kDa], the complex last")
+    masses_kda: list[float] = key("Masses at which the species' peaks are highest [kDa], the complex last")
     width_kda: float = key("Width of the lightest species beside the events' own errors [kDa]")
     tail_kda: float = key("Mean of the peaks' exponential tail, negative towards light ones [kDa]")
     limit_kda: Number = key("Mass detected every other time where the tables' edge tells [kDa]")

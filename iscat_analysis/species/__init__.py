@@ -25,7 +25,8 @@ species, `structure` maximises the likelihood above where species or samples sha
 repeats the measurement, and `curves` holds what is drawn.  `tables` reads events of any program.
 
 `comparison` asks whether two samples are one.  `equilibrium` fits a constant to a series of
-concentrations, with the law of `mass_action`, and `kinetics` the rates of landing and leaving.
+concentrations, with the law of `mass_action` and the likelihood of `series`, which `maximum`
+maximises; `kinetics` has the rates of landing and leaving.
 
 A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
 and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the

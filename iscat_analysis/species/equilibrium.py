@@ -14,8 +14,12 @@ flows and whether the surface keeps all that reach it: a normal distribution abo
 standard deviation of 1/6 enters the likelihood.  A ratio of two masses shifts ln K_D of dimers by
 0.1 to 0.2 between these.
 
+A tail of either sign, the background and a limit of detection can stand for each other, and the
+likelihood has two maxima in every fifth series with a limit, of heights that differ by tenths.  The
+fit therefore starts from tails of either sign, and takes the highest.
+
 The interval of K_D is where the likelihood, maximised over everything else, lies within 1.92 of its
-maximum (James & Roos, Comput. Phys. Commun. 10, 343, 1975).  The model is tested against one whose
+maximum (James & Roos, Comput. Phys. Commun. 10, 343, 1975); it is followed from every maximum.  The model is tested against one whose
 weights are free in every table, with the same masses and width: twice the gain is χ² with as many
 degrees of freedom as there are weights more.  Proteins that do not bind, concentrations that are
 not as labelled and replicates that disagree show there.  An inactive part, which shifts all tables
@@ -123,7 +127,7 @@ def fit_equilibrium(
         inactive=constants.get("inactive", 0.0),
         inactive_se=constant_errors.get("inactive", math.nan),
         inactive_p=float(chdtrc(1, gain)) / 2,
-        landing_power=constants.get("power", power),
+        landing_power=constants["power"] if power is None else power,
         landing_power_se=constant_errors.get("power", 0.0),
         masses_kda=series.modes(full),
         width_kda=math.sqrt(float(shared.variance[0])),

@@ -8,8 +8,8 @@ them, have in common:
 - Peaks with an exponential tail t, of either sign (`_kernels.tailed_mixture`), and a variance that
   goes with the mass, from that of the lightest to that of the complex.
 - A background whose density is learned: it is linear between the middles of the gaps between
-  species, so that it bends nowhere under a peak, and is of the same shape in every table.  Its
-  share is each table's own.
+  species, so that it bends nowhere under a peak, and of the same shape in every table.  That shape
+  is smooth: its logarithm is nearly a line.  Shares scatter about a level that the series has.
 - Of tables that do not say what was missed, one chance of detection Φ((x − T)/r) of what was
   measured, T and r learned from their own rising edge.
 
@@ -17,6 +17,11 @@ Events beyond the window, as aggregates, say nothing of the species and are left
 exact: the likelihood is that of events within it.  What is between a peak and the next is described
 by three parameters, and that is why they are there: with normal peaks on a background of given
 density, K_D of skewed peaks was 0.79 of the truth and no interval held it.
+
+A share is no less than 0, and what noise makes of it is taken from the species that is rare: from
+dimers where concentrations are low and from monomers where they are high, which is a larger K_D.
+With a share for each table by itself, and a shape that could pile up beside a peak, clean series had
+2 % of background and a K_D of 1.04; series of which 7 % are background had 5 %, and 0.92.
 """
 
 from __future__ import annotations
