@@ -19,12 +19,13 @@ likelihood has two maxima in every fifth series with a limit, of heights that di
 fit therefore starts from tails of either sign, and takes the highest.
 
 The interval of K_D is where the likelihood, maximised over everything else, lies within 1.92 of its
-maximum (James & Roos, Comput. Phys. Commun. 10, 343, 1975); it is followed from every maximum.  The model is tested against one whose
-weights are free in every table, with the same masses and width: twice the gain is χ² with as many
-degrees of freedom as there are weights more.  Proteins that do not bind, concentrations that are
-not as labelled and replicates that disagree show there.  An inactive part, which shifts all tables
-a little, is asked for by itself: twice the gain of β is half of the time 0, else χ² with one degree
-of freedom, where there is none (Self & Liang, J. Am. Stat. Assoc. 82, 605, 1987).
+maximum (James & Roos, Comput. Phys. Commun. 10, 343, 1975); it is followed from every maximum.
+The model is tested against one whose weights are free in every table, with the same masses and
+width: twice the gain is χ² with as many degrees of freedom as there are weights more.  Proteins
+that do not bind, concentrations that are not as labelled and replicates that disagree show there.
+An inactive part, which shifts all tables a little, is asked for by itself: twice the gain of β is
+half of the time 0, else χ² with one degree of freedom, where there is none (Self & Liang, J. Am.
+Stat. Assoc. 82, 605, 1987).
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ density, K_D of skewed peaks was 0.79 of the truth and no interval held it.
 
 A share is no less than 0, and what noise makes of it is taken from the species that is rare: from
 dimers where concentrations are low and from monomers where they are high, which is a larger K_D.
-With a share for each table by itself, and a shape that could pile up beside a peak, clean series had
-2 % of background and a K_D of 1.04; series of which 7 % are background had 5 %, and 0.92.
+With a share for each table by itself, and a shape that could pile up beside a peak, clean series
+had 2 % of background and a K_D of 1.04; series of which 7 % are background had 5 %, and 0.92.
 """
 
 from __future__ import annotations
