@@ -195,11 +195,11 @@ def print_batch(found: Batch) -> None:
     for row in found.kd.to_dict("records"):
         if not row["why"]:
             p = "" if math.isnan(row["p_value"]) else f", p = {row['p_value']:.2g}"
-            remarks = f"; {row['remarks']}" if row["remarks"] else ""
+            notes = f"; {row['notes']}" if row["remarks"] else ""
             print_result(
                 f"{kd_name(row['condition'])} = {short(row['kd_nm'])} nM (95 %: "
                 f"{short(row['kd_low'])} to {upper_end(row['kd_high'])}), "
-                f"{count(row['movies'], 'movie')}{p}{remarks}"
+                f"{count(row['movies'], 'movie')}{p}{notes}"
             )
     if len(found.movies) > ROWS_SHOWN:
         print_result(f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}")

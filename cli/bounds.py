@@ -275,7 +275,7 @@ def _target(config: Config, text: str) -> dict[str, Any]:
         "target": {
             "parameter": goal.parameter,
             "value": goal.value,
-            "effort": [asdict(way) for way in effort(config, goal)],
+            "effort": [asdict(entry) for entry in effort(config, goal)],
             "budget": [asdict(line) for line in budget(config, goal.parameter)],
             "note": ""
             if config.camera.samples_per_pixel > 1

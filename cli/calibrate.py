@@ -86,14 +86,14 @@ def camera(
     with failures(messages, debug=debug):
         from iscat_analysis.answers.calibrations import camera_calibration
         from iscat_analysis.errors import ConfigError
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
         given = [*(stacks or ()), *([dark] if dark is not None else [])]
         if not given:
             raise ConfigError("give a flat, the movie, or --dark")
         if dark is not None and offset is not None:
             raise ConfigError("--dark measures the offset: leave --offset out")
-        folder = out if out is not None else beside(given[0], ".camera")
+        folder = out if out is not None else path_beside(given[0], ".camera")
         with messages.progress() as progress:
             found = camera_calibration(
                 stacks or (),
@@ -155,9 +155,9 @@ def mass(
         masses, errors = _standards(standards)
 
         from iscat_analysis.answers.calibrations import mass_calibration
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
-        folder = out if out is not None else beside(events, ".calibration")
+        folder = out if out is not None else path_beside(events, ".calibration")
         found = mass_calibration(
             events,
             masses,
@@ -233,9 +233,9 @@ def optics(
         from iscat_analysis.answers.calibrations import optics_calibration
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
-        folder = out if out is not None else beside(movie, ".optics")
+        folder = out if out is not None else path_beside(movie, ".optics")
         with messages.progress() as progress:
             found = optics_calibration(
                 movie,
@@ -277,13 +277,13 @@ def _measure(
     from iscat_analysis.answers.calibrations import template_calibration
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import ConfigError, DataError
-    from iscat_analysis.movie.addresses import beside
+    from iscat_analysis.movie.addresses import path_beside
 
     if free is not None or focus_step is not None:
         raise ConfigError(
             "--measured takes the picture as it is at one focus: leave out --free and --focus-step"
         )
-    folder = out if out is not None else beside(movie, ".optics")
+    folder = out if out is not None else path_beside(movie, ".optics")
     with messages.progress() as progress:
         found = template_calibration(
             movie, load_config(config, settings or ()), folder,

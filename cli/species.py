@@ -316,15 +316,15 @@ def _print(found: Distribution) -> None:
         if row.get("background"):
             shown.add_row("background", "–", "–", "–", short(row["count"]), "–", "–", "–", "–")
             continue
-        hidden = math.isnan(row["count_corrected"])
+        undetectable = math.isnan(row["count_corrected"])
         shown.add_row(
             str(row.get("n", number)),
             short(row["mass_kda"]),
-            "not determined" if hidden else _interval(row["mass_low"], row["mass_high"]),
+            "not determined" if undetectable else _interval(row["mass_low"], row["mass_high"]),
             short(row["width_kda"], 3),
             short(row["count"]),
             f"{100 * row['efficiency']:.3g} %",
-            "–" if hidden else short(row["count_corrected"]),
+            "–" if undetectable else short(row["count_corrected"]),
             "–" if math.isnan(row["fraction"]) else f"{100 * row['fraction']:.3g} %",
             _interval(100 * row["fraction_low"], 100 * row["fraction_high"], 3),
         )

@@ -99,7 +99,7 @@ class Executor(Protocol):
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
         """Do something with every item, several at a time where jobs run elsewhere."""
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
+    def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say what a user should know before work begins."""
 
 
@@ -175,7 +175,7 @@ class LocalExecutor:
                     second.end()
                     self._second = None
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
+    def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say nothing; see `Executor`."""
         del memory_limit_mb
         return []
@@ -229,7 +229,7 @@ class DaskExecutor:
         del jobs
         return wanted
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
+    def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Executor`."""
         if not self._memory:
             return [f"{self._address} has no workers yet; the work begins with the first"]

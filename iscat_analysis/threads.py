@@ -74,7 +74,7 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
-def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
+def start_in_thread(work: Callable[..., T], *arguments: Any) -> Future[T]:
     """Begin work in a thread of its own, with no more threads than are allotted to this one."""
     pool = ThreadPoolExecutor(1)
     begun = pool.submit(copy_context().run, work, *arguments)

@@ -301,8 +301,8 @@ def _read_samples(path: Path) -> pd.DataFrame:
         what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
     except ValueError as error:
-        said = str(error).splitlines()[0] if str(error) else "it is empty"
-        raise DataError(f"{path}: is no CSV file with a first line of names ({said})") from None
+        reason = str(error).splitlines()[0] if str(error) else "it is empty"
+        raise DataError(f"{path}: is no CSV file with a first line of names ({reason})") from None
 
 
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:

@@ -231,11 +231,11 @@ def mass_calibration(
 def analysed_with(events: Path) -> Config | None:
     """Read the configuration with which a table of this package was made; None where it is lost."""
     path = _table(events)
-    beside = path.with_name("config.toml")
-    if path.name != "fits.csv" or not is_file(beside):
+    config_path = path.with_name("config.toml")
+    if path.name != "fits.csv" or not is_file(config_path):
         return None
     try:
-        return load_config(beside)
+        return load_config(config_path)
     except ConfigError:
         return None
 

@@ -35,7 +35,7 @@ def find_amplifier_boundaries(
 
 
 def parts_of(
-    shape: tuple[int, int], seams: AmplifierBoundaries
+    shape: tuple[int, int], boundaries: AmplifierBoundaries
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Tell which rows and columns belong together.
 
@@ -43,9 +43,9 @@ def parts_of(
     """
     rows, columns = (
         np.equal.outer(np.searchsorted(cuts, np.arange(n), side="right"), np.arange(len(cuts) + 1))
-        for n, cuts in zip(shape, seams, strict=True)
+        for n, cuts in zip(shape, boundaries, strict=True)
     )
-    if not any(seams):
+    if not any(boundaries):
         rows, columns = rows[:, :0], columns[:, :0]
     products = np.ones((rows.shape[1], columns.shape[1]), dtype=np.bool_)
     return rows.astype(np.float64), columns.astype(np.float64), products
@@ -56,7 +56,7 @@ def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) ->
     light = changes.light_e.sum(axis=axis - 1)
     lit = light > 0
     before, after = np.moveaxis(changes.sums_e.sum(axis=axis + 1)[..., lit], 1, 0)
-    light, place = light[lit], np.flatnonzero(lit)
+    light, lit_positions = light[lit], np.flatnonzero(lit)
     change = after / after.sum(axis=1, keepdims=True) - before / before.sum(axis=1, keepdims=True)
     change *= light.sum() / np.sqrt(light * changes.noises[:, None])
     count = light.size
@@ -69,7 +69,7 @@ def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) ->
     root = np.sqrt(light)[:, None]
     smooth = root * legvander(np.linspace(-1, 1, count), _SMOOTH)
     steps = root * (np.arange(count)[:, None] >= np.arange(count))
-    tried = np.searchsorted(place, known).tolist()
+    tried = np.searchsorted(lit_positions, known).tolist()
     kept, unexplained = len(tried), np.inf
     significant = float(chdtri(len(change), _BY_CHANCE)) / len(change)
     while True:
@@ -80,14 +80,14 @@ def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) ->
             kept, unexplained = len(tried), left
         if len(tried) == _MOST:
             break
-        ways = steps - basis @ (basis.T @ steps)
+        independent_steps = steps - basis @ (basis.T @ steps)
         far = sharp.copy()
         for cut in (0, *tried, count):
             far[max(cut - _LEAST + 1, 0) : cut + _LEAST] = False
-        size = np.where(far, np.linalg.norm(ways, axis=0), np.inf)
-        gains = np.square(rest @ (ways / size))
+        size = np.where(far, np.linalg.norm(independent_steps, axis=0), np.inf)
+        gains = np.square(rest @ (independent_steps / size))
         best = int(gains.sum(axis=0).argmax())
         if np.median(gains[:, best]) / _NORMAL_SQUARE - 1 < max(significant, least):
             break
         tried.append(best)
-    return tuple(sorted(int(place[k]) for k in tried[:kept]))
+    return tuple(sorted(int(lit_positions[k]) for k in tried[:kept]))

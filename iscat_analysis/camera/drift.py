@@ -90,8 +90,8 @@ def follow_pattern(
     usable = trusted(usable)
     mover = Mover((usable.shape[0], usable.shape[1]))
 
-    def one(place: int) -> tuple[FloatArray, FloatArray, float]:
-        here, before = lit[place], lit[place - 1]
+    def one(number: int) -> tuple[FloatArray, FloatArray, float]:
+        here, before = lit[number], lit[number - 1]
         return _register(
             mover, (blocks_e[before] / still)[nearest], blocks_e[here] / still, usable,
             power[before] * noise, power[here] * noise, float(power[here] / power[before]),
@@ -102,8 +102,8 @@ def follow_pattern(
         return None
     steps = np.array([step for step, _, _ in found])
     errors = np.array([error for _, error, _ in found])
-    way = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
-    return Trajectory(frames[lit], way, np.vstack([errors[:1], errors]))
+    shift = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    return Trajectory(frames[lit], shift, np.vstack([errors[:1], errors]))
 
 
 def _register(

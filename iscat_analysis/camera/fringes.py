@@ -80,9 +80,9 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
     change, light = changes.binned(side)
     if min(light.shape) < _LEAST_SQUARES:
         return NO_FRINGES
-    beside = min(highest, _BESIDE)
+    smooth_degree = min(highest, _BESIDE)
     spread = _NORMAL * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
-    change = _without_smooth(np.clip(change, -_CLIP * spread, _CLIP * spread), beside)
+    change = _without_smooth(np.clip(change, -_CLIP * spread, _CLIP * spread), smooth_degree)
     slowest = min(highest / _DEGREES_PER_WAVE, _SLOWEST)
     least = changes.least(window) / changes.error
     waves, square, rest = np.empty((0, 2)), 0.0, change
@@ -90,8 +90,8 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
         peak = _peak(rest, slowest)
         if peak is None:
             break
-        found = _refined(change, light, np.vstack([waves, peak]), beside)
-        beyond, left = _explained(change, light, Fringes(found), beside)
+        found = _refined(change, light, np.vstack([waves, peak]), smooth_degree)
+        beyond, left = _explained(change, light, Fringes(found), smooth_degree)
         if beyond - square < least:
             break
         waves, square, rest = found, beyond, left
@@ -101,13 +101,15 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
     room = changes.used.sum() / _PIXELS_PER_TERM
     most = max(k for k in range(_STEEPEST + 1) if not k or len(waves) * (k + 1) * (k + 2) <= room)
     squares = np.array([
-        _explained(change, light, Fringes(waves, k), beside)[0] for k in range(most + 1)
+        _explained(change, light, Fringes(waves, k), smooth_degree)[0] for k in range(most + 1)
     ])  # fmt: skip
     degree = int(np.flatnonzero(squares > squares.max() - least).min())
     return Fringes(waves / side, degree, math.sqrt(max(squares[degree], 0.0) * changes.error))
 
 
-def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: int) -> FloatArray:
+def _refined(
+    change: FloatArray, light: FloatArray, waves: FloatArray, smooth_degree: int
+) -> FloatArray:
     """Give waves the vectors with which they leave least, beside a polynomial.
 
     A wave whose vector is off by d leaves i d·r of itself (Gauss-Newton).
@@ -118,7 +120,7 @@ def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: i
         phase = waves[:, :1, None] * y[:, None] + waves[:, 1:, None] * x
         both = root * np.stack([np.cos(phase), np.sin(phase)])
         parts = np.concatenate([both, both * y[:, None], both * x])
-        terms = _without_smooth(parts.reshape(-1, *light.shape), beside)
+        terms = _without_smooth(parts.reshape(-1, *light.shape), smooth_degree)
         found, *_ = np.linalg.lstsq(terms.reshape(len(terms), -1).T, flat.T, rcond=None)
         ahead, behind = np.moveaxis(found.reshape(3, 2, len(waves), -1), 1, 0)
         height, slope = ahead[0] - 1j * behind[0], ahead[1:] - 1j * behind[1:]
@@ -128,7 +130,7 @@ def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: i
 
 
 def _explained(
-    change: FloatArray, light: FloatArray, fringes: Fringes, beside: int
+    change: FloatArray, light: FloatArray, fringes: Fringes, smooth_degree: int
 ) -> tuple[float, FloatArray]:
     """Fit fringes beside a polynomial, which is no part of the changes any more.
 
@@ -137,7 +139,7 @@ def _explained(
     rows, columns, products = fringes.axes(light.shape)
     down, along = np.nonzero(products)
     terms = np.sqrt(light) * rows.T[down][:, :, None] * columns.T[along][:, None]
-    basis, _ = np.linalg.qr(_without_smooth(terms, beside).reshape(len(terms), -1).T)
+    basis, _ = np.linalg.qr(_without_smooth(terms, smooth_degree).reshape(len(terms), -1).T)
     seen = change.reshape(len(change), -1) @ basis
     rest = change - (seen @ basis.T).reshape(change.shape)
     return float((np.square(seen) - 1).sum()) / len(change), rest
@@ -149,8 +151,8 @@ def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
         np.linalg.qr(legvander(np.linspace(-1, 1, n), degree))[0] for n in change.shape[1:]
     )
     degrees = np.arange(degree + 1)
-    kept = np.add.outer(degrees, degrees) <= degree
-    return np.asarray(change - rows @ (kept * (rows.T @ change @ columns)) @ columns.T)
+    low_orders = np.add.outer(degrees, degrees) <= degree
+    return np.asarray(change - rows @ (low_orders * (rows.T @ change @ columns)) @ columns.T)
 
 
 def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
@@ -171,14 +173,14 @@ def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
     wave = 2 * np.pi * np.array(sampled)
     step = np.pi / np.array([high, wide])
     for _ in range(_ZOOMS):
-        ways = wave[:, None] + step[:, None] * np.arange(-2, 3)
+        trial_waves = wave[:, None] + step[:, None] * np.arange(-2, 3)
         down, along = (
-            np.exp(-1j * np.outer(way, np.arange(n)))
-            for way, n in zip(ways, (high, wide), strict=True)
+            np.exp(-1j * np.outer(trial, np.arange(n)))
+            for trial, n in zip(trial_waves, (high, wide), strict=True)
         )
         near = np.square(np.abs(down @ seen @ along.T)).sum(axis=0)
         best = np.unravel_index(int(near.argmax()), near.shape)
-        wave = np.array([ways[0, best[0]], ways[1, best[1]]])
+        wave = np.array([trial_waves[0, best[0]], trial_waves[1, best[1]]])
         step = step / 2
     return wave
 

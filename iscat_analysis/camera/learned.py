@@ -21,7 +21,7 @@ from iscat_analysis.camera.calibration.laws import Law, find_law
 from iscat_analysis.camera.calibration.transfer import Transfer, measure_transfer
 from iscat_analysis.camera.counts import Camera, camera_from_config, rounding_variance_adu2
 from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain
-from iscat_analysis.camera.pattern_jitter import without_shaking
+from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.response import Response, full_scale, linear, response_of
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.camera.successive import averaged_noise
@@ -37,11 +37,12 @@ EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at, a second
 _LEAST_FRAMES = 8
 _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
-_LOOKS = 24  # frames all over a movie, that tell how much light there is
+_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST = 64  # frames among which some may be dark
 _DARK = 0.5  # of the usual counts, below which a frame may be without light
 _LEAST = 0.01  # of the usual counts, by which dark frames may differ
-_TOLD, _LEAK = 0.1, 0.1  # of what the counts of dark frames would show, if they were light
+# of what the counts of dark frames would show, if they were light: its error, and itself
+_LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
 _BLINKS = 4.0  # times the median, of the noise of a pixel in the dark that is left out
 _QUIET = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
@@ -75,7 +76,7 @@ class LearnedCamera:
     response: Response | None = None
 
     @property
-    def said(self) -> str:
+    def description(self) -> str:
         """Give the numbers and where they come from, in one line."""
         parts = []
         for key, words in (
@@ -173,7 +174,7 @@ def _sample(
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
     total = movie.shape[0]
-    looks = np.unique(np.linspace(span[0], span[1] - 1, _LOOKS).astype(int)).tolist()
+    looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
     opening = _finite(movie.read(0, min(_FIRST, total)))
     if not levels or not len(opening):
@@ -213,8 +214,8 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
     rest = float(np.mean((apart - share * pattern) ** 2))
     error = math.sqrt(rest / power) if power > 0 else math.inf
-    if error < _TOLD * as_light:
-        return abs(share) < _LEAK * as_light + 3 * error
+    if error < _LIT_SHARE_ERROR * as_light:
+        return abs(share) < _LIT_SHARE * as_light + 3 * error
     noise = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
     return noise < _QUIET * as_light * _noise_adu2(lit)
 
@@ -334,7 +335,7 @@ class _Learning:
         longer = averaged_noise(counts, seen)
         if longer is not None:
             return found.gain_e_per_adu / longer, found.gain_se / longer, EFFECTIVE
-        still = without_shaking(counts[:_FIRST], seen)
+        still = without_pattern_jitter(counts[:_FIRST], seen)
         calm, rough = (_short(part, seen) for part in (still, counts[:_FIRST].astype(np.float64)))
         if calm is not None and rough is not None:
             ratio = calm.noise_ratio / rough.noise_ratio

@@ -61,52 +61,58 @@ class Surface:
     degree: int
     rms: float = math.nan
     fringes: Fringes = NO_FRINGES
-    seams: AmplifierBoundaries = ((), ())
-    haze: float = 0.0
+    amplifier_boundaries: AmplifierBoundaries = ((), ())
+    stray_light: float = 0.0
 
     @property
     def measures(self) -> bool:
         """Whether anything changes."""
-        return bool(self.degree or len(self.fringes.waves) or any(self.seams) or self.haze)
+        return bool(
+            self.degree
+            or len(self.fringes.waves)
+            or any(self.amplifier_boundaries)
+            or self.stray_light
+        )
 
     @property
     def messages(self) -> list[str]:
         """What the user should know, one line each."""
-        said = []
+        lines = []
         if self.degree:
-            said.append(
+            lines.append(
                 f"the light changes slowly over the field, by {100 * self.rms:.2g} % rms between "
                 "frames that are compared, as where the beam wanders or fringes pass: each frame "
                 f"was divided by its own smooth light, a polynomial of degree {self.degree}"
             )
         if len(self.fringes.waves):
             periods = " and ".join(f"{period:.3g}" for period in self.fringes.periods_px)
-            said.append(
+            lines.append(
                 f"fringes with a period of {periods} pixels pass over the field, and change the "
                 f"light by {100 * self.fringes.rms:.2g} % rms between frames that are compared: "
                 "each frame was divided by its own; what reflects the laser beside the sample "
                 "makes them: tilt it, or take a source that is less coherent"
             )
-        if any(self.seams):
+        if any(self.amplifier_boundaries):
             parts = " and ".join(
                 f"{name} {', '.join(map(str, cuts))}"
-                for name, cuts in zip(("row", "column"), self.seams, strict=True)
+                for name, cuts in zip(("row", "column"), self.amplifier_boundaries, strict=True)
                 if cuts
             )
-            said.append(
+            lines.append(
                 f"parts of the field, which begin at {parts}, change as a whole, as where the "
                 "camera reads them out by amplifiers of their own: each part of each frame was "
                 "divided by its own light"
             )
-        if self.haze:
-            said.append(
+        if self.stray_light:
+            lines.append(
                 "dim pixels change by more of their light than bright ones, as where something is "
-                f"added to all of them that changes by {100 * self.haze:.2g} % of the mean light "
-                "within the movie: light that does not come through the objective, the offset of "
-                "a camera that warms up, or what focus does; each frame was divided by its own, "
-                "but what is added all the time is not known, and masses may be wrong by as much"
+                f"added to all of them that changes by {100 * self.stray_light:.2g} % of the mean "
+                "light within the movie: light that does not come through the objective, the "
+                "offset of a camera that warms up, or what focus does; each frame was divided by "
+                "its own, but what is added all the time is not known, and masses may be wrong by "
+                "as much"
             )
-        return said
+        return lines
 
     @cached_property
     def _axes(self) -> tuple[FloatArray, FloatArray]:
@@ -128,7 +134,7 @@ class Surface:
         parts = [
             (*(legvander(np.linspace(-1, 1, n), self.degree) for n in shape), smooth),
             self.fringes.axes(shape),
-            parts_of(shape, self.seams),
+            parts_of(shape, self.amplifier_boundaries),
         ]
         rows, columns, products = zip(*parts, strict=True)
         return np.hstack(rows), np.hstack(columns), block_diag(*products) > 0
@@ -144,11 +150,11 @@ class Surface:
                 (rows * rows[:, i : i + 1]).T @ self.light_e @ (columns * columns[:, j : j + 1])
             )
             gram[k] = overlap[down, along]
-        if self.haze:
+        if self.stray_light:
             light, more = self.light_e, lift(self.light_e)
-            beside = (rows.T @ (light * more) @ columns)[down, along]
+            mixed = (rows.T @ (light * more) @ columns)[down, along]
             own = np.sum(light * more**2)
-            gram = np.block([[gram, beside[:, None]], [beside, own]])
+            gram = np.block([[gram, mixed[:, None]], [mixed, own]])
         return np.asarray(np.linalg.pinv(gram, rcond=_LEAST_SHARE, hermitian=True))
 
     def factors(self, electrons: FloatArray) -> FloatArray:
@@ -165,15 +171,17 @@ class Surface:
         change = np.where(lit, seen - self.light_e, 0.0)
         overlap = rows.T @ change @ columns
         flat = overlap.reshape(*overlap.shape[:-2], -1)
-        told = flat[..., self._kept]
-        if self.haze:
+        overlaps = flat[..., self._kept]
+        if self.stray_light:
             more = lift(self.light_e)
-            told = np.concatenate([told, np.sum(change * more, axis=(-2, -1))[..., None]], axis=-1)
-        found = told @ self._inverse
+            overlaps = np.concatenate(
+                [overlaps, np.sum(change * more, axis=(-2, -1))[..., None]], axis=-1
+            )
+        found = overlaps @ self._inverse
         terms = np.zeros_like(flat)
         terms[..., self._kept] = found[..., : self._kept.size]
         out = 1 + rows @ terms.reshape(overlap.shape) @ columns.T
-        if self.haze:
+        if self.stray_light:
             out += found[..., -1:, None] * more
         return np.where(out > 0, out, 1.0)
 
@@ -196,7 +204,7 @@ def find_surface(
     seamless = _even(changes, replace(found, fringes=NO_FRINGES))
     degree, rms = _smooth(seamless, window, highest, found.fringes)
     found = replace(found, degree=degree, rms=rms)
-    found = replace(found, haze=find_stray_light(_even(changes, found), window))
+    found = replace(found, stray_light=find_stray_light(_even(changes, found), window))
     return found if found.measures else None
 
 
@@ -204,10 +212,10 @@ def _patterns(changes: Changes, window: int, highest: int) -> Surface:
     """Look for seams and fringes, which hide each other."""
     found = Surface(changes.light_e, 0, 0.0)
     for _ in range(_ROUNDS):
-        seams = find_amplifier_boundaries(_even(changes, found), window, found.seams)
-        if len(found.fringes.waves) and seams == found.seams:
+        seams = find_amplifier_boundaries(_even(changes, found), window, found.amplifier_boundaries)
+        if len(found.fringes.waves) and seams == found.amplifier_boundaries:
             break
-        found = replace(found, seams=seams, fringes=NO_FRINGES)
+        found = replace(found, amplifier_boundaries=seams, fringes=NO_FRINGES)
         fringes = find_fringes(_even(changes, found), window, highest)
         found = replace(found, fringes=fringes)
         if not len(fringes.waves):

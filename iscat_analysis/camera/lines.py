@@ -44,12 +44,12 @@ class Lines:
     @property
     def messages(self) -> list[str]:
         """What the user should know, one line each."""
-        said = []
+        lines = []
         if self.surface is not None:
-            said += self.surface.messages
+            lines += self.surface.messages
         if any(self.shares):
-            said.append(self._flicker)
-        return said
+            lines.append(self._flicker)
+        return lines
 
     @property
     def _flicker(self) -> str:
@@ -71,9 +71,9 @@ class Lines:
             "smooth_rms": surface.rms,
             "fringe_periods_px": surface.fringes.periods_px.tolist(),
             "fringe_rms": surface.fringes.rms,
-            "seam_rows": list(surface.seams[0]),
-            "seam_columns": list(surface.seams[1]),
-            "haze": surface.haze,
+            "seam_rows": list(surface.amplifier_boundaries[0]),
+            "seam_columns": list(surface.amplifier_boundaries[1]),
+            "haze": surface.stray_light,
         }
 
     def factors(self, electrons: FloatArray) -> FloatArray:

@@ -69,8 +69,8 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
             "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
     camera = config.camera.model_copy(update=found)
-    optics, said = _with_optics(config.optics, metadata)
-    notes += said
+    optics, taken_from_file = _with_optics(config.optics, metadata)
+    notes += taken_from_file
     config = config.model_copy(update={"camera": camera, "optics": optics})
     source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
     return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
@@ -115,14 +115,14 @@ def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
     spot_nm = optics.wavelength_nm / (2 * optics.na)
     if pixel_nm is None or pixel_nm <= spot_nm:
         return
-    said = (
+    problem = (
         f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
         f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
     )
     advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
     if pixel_nm > 2 * spot_nm:
-        raise DataError(f"{said}; {advice}")
-    yield f"{said}, so that pictures are not resolved; unless it was binned so far, {advice}"
+        raise DataError(f"{problem}; {advice}")
+    yield f"{problem}, so that pictures are not resolved; unless it was binned so far, {advice}"
 
 
 def _refuse_unlikely(pixel_nm: float, source: str) -> None:
@@ -146,7 +146,7 @@ class GainDiagnosis:
     n_frames: int
     n_pixels: int
     noise_counts: float = math.inf
-    shaking: PatternJitter | None = None
+    pattern_jitter: PatternJitter | None = None
 
     @property
     def off(self) -> bool:
@@ -156,32 +156,36 @@ class GainDiagnosis:
     @property
     def shakes(self) -> bool:
         """Whether motion of the fixed pattern explains most of an excess."""
-        return self.off and self.shaking is not None and self.shaking.share > MOST_EXPLAINED
+        return (
+            self.off
+            and self.pattern_jitter is not None
+            and self.pattern_jitter.share > MOST_EXPLAINED
+        )
 
     @property
     def message(self) -> str | None:
         """One sentence for the user where the gain is off; else None."""
         if not self.off:
             return None
-        said = (
+        problem = (
             f"the noise variance is {self.noise_ratio:.3g} ± {self.noise_ratio_se:.1g} times what "
             f"camera.gain_e_per_adu = {self.configured_gain:.4g} predicts"
         )
         if self.noise_counts < 1:
             return (
-                f"{said}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
+                f"{problem}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
                 "rounding hides it: record or export the movie with more bits"
             )
-        if self.shaking is not None and self.shakes:
+        if self.pattern_jitter is not None and self.shakes:
             return (
-                f"{said}; the gain is not the cause: the fixed pattern shakes by "
-                f"{self.shaking.rms_px:.2g} pixels from frame to frame, which explains "
-                f"{min(self.shaking.share, 1.0):.0%} of what is too much: damp vibrations of the "
-                "stage and the beam"
+                f"{problem}; the gain is not the cause: the fixed pattern shakes by "
+                f"{self.pattern_jitter.rms_px:.2g} pixels from frame to frame, which explains "
+                f"{min(self.pattern_jitter.share, 1.0):.0%} of what is too much: damp vibrations "
+                "of the stage and the beam"
             )
         # Noise that grows with the light itself can only add, so only an excess has two causes.
         cause = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
-        return f"{said}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
+        return f"{problem}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
 
 
 def diagnose_gain(
@@ -271,19 +275,19 @@ def diagnose_gain(
         n_pixels=int(np.count_nonzero(kept)),
         noise_counts=float(per_count) if whole else math.inf,
     )
-    return with_shaking(found, counts, camera, masked=~used)
+    return with_pattern_jitter(found, counts, camera, masked=~used)
 
 
-def with_shaking(
+def with_pattern_jitter(
     found: GainDiagnosis, counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None
 ) -> GainDiagnosis:
     """Measure what motion of the fixed pattern explains of an excess, where there is one.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
-    if not found.off or found.noise_ratio < 1 or found.shaking is not None:
+    if not found.off or found.noise_ratio < 1 or found.pattern_jitter is not None:
         return found
-    return replace(found, shaking=measure_pattern_jitter(counts, camera, masked=masked))
+    return replace(found, pattern_jitter=measure_pattern_jitter(counts, camera, masked=masked))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:

@@ -51,7 +51,7 @@ def measure_pattern_jitter(
     return PatternJitter(explained / beyond, float(rms))
 
 
-def without_shaking(
+def without_pattern_jitter(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> NDArray[Any]:
     """Take the motion of the fixed pattern off frames, to first order.

@@ -29,8 +29,8 @@ _PAIRS = 64  # of frames that are compared
 _LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
 _OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
 _LANDED = 4  # such pixels more than in most pairs of frames, where something has landed
-_GLANCES = 9  # pairs whose median number of such pixels is that of a pair in which nothing lands
-_SOME = 8  # of as many pixels, whose median tells how large the noise is
+_FIRST_PAIRS = 9  # their median number of such pixels is that of a pair in which nothing lands
+_EVERY_NTH_PIXEL = 8  # of as many pixels, whose median tells how large the noise is
 _SIGNIFICANT = 4.5  # standard errors beyond which a correlation is one
 _NEGLIGIBLE = 0.01  # of the expected variance, below which nothing is corrected
 _LEAST = 0.05  # of the variance, that every frequency is taken to have
@@ -176,14 +176,14 @@ def measure_spectrum(
         z = after / powers[1] - before / powers[0]
         z /= np.sqrt(by_light * expected + by_frame * read_noise)
         z[~used] = 0.0
-        middle = float(np.median(np.abs(z[used][::_SOME])))
+        middle = float(np.median(np.abs(z[used][::_EVERY_NTH_PIXEL])))
         return z, _OUTLIER * middle / _NORMAL_QUARTILE
 
     def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
 
     # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
-    few = starts[:: max(1, pairs // _GLANCES)].tolist()
+    few = starts[:: max(1, pairs // _FIRST_PAIRS)].tolist()
     most = float(np.median([outliers(change(start)) for start in few])) + _LANDED
 
     def periodogram(start: int) -> FloatArray | None:
@@ -237,9 +237,9 @@ def _spectrum_of(
         line if line[here] > 0 else np.zeros_like(line) for line in (by_row, by_column)
     )
     common = by_row[:, None] + by_column[None, :]
-    beside = np.abs(local)
-    beside[here, here] = 0.0
-    if beside.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):
+    neighbours = np.abs(local)
+    neighbours[here, here] = 0.0
+    if neighbours.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):
         if abs(variance - 1) < _NEGLIGIBLE and not common.any():
             return None
         local = np.zeros_like(local)

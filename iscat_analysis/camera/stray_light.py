@@ -21,7 +21,7 @@ _PATTERN = 10.0  # times what the noise of the mean frame tells, that its patter
 _ALIKE = 4.0  # times what the median part tells, more than which none should
 _MOST = 0.25  # of the mean light, more than which is not added between windows
 _LEAST_PARTS = 16
-_LEAST_TOLD = 1e-3  # by a part, of what others tell
+_LEAST_PATTERN_POWER = 1e-3  # by a part, of what others tell
 
 
 def lift(light_e: FloatArray) -> FloatArray:
@@ -49,36 +49,39 @@ def find_stray_light(changes: Changes, window: int) -> float:
     each = sums * (light.sum() / sums.sum(axis=(2, 3), keepdims=True)) - light
     change = each[:, 1] - each[:, 0]
     held, once, twice = summed(light), summed(light * more), summed(light * more**2)
-    told = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
-    if not (told > 0).any():
+    pattern_power = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
+    if not (pattern_power > 0).any():
         return 0.0
-    lit = (told > 0) & (told < _ALIKE * np.median(told[told > 0]))  # without dust and particles
+    usual = np.median(pattern_power[pattern_power > 0])
+    lit = (pattern_power > 0) & (pattern_power < _ALIKE * usual)  # without dust and particles
     if lit.sum() < _LEAST_PARTS:
         return 0.0
-    mean, told = once[lit] / held[lit], told[lit]
+    mean, pattern_power = once[lit] / held[lit], pattern_power[lit]
     pixels = summed((light > 0).astype(np.float64))[lit]
-    if told.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
+    if pattern_power.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
         return 0.0
     even = summed(change)[:, lit]
     seen = summed(change * more)[:, lit] - even * mean
-    added = seen.sum(axis=1, keepdims=True) / told.sum()
-    rest = seen - added * told
-    spread = np.square(rest) / np.maximum(told, told.mean() * _LEAST_TOLD)
-    error = spread.sum(axis=1) / (lit.sum() - 1) / told.sum()
+    added = seen.sum(axis=1, keepdims=True) / pattern_power.sum()
+    rest = seen - added * pattern_power
+    spread = np.square(rest) / np.maximum(
+        pattern_power, pattern_power.mean() * _LEAST_PATTERN_POWER
+    )
+    error = spread.sum(axis=1) / (lit.sum() - 1) / pattern_power.sum()
     square = float(np.median(np.square(added)))
     if square > _MOST**2:
         return 0.0
-    if square * told.sum() / light.sum() < changes.least(window) + changes.error:
+    if square * pattern_power.sum() / light.sum() < changes.least(window) + changes.error:
         return 0.0
     if np.median(np.square(added[:, 0]) / error) < _SIGNIFICANT:
         return 0.0
     # in variances of noise, of the pixels of a part
     noises = changes.noises[:, None]
     squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
-    gain = np.square(added) * told / noises
+    gain = np.square(added) * pattern_power / noises
     left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)
     doubt = _DOUBT * math.sqrt(2 * float(pixels.mean()) / left.size)
     if np.median(left) > np.median(gain) + doubt:
         return 0.0
     here = summed(each * more)[..., lit] - summed(each)[..., lit] * mean
-    return float(np.ptp(here.sum(axis=-1))) / float(told.sum())
+    return float(np.ptp(here.sum(axis=-1))) / float(pattern_power.sum())

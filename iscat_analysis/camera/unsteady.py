@@ -34,7 +34,7 @@ _WHOLE = 0.5  # of the pixels of a line that is named as such
 _MOST = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 
 
-def unsteady_said(pixels: BoolArray) -> str:
+def unsteady_message(pixels: BoolArray) -> str:
     """Say which pixels are unsteady.
 
     Shapes: `pixels` (y, x).
@@ -99,7 +99,7 @@ def find_unsteady(
         limit = chdtri(number, _CHANCE) / number
         more = ratio > usual * limit
         more &= scatter.beside < least_beside * scatter.squares
-        more &= _beside(ratio) - usual < least_beside * (ratio - usual)
+        more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
         if more.any():  # by those around as well, which takes longest
             more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
             found |= more
@@ -109,7 +109,7 @@ def find_unsteady(
     return found if 0 < found.mean() < _MOST else None
 
 
-def _beside(values: FloatArray) -> FloatArray:
+def _largest_neighbour(values: FloatArray) -> FloatArray:
     """Give the larger of the two values beside each, along the axis where that is less."""
     padded = np.pad(values, 1, mode="reflect")
     along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])

@@ -69,8 +69,8 @@ def calibrate_day(plan: Plan, runner: Runner) -> Day:
             outcomes[movie.name] = outcome
             continue
         tables[movie.name] = folder / "fits.csv"
-        if learned is None and (told := _optics(folder, plan.config)) is not None:
-            learned, origin = told
+        if learned is None and (optics := _optics(folder, plan.config)) is not None:
+            learned, origin = optics
             origins["optics"] = f"{origin} by {movie.name}"
     settings |= learned or {}
     standards: tuple[float, ...] = ()
@@ -127,10 +127,10 @@ def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
     if config.optics.file is not None:
         return None
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    told = summary.get("optics", {})
-    if not told or told.get("reason"):
+    optics = summary.get("optics", {})
+    if not optics or optics.get("reason"):
         return None
-    if not told["calibrated"]:
+    if not optics["calibrated"]:
         return {}, "confirmed"
     learned = read_toml(folder / "config.toml")["optics"]
     keys = {f"optics.{key}": learned[key] for key in _OPTICS if key in learned}
@@ -160,7 +160,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
             )
         except SignError as error:  # which way they land is what the configuration says
             raise DataError(
-                f"{error.said}, correct the sign of calibration.gradient_per_kda, or "
+                f"{error.problem}, correct the sign of calibration.gradient_per_kda, or "
                 "optics.focus_nm or optics.reference_phase_deg"
             ) from None
         masses = [float(mass) for mass in found.standards["mass_kda"]]

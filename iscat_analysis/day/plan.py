@@ -10,7 +10,7 @@ from typing import Any
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.table import Row, Table
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie.addresses import beside, split_address
+from iscat_analysis.movie.addresses import path_beside, split_address
 from iscat_analysis.text import printable
 
 
@@ -78,7 +78,7 @@ def part_of(movies: tuple[Movie, ...], only: tuple[int, int] | None) -> tuple[Mo
 def _names(table: Table) -> list[str]:
     """Name each result after its movie, with as many folders as it takes to tell it from others."""
     files = [split_address(row.path)[0] for row in table.rows]
-    stems = [beside(row.path, "") for row in table.rows]
+    stems = [path_beside(row.path, "") for row in table.rows]
     same = Counter(stems)
     ends = [
         f"{stem.name}-{file.suffix[1:]}" if same[stem] > 1 else stem.name

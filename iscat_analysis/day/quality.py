@@ -110,19 +110,19 @@ def _optics(
     summary: Mapping[str, Any], config: Config | None, day: Day
 ) -> tuple[str, float | None]:
     """Say where the optics are from, and by how much the focus was moved."""
-    told = summary.get("optics")
+    optics = summary.get("optics")
     source = "of the day" if day.settings.get("optics.focus_nm") is not None else "as configured"
     if config is not None and config.optics.file is not None:
         source = "of a file"
-    if not told:
+    if not optics:
         return f"{source}, not tested", None
-    if told.get("calibrated") and config is not None:
+    if optics.get("calibrated") and config is not None:
         reference = day.settings.get("optics.focus_nm")
         shift = None if reference is None else config.optics.focus_nm - float(reference)
         return "learned from this movie", shift
-    if "median_p" not in told and "left_over" not in told:
+    if "median_p" not in optics and "left_over" not in optics:
         return f"{source}, too few bright particles to test them", None
-    if told.get("reason"):
+    if optics.get("reason"):
         return f"rejected by this movie ({source}), and not learned", None
     return f"{source}, confirmed", None
 

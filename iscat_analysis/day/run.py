@@ -42,7 +42,7 @@ class Runner:
     progress: Progress
     notify: Notify
     command: str
-    place: Executor
+    executor: Executor
     retry: bool = True
 
     def job(
@@ -102,7 +102,7 @@ class Runner:
         """Fit a movie unless that is done."""
 
         def work() -> dict[str, Any]:
-            return self.place.call(
+            return self.executor.call(
                 analyse_movie,
                 self.out.absolute(),
                 name,

@@ -125,20 +125,20 @@ def offset_said(zero: LightZero, camera: Camera) -> str:
     found = float(np.mean(camera.offset_adu)) + counts
     how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
     read = zero.electrons < 0 and not zero.flickers
-    said = (
+    message = (
         f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
         f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
     )
     if np.ndim(camera.offset_adu):
-        said += "record a dark for `iscat calibrate camera --maps`"
+        message += "record a dark for `iscat calibrate camera --maps`"
     elif found < -_SUBTRACTED * se:
-        said += "see whether counts were subtracted from the movie; record raw counts"
+        message += "see whether counts were subtracted from the movie; record raw counts"
     else:
-        said += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
+        message += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
     if read:
         missing = math.sqrt(-zero.electrons)
-        said += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
-    return said
+        message += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
+    return message
 
 
 def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:

@@ -260,7 +260,7 @@ def landing_rate_warning(table: pd.DataFrame) -> str:
     and after.
     """
     flags = table["flags"].fillna("").astype(str).str.split(";")
-    slow = int(flags.map(lambda said: Status.CHANGING.value in said).sum())
+    slow = int(flags.map(lambda listed: Status.CHANGING.value in listed).sum())
     if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
         return ""
     return (
@@ -323,7 +323,7 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
     )
 
 
-def shaking_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
+def pattern_jitter_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
     """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
 
     Particles that move add noise too, but not along the gradient of the mean of all frames.

@@ -29,7 +29,7 @@ CLEAR = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
 tenth."""
 
-STAYS = 0.15
+LEAST_STEP_SHARE = 0.15
 """What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
 of others make less."""
 
@@ -78,13 +78,13 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     peaks = peaks[_of_spots(blocks, peaks, spot_px)]
     if not len(peaks):
         return NO_CHANGES
-    block, *place = peaks.T
-    one, two, _, four, five = (smooth[block + n, *place] for n in range(_LEAST_BLOCKS))
-    change = size[block, *place]
-    beside = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(_QUIET * noise / change, STAYS)
+    block, *position = peaks.T
+    one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
+    change = size[block, *position]
+    neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
+    quiet = np.maximum(_QUIET * noise / change, LEAST_STEP_SHARE)
     pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
-    staying = (beside < quiet) & (pictures == 1)
+    staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
 
 
@@ -116,8 +116,8 @@ def _of_spots(
         if 0 < y < rows - 1 and 0 < x < columns - 1:
             part = slice(y - 1, y + 2), slice(x - 1, x + 2)
             change = blocks[t + 3][part] - blocks[t + 1][part]
-            beside = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
-            real[number] = beside * np.sign(change[1, 1]) > least * abs(change[1, 1])
+            neighbouring = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
+            real[number] = neighbouring * np.sign(change[1, 1]) > least * abs(change[1, 1])
     return real
 
 

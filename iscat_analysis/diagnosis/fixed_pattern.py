@@ -78,16 +78,16 @@ def _part_moved(
     used = ~windows.masked[part]
     if min(used.shape) < _SMALLEST_PX:
         return None
-    way = follow_pattern(
+    motion = follow_pattern(
         np.stack([windows.before_e[part], windows.after_e[part]]),
         np.array([1.0, windows.power_ratio]),
         np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
         np.ascontiguousarray(used),
         np.ascontiguousarray(windows.read_variance_before_e2[part]),
     )
-    if way is None or not np.isfinite(way.error_px).all():
+    if motion is None or not np.isfinite(motion.error_px).all():
         return None
-    return way.shift_px[1], way.error_px[1]
+    return motion.shift_px[1], motion.error_px[1]
 
 
 def drift_warning(name: str, background: dict[str, Any]) -> str | None:

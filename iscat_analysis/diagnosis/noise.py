@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.calibration import find_zero
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.metadata import diagnose_gain, with_shaking
-from iscat_analysis.camera.pattern_jitter import without_shaking
+from iscat_analysis.camera.metadata import diagnose_gain, with_pattern_jitter
+from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.camera.successive import shared_light
 from iscat_analysis.config import Config
@@ -65,13 +65,13 @@ class Noise:
     spectrum: NoiseSpectrum | None = None
     shakes: bool = False
 
-    def said(self, name: str) -> Iterator[str]:
+    def messages_of(self, name: str) -> Iterator[str]:
         """Give what the user should know."""
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
         yield from self.messages
 
-    def beside(self, chi2: FloatArray) -> Noise:
+    def compared_with_fits(self, chi2: FloatArray) -> Noise:
         """Hold what noise around particles is said to be against what fits of them leave over.
 
         Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
@@ -110,9 +110,9 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
-    gain = with_shaking(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
+    gain = with_pattern_jitter(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
-        still = without_shaking(counts, camera, masked=masked)
+        still = without_pattern_jitter(counts, camera, masked=masked)
         return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
@@ -130,15 +130,15 @@ def judge_counts(
         zero = None  # the variance of a pixel is then of its neighbours' light as well
     wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
     if wrong is not None:
-        said = offset_said(wrong, camera)
+        message = offset_said(wrong, camera)
     else:
-        said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+        message = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
     if gain.shakes and follows is False:
-        said += ", or set background.drift_correction = true, with which it is followed"
-    excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
+        message += ", or set background.drift_correction = true, with which it is followed"
+    excess = ExcessNoise(gain.noise_ratio, message) if gain.off and gain.noise_ratio > 1 else None
     if wrong is None:
-        return Noise((said,) if said else (), gain.off, excess, spectrum, gain.shakes)
-    messages = [said]
+        return Noise((message,) if message else (), gain.off, excess, spectrum, gain.shakes)
+    messages = [message]
     moved = replace(
         camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu, law=None
     )

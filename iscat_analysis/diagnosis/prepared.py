@@ -26,7 +26,7 @@ class Prepared:
     steady: Stack
     config: Config
     camera: Camera
-    way: BackgroundMode
+    background_mode: BackgroundMode
     lines: Lines | None
     opening: NoiseSurvey | None
     other_kind: str

@@ -69,7 +69,7 @@ class Event(Fitted):
     rise: int = 0
 
 
-def remarks(
+def fit_flags(
     context: AnalysisContext,
     fitted: Fitted,
     windows: Windows,
@@ -84,11 +84,11 @@ def remarks(
     saturated = saturated_near(
         windows.saturated, fit.x_nm, fit.y_nm, context.pixel_nm, corner=corner
     )
-    said = (
+    possible = (
         (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
         (too_close, Status.TOO_CLOSE), (changing, Status.CHANGING),
     )  # fmt: skip
-    return verdict([*fit.flags, *(flag for true, flag in said if true)])[1]
+    return verdict([*fit.flags, *(flag for true, flag in possible if true)])[1]
 
 
 def standing_out(events: Sequence[Event]) -> Sequence[Event]:

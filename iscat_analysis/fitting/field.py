@@ -18,7 +18,7 @@ import numpy as np
 
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
-from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, remarks
+from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
 from iscat_analysis.fitting.regions import (
     Region,
     noise_cumulants,
@@ -387,7 +387,7 @@ def _judged(
         )
         lobe = number >= len(fitted) or one.described.is_dwarfed(near)
         own = windows.cut(one.region.slices)
-        flags = remarks(context, one, own, sidelobe=lobe, too_close=crowded)
+        flags = fit_flags(context, one, own, sidelobe=lobe, too_close=crowded)
         judged.append(
             Event(
                 one.region, one.fit, one.likelihood, own, flags,

@@ -111,8 +111,8 @@ def evidence_beside(
     """
     if context.mode != "mass":
         return np.full((len(events), len(NOTHING)), np.nan)
-    told = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
-    return np.array(list(told)).reshape(-1, len(NOTHING))
+    rows = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
+    return np.array(list(rows)).reshape(-1, len(NOTHING))
 
 
 def _line(

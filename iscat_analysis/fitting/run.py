@@ -16,7 +16,7 @@ from iscat_analysis.records import FREE_PARAMETERS, Progress
 Notify = Callable[[str], None]
 
 
-def unheard(text: str) -> None:
+def notify_nobody(text: str) -> None:
     """Tell nobody."""
 
 
@@ -41,7 +41,7 @@ class Run:
     notify: Notify
     progress: Progress
     partial: Path | None
-    place: Executor
+    executor: Executor
     inject: int
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)

@@ -141,7 +141,7 @@ def likely_cause(
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
-    found = {name: _told(config, name, left, excess) for name in _NAMES}
+    found = {name: _explained_by(config, name, left, excess) for name in _NAMES}
     named = {name: tried for name, tried in found.items() if tried[0][0] > WORTH_NAMING}
     if not named:  # a share is above 1 where there is less noise than the camera's numbers say
         return None
@@ -165,7 +165,7 @@ def likely_cause(
     )
 
 
-def _told(
+def _explained_by(
     config: Config, name: str, left: Sequence[_Left], excess: float
 ) -> list[tuple[float, float]]:
     """Share of χ² in excess that a part of the microscope explains, and by what step.

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-from iscat_analysis._kernels.goodness import look
+from iscat_analysis._kernels.goodness import count_and_test
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise_models import MANY_COUNTS
 
@@ -84,7 +84,7 @@ def three_tests(
     free = np.asarray(free, dtype=np.bool_)
     optics, grid = likelihood.model.optics, likelihood.grid
     rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
-    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = look(
+    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = count_and_test(
         likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
         theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL,
         MANY_COUNTS, rate, tails,

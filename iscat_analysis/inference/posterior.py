@@ -52,12 +52,14 @@ def sample_posterior(
     import emcee  # takes a third of a second, and only chains need it
 
     index = np.flatnonzero(fit.box.free)
-    told = index < len(PARAMETERS)
+    physical = index < len(PARAMETERS)
     normal = (
         {}
         if prior is None
         else {
-            name: prior.normal[name] for i in index[told] if (name := PARAMETERS[i]) in prior.normal
+            name: prior.normal[name]
+            for i in index[physical]
+            if (name := PARAMETERS[i]) in prior.normal
         }
     )  # of what is not free nothing can be learned
     prior = Prior(normal)
@@ -104,17 +106,19 @@ def sample_posterior(
         samples[..., column] = likelihood.model.scale.mass(samples[..., column])
     # the level of the light, where it is free, says nothing of the particle: it is integrated over
     return PosteriorResult(
-        names=tuple(PARAMETERS[i] for i in index[told]),
-        samples=samples[..., told],
+        names=tuple(PARAMETERS[i] for i in index[physical]),
+        samples=samples[..., physical],
         log_likelihood=values,
-        tau=verdict.tau[told],
-        r_hat=verdict.r_hat[told],
-        ess_bulk=verdict.ess_bulk[told],
-        ess_tail=verdict.ess_tail[told],
+        tau=verdict.tau[physical],
+        r_hat=verdict.r_hat[physical],
+        ess_bulk=verdict.ess_bulk[physical],
+        ess_tail=verdict.ess_tail[physical],
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=verdict.converged,
         message=verdict.message,
-        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[told] if normal else None,
+        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[physical]
+        if normal
+        else None,
     )
 
 

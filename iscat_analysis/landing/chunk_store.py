@@ -68,10 +68,10 @@ class Store(Checkpoint):
         self.write(number, done.lines, arrays)
 
 
-def _columns(way: Trajectory | None) -> FloatArray:
-    if way is None:
+def _columns(motion: Trajectory | None) -> FloatArray:
+    if motion is None:
         return np.empty((0, 5))
-    return np.column_stack([way.frames, way.shift_px, way.error_px])
+    return np.column_stack([motion.frames, motion.shift_px, motion.error_px])
 
 
 def _empty(squares: FloatArray, counts: FloatArray, shared: FloatArray) -> EmptySpread | None:

@@ -65,12 +65,12 @@ def with_measured_images(
             chosen.append(i)
         elif not middle.is_measured:
             lobes.add(i)
-    told = list(steps)
+    measured = list(steps)
     for _ in range(_PASSES):
         for i in chosen:
-            others = [told[k] for k in near[i] if k not in lobes]
-            told[i] = _measured(told[i], others, chunk, neighbours, window, roi_px)
-    return [step for i, step in enumerate(told) if i not in lobes]
+            others = [measured[k] for k in near[i] if k not in lobes]
+            measured[i] = _measured(measured[i], others, chunk, neighbours, window, roi_px)
+    return [step for i, step in enumerate(measured) if i not in lobes]
 
 
 def _hides_others(step: Step, threshold: float) -> bool:

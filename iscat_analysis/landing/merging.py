@@ -119,8 +119,8 @@ class Merged:
             if number < VIEWS and row < len(done.views):
                 view = replace(done.views[row], event=number)
                 views.append(view if number < CLIPS else replace(view, clip=None))
-        told = [homes[i][0].evidence[homes[i][1]] for i in order]
-        self.evidence = np.array(told).reshape(-1, len(NOTHING))
+        evidence = [homes[i][0].evidence[homes[i][1]] for i in order]
+        self.evidence = np.array(evidence).reshape(-1, len(NOTHING))
         rows = make_rows(table.iloc[order], {"event": range(len(order))})
         return rows, tuple(views), tuple(repeats)
 

@@ -134,16 +134,16 @@ def _raise_around(
     np.maximum(asked, left, out=asked)
 
 
-def searched_warning(name: str, told: dict[str, Any]) -> str:
+def searched_warning(name: str, summary: dict[str, Any]) -> str:
     """Say that a part of the movie was not searched; empty where nearly all was."""
-    share = told["searched_share"]
+    share = summary["searched_share"]
     if share is None or share >= LEAST_SHARE:
         return ""
-    spans = sorted(told["partly_searched"], key=lambda span: span[2])[:3]
+    spans = sorted(summary["partly_searched"], key=lambda span: span[2])[:3]
     worst = ", ".join(f"{start}:{stop} ({part:.0%})" for start, stop, part in sorted(spans))
     return (
         f"{name}: {share:.0%} of field and time were searched for particles with a signal-to-noise "
-        f"ratio of {told['searched_snr']:.0f}; what bright or ill-described particles left over "
+        f"ratio of {summary['searched_snr']:.0f}; what bright or ill-described particles left over "
         f"hides the rest, most in frames {worst}; numbers of particles and rates are corrected "
         "for it, but look at these frames"
     )

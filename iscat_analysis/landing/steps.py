@@ -18,7 +18,7 @@ import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
-from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
@@ -355,7 +355,7 @@ class ChunkFitter:
             at_once = np.abs(frame - frame[number]) < self._window
             near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
             event = own.fitted.event
-            flags = remarks(
+            flags = fit_flags(
                 self._context, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,

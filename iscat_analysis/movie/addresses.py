@@ -41,7 +41,7 @@ def setup_beside(address: Path) -> Path:
     return split_address(address)[0].parent / SETUP
 
 
-def beside(address: Path, suffix: str) -> Path:
+def path_beside(address: Path, suffix: str) -> Path:
     """Name what is written about a movie, next to it."""
     path, part = split_address(address)
     if path.name in ("", ".."):  # the folder one is in, or the one above, has its name elsewhere

@@ -202,9 +202,9 @@ class Hdf5Reader:
         try:
             yield
         except WHAT_LIBRARIES_RAISE as error:
-            said = next(iter(str(error).splitlines()), "") or type(error).__name__
+            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
             raise DataError(
-                f"{self._path}: begins like an HDF5 file but is damaged ({said}); "
+                f"{self._path}: begins like an HDF5 file but is damaged ({reason}); "
                 "copy it again or export it again"
             ) from None
 

@@ -115,13 +115,13 @@ def open_npy(path: Path) -> MappedFrames:
 def open_raw(path: Path, part: str) -> MappedFrames:
     """Open a file that holds the counts and nothing else."""
     example = f"{path}{MARK}1500x128x128,uint16"
-    said = layout(part)
-    if said is None:
+    found = layout(part)
+    if found is None:
         raise DataError(
             f"{path}{MARK}{part}: a file of plain numbers needs frames x rows x columns and their "
             f"type, as in {example}"
         )
-    frames, rows, columns, name = said
+    frames, rows, columns, name = found
     try:
         stored = np.dtype(name)
     except (TypeError, ValueError, SyntaxError):

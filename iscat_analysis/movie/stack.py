@@ -18,7 +18,7 @@ from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files,
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.text import printable
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
@@ -396,7 +396,7 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            self._hashing = beside(self.sha256)
+            self._hashing = start_in_thread(self.sha256)
         return self._hashing
 
     def _require(self, start: int, stop: int) -> None:

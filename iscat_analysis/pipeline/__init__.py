@@ -28,7 +28,7 @@ from iscat_analysis.fitting.checkpoint import (
 )
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.run import Notify, Run, unheard
+from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
 from iscat_analysis.movie import Stack, beside, open_stack
@@ -59,10 +59,10 @@ def fit_stack(
     out: Path | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Notify = unheard,
+    notify: Notify = notify_nobody,
     command: str = "",
     inject: int = 0,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -124,10 +124,12 @@ def fit_stack(
                 command=command,
                 partial=partial,
                 inject=inject,
-                place=place,
+                executor=executor,
             )
         with parts_kept(None if way == "fixed" else partial):
-            write_report(analysis, folder, overwrite=overwrite, event_figures=figures, place=place)
+            write_report(
+                analysis, folder, overwrite=overwrite, event_figures=figures, executor=executor
+            )
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:
@@ -143,24 +145,25 @@ def analyse(
     config: Config,
     *,
     progress: Progress = silent,
-    notify: Notify = unheard,
+    notify: Notify = notify_nobody,
     command: str = "",
     partial: Path | None = None,
     inject: int = 0,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> Analysis:
     """Analyse an open movie."""
-    if place is not None and place.distant and not movie.identity:
+    if executor is not None and executor.distant and not movie.identity:
         raise ConfigError(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
             "numpy.save, and give its path; or leave `scheduler` out"
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
-        run = Run(notify, progress, partial, place or LocalExecutor(), inject)
+        run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
-        found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
-        with parts_kept(None if ready.way == "fixed" else partial):
+        # background, detect, fit, posterior, bounds
+        found = FIND[ready.background_mode](ready, run)
+        with parts_kept(None if ready.background_mode == "fixed" else partial):
             extra, stopped = injected(ready, run, found)
             stopped = stopped or found.interrupted
             return gather(

@@ -118,7 +118,7 @@ def _background(
         context = make_context(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
-    for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
+    for text in (*noise.messages_of(movie.name), *pixel_warnings(*windows.left_out)):
         run.warn(text)
     uneven = "" if still else uneven_warning(config, movie.name, windows)
     for text in (repeats_warning(movie, windows), uneven):
@@ -158,7 +158,7 @@ def _judged_beside(
     noise = judge_beside(
         context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
     )
-    return noise.beside(table["chi2_reduced"].to_numpy(float))
+    return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
 
 
 def _together(

@@ -77,22 +77,22 @@ def gather(
     for flag in ready.flags:
         table = flagged(table, flag)
     scale = context.model.scale
-    if rows.course:
-        run.warn(rows.course)
-    for name, beside in (
+    if rows.changing_light:
+        run.warn(rows.changing_light)
+    for name, finding in (
         ("heights", rows.heights), ("extension", rows.extension),
         ("fluctuation", rows.fluctuation),
     ):  # fmt: skip
-        if beside is not None:
-            further[name] = beside.summary
-            if beside.message:
-                run.warn(beside.message)
+        if finding is not None:
+            further[name] = finding.summary
+            if finding.message:
+                run.warn(finding.message)
     for doubt in (
         scale_warning(scale),
         line_warning(config, table),
         nonlinearity_warning(scale, table),
         sign_warning(config, table),
-        landing_rate_warning(table) if ready.way == "sliding" else "",
+        landing_rate_warning(table) if ready.background_mode == "sliding" else "",
     ):
         if doubt:
             run.warn(doubt)
@@ -101,7 +101,8 @@ def gather(
         had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
         verdict = spread_verdict(
             {name: one for name, one in achieved.items() if name not in had}, found.summary,
-            scaled=scaled, rejected=bool(rejection(table)), sliding=ready.way == "sliding",
+            scaled=scaled, rejected=bool(rejection(table)),
+            sliding=ready.background_mode == "sliding",
         )  # fmt: skip
         further["repeats"] = verdict
         if verdict["message"]:
@@ -115,16 +116,16 @@ def gather(
     films: tuple[Film, ...] = ()
     if found.followed is not None:
         followed = found.followed
-        tracks, said = tracks_of(
+        tracks, track_summary = tracks_of(
             context, table, followed.windows,
             masses=followed.masses, ticks=ticks, warn=run.warn, progress=progress,
         )  # fmt: skip
-        further |= said
+        further |= track_summary
         for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
             run.warn(text)
-        flat = fixed_height_warning(config, table)
-        if flat:
-            run.warn(flat)
+        height_warning = fixed_height_warning(config, table)
+        if height_warning:
+            run.warn(height_warning)
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")

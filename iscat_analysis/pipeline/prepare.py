@@ -36,7 +36,7 @@ from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
-from iscat_analysis.threads import beside, one_thread_algebra
+from iscat_analysis.threads import one_thread_algebra, start_in_thread
 from iscat_analysis.tracking.tracks import judge_times
 
 _OPENING = 64  # frames that are looked at before anything else
@@ -70,7 +70,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     for text in (*known.messages, *law_said(known)):
         run.warn(f"{movie.name}: {text}")
     if auto:
-        run.notify(f"{movie.name}: {known.said}")
+        run.notify(f"{movie.name}: {known.description}")
     processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
@@ -85,20 +85,20 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     summary: dict[str, Any] = {"camera": known.summary}
     if processing is not None:
         summary["processing"] = processing.summary
-    looking: Future[Changes] | None = None
-    opened: NoiseSurvey | None = None
+    changes_future: Future[Changes] | None = None
+    noise_survey: NoiseSurvey | None = None
 
     with one_thread_algebra():  # in all threads until the light is judged
         if way == "sliding":
-            judged, opened, motion = _landing_light(movie, config, camera, span)
+            judged, noise_survey, motion = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
                 config = followed(config, moves=bool(motion))
             if motion:
                 run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
-                judged, opened, _ = _landing_light(movie, config, camera, span)
+                judged, noise_survey, _ = _landing_light(movie, config, camera, span)
         else:
             if tracked:  # in the light as it is; again if anything of it is unsteady
-                looking = beside(look_at_changes, movie, config, camera, span)
+                changes_future = start_in_thread(look_at_changes, movie, config, camera, span)
             judged = judge_light(movie, config, camera)
     for text in judged.messages:
         run.warn(f"{movie.name}: {text}")
@@ -107,26 +107,26 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if lines is not None:
         summary["lines"] = lines.summary
     if way == "sliding" or (tracked and unsteady):
-        looking = beside(look_at_changes, steady, config, camera, span)
+        changes_future = start_in_thread(look_at_changes, steady, config, camera, span)
     digest = movie.hashed()
     configured = config
     wrong = wrong_sign(config)
     if wrong is not None:
         config, learned = learn_sign(
-            steady, wrong, camera, warn=run.warn, notify=run.notify, opening=opened
+            steady, wrong, camera, warn=run.warn, notify=run.notify, opening=noise_survey
         )
         config = _with_standards(config, run)
     else:
         config, learned = learn_optics(
             steady, _with_standards(config, run), camera,
-            warn=run.warn, notify=run.notify, opening=opened,
+            warn=run.warn, notify=run.notify, opening=noise_survey,
         )  # fmt: skip
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
     other_kind = ""
-    if looking is not None:
-        changes = looking.result()
+    if changes_future is not None:
+        changes = changes_future.result()
         if config.optics.na != configured.optics.na:
             changes = look_at_changes(steady, config, camera, span)
         summary["changes"] = changes_summary(changes)
@@ -136,7 +136,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(
-        movie, steady, config, camera, way, lines, opened, other_kind, digest, summary,
+        movie, steady, config, camera, way, lines, noise_survey, other_kind, digest, summary,
         known.response, processing,
     )  # fmt: skip
 
@@ -164,19 +164,20 @@ def _landing_light(
     wanted next, is summed while the light is still being judged.
     """
 
-    def opening_of(seen: Stack) -> tuple[NoiseSurvey, str]:
-        opened = survey_noise(reader_of(seen, config, camera, span), config)
+    def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
+        noise_survey = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
-        motion = motion_said(seen, opened) if left_open else ""
+        motion = motion_said(seen, noise_survey) if left_open else ""
         if not motion:
-            sum_first_chunk(opened.reader, config, opened.window)
-        return opened, motion
+            sum_first_chunk(noise_survey.reader, config, noise_survey.window)
+        return noise_survey, motion
 
-    opening = beside(opening_of, movie)  # in the light as it is; again if anything is unsteady
+    # in the light as it is; again if anything is unsteady
+    survey = start_in_thread(survey_light, movie)
     judged = judge_light(movie, config, camera)
     if judged.steady is not movie:
-        opening = beside(opening_of, judged.steady)
-    return judged, *opening.result()
+        survey = start_in_thread(survey_light, judged.steady)
+    return judged, *survey.result()
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:
@@ -187,7 +188,7 @@ def _refuse_still(counts: NDArray[Any], name: str) -> None:
 
 def _refuse_what_only_slides(run: Run, name: str) -> None:
     """Say that workers are left idle, and refuse to inject particles."""
-    if run.place.distant:
+    if run.executor.distant:
         run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
     if run.inject:
         raise ConfigError(

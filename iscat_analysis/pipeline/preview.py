@@ -20,7 +20,7 @@ from iscat_analysis.fitting.background_mode import BackgroundMode, background_mo
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
-from iscat_analysis.pipeline.looks import (
+from iscat_analysis.pipeline.preview_searches import (
     BoundSearch,
     LandingSearch,
     Look,

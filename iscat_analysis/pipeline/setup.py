@@ -133,7 +133,7 @@ def write_setup(
         frames, rows, columns = stack.shape
         warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
         known = _known(stack.metadata, answers or {})
-        warn(_metadata_said(stack))
+        warn(_metadata_line(stack))
         values, config = _ask_the_rest(known, ask, warn)
         if config.camera.pixel_size_nm is None:
             raise DataError(
@@ -163,11 +163,11 @@ def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[
     """Collect what answers and metadata say of what would be asked; answers win."""
     known = []
     for question in _QUESTIONS:
-        said = getattr(metadata, question.key.partition(".")[2], None)
+        value = getattr(metadata, question.key.partition(".")[2], None)
         if question.key in answers:
             known.append(Value(question.key, answers[question.key], ANSWER))
-        elif said is not None:
-            known.append(Value(question.key, said, _of_file(metadata)))
+        elif value is not None:
+            known.append(Value(question.key, value, _of_file(metadata)))
     return known
 
 
@@ -208,10 +208,10 @@ def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Pre
 
 def _each_movie(metadata: StackMetadata) -> list[Value]:
     """Show what the metadata of every movie say, and its configuration should not."""
-    said = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
+    stated = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
     return [
         Value(key, value, _of_file(metadata), written=False)
-        for key, value in said.items()
+        for key, value in stated.items()
         if value is not None
     ]
 
@@ -278,7 +278,7 @@ def _toml(setup: Setup) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _metadata_said(stack: Stack) -> str:
+def _metadata_line(stack: Stack) -> str:
     """Give in one line what the file says of itself."""
     metadata = stack.metadata
     parts = [

@@ -109,7 +109,7 @@ def _overview(
 ) -> dict[str, Any]:
     done = movies[movies["state"] == "done"]
     analysed = done[done["role"] != "flat"]
-    told = int((done["cautions"].fillna("") != "").sum())
+    cautioned = int((done["cautions"].fillna("") != "").sum())
     tables = []
     if failed:
         columns: list[Any] = ["not analysed", "why"]
@@ -127,7 +127,7 @@ def _overview(
             },
             {"label": "Samples", "value": str(analysed["sample"].nunique())},
             {"label": "Events", "value": str(int(analysed["events"].sum()))},
-            {"label": "With cautions", "value": str(told), "note": "see the quality"},
+            {"label": "With cautions", "value": str(cautioned), "note": "see the quality"},
         ],
         "tables": tables,
     }
@@ -296,7 +296,7 @@ def _equilibria(
     section = _charts("equilibrium", "Equilibrium", drawn, ("kd",)) or {}
     charts = section["charts"]
     rows = []
-    for chart, (condition, found, remarks) in zip(charts, equilibria, strict=True):
+    for chart, (condition, found, notes) in zip(charts, equilibria, strict=True):
         chart["title"] = f"K_D, {condition}" if condition else "K_D"
         kd, low, high = (found[name] for name in ("kd_nm", "kd_low", "kd_high"))
         rows.append(
@@ -307,7 +307,7 @@ def _equilibria(
                 number(kd),
                 f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}",
                 probability(found["p_value"]),
-                "; ".join(remarks) or "none",
+                "; ".join(notes) or "none",
             ]
         )
     columns = [
@@ -362,7 +362,7 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
     rows = []
     for row in movies.to_dict("records"):
         failed = row["state"] != "done"
-        said = row["why"] if failed else row["cautions"]
+        text = row["why"] if failed else row["cautions"]
         rows.append(
             [
                 links[row["movie"]],
@@ -370,7 +370,7 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
                 unbroken(row["sample"]),
                 *(plain(row[name]) for name in further),
                 {"done": "done", "failed": "failed", "missing": "not yet"}[row["state"]],
-                said or "none",
+                text or "none",
                 whole(row["events"]),
                 share(row["ok"], row["events"]),
                 fixed(row["noise_over_shot"], 2),

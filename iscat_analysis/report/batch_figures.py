@@ -113,8 +113,8 @@ def _overlaid(curves: Sequence[Curve], limit: float, label: str) -> Figure:
         if panel.get_legend_handles_labels()[0]:
             panel.legend(fontsize=6, ncols=1 if len(samples) <= _SHORT else 2)
         elif len(samples) > _NAMED:
-            said = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
-            panel.set_title(said.strip(": "))
+            title = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
+            panel.set_title(title.strip(": "))
     panels[0].set(xlim=(0, limit))
     panels[0].set_ylim(0, _HEADROOM * panels[0].get_ylim()[1])
     _leave_out(panels, len(groups), columns)

@@ -174,11 +174,11 @@ def export_result(
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out
     if not is_file(folder / "fits.csv"):
         raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
-    beside = path.with_suffix(".yaml")
-    for taken in [path, *([beside] if layout == "picasso" else [])]:
+    yaml_path = path.with_suffix(".yaml")
+    for taken in [path, *([yaml_path] if layout == "picasso" else [])]:
         if taken.exists() and not overwrite:
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
-    if layout == "picasso" and path == beside:
+    if layout == "picasso" and path == yaml_path:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
     tracked = is_file(folder / "tracks.csv")
     if tracked and layout == "photomol":
@@ -192,7 +192,7 @@ def export_result(
         path.parent.mkdir(parents=True, exist_ok=True)
         if layout == "picasso":
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
-            with whole_file(beside) as partial_yaml, whole_file(path) as partial:
+            with whole_file(yaml_path) as partial_yaml, whole_file(path) as partial:
                 _write_yaml(partial_yaml, info)
                 _write_locs(partial, locs, info)
         else:

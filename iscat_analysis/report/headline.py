@@ -240,10 +240,12 @@ def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     """Say what spread was measured, and where the model is rejected."""
     free = FREE_PARAMETERS[analysis.mode]
     rejected = rejection(table)
-    said = analysis.summary.get("repeats", {}).get("message", "")
+    message = analysis.summary.get("repeats", {}).get("message", "")
     lines = []
-    if said:
-        lines.append(f"{said if said.startswith('σ') else said[:1].upper() + said[1:]}.")
+    if message:
+        lines.append(
+            f"{message if message.startswith('σ') else message[:1].upper() + message[1:]}."
+        )
     else:
         name = "mass_kda" if "mass_kda" in free else "z_nm"
         p = precision_of(analysis, table, name)

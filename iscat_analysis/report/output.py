@@ -43,7 +43,7 @@ OUTPUT_NAMES = frozenset(
 
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."
 _SIGNED = "lock of iscat-analysis, process "
-_LITTER = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+_SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 _BUILDING, _EARLIER, _LOCK = ".iscat-building.", ".iscat-earlier.", ".iscat-lock."
 _LONGEST_NAME = 200  # bytes; longer ones leave no room for the words above
 
@@ -60,7 +60,7 @@ def check_output(
             raise DataError(f"{folder}: is a file, not a folder; choose another `out`")
         listed = _listed(target)
         foreign = _foreign(target, listed, known)
-        empty = all(entry.name in _LITTER for entry in target.iterdir())
+        empty = all(entry.name in _SYSTEM_FILES for entry in target.iterdir())
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
     if foreign and not listed and foreign in known:
@@ -101,7 +101,7 @@ def atomic_folder(
     """Fill a temporary sibling, and put it in place only once the block has ended well."""
     with claim_output(folder, overwrite, known=known):
         target = _resolved(folder)
-        building = _hidden(_BUILDING, target)
+        building = _hidden_folder(_BUILDING, target)
         try:
             with unfinished(building):
                 try:
@@ -138,7 +138,7 @@ def _short(target: Path) -> str:
     return target.name if len(raw) <= _LONGEST_NAME else hashlib.sha256(raw).hexdigest()
 
 
-def _hidden(kind: str, target: Path) -> Path:
+def _hidden_folder(kind: str, target: Path) -> Path:
     """Choose the name of a hidden folder beside the target, without making the folder."""
     return target.with_name(f"{kind}{secrets.token_hex(4)}.{_short(target)}")
 
@@ -189,7 +189,7 @@ def _inside(folder: Path, *, deepest_first: bool = False) -> Iterator[str]:
         raise error
 
     for where, folders, files in os.walk(folder, topdown=not deepest_first, onerror=refuse):
-        for name in sorted({*folders, *files} - _LITTER):
+        for name in sorted({*folders, *files} - _SYSTEM_FILES):
             yield (Path(where) / name).relative_to(folder).as_posix()
 
 
@@ -203,12 +203,12 @@ def _remove_listed(folder: Path) -> None:
                 continue
             with suppress(OSError):  # a folder that holds something else
                 if path.is_dir() and not path.is_symlink():
-                    for litter in _LITTER:
-                        (path / litter).unlink(missing_ok=True)
+                    for system_file in _SYSTEM_FILES:
+                        (path / system_file).unlink(missing_ok=True)
                     path.rmdir()
                 else:
                     path.unlink()
-        if all(entry.name in {*_LITTER, FILE_LIST} for entry in folder.iterdir()):
+        if all(entry.name in {*_SYSTEM_FILES, FILE_LIST} for entry in folder.iterdir()):
             remove_folder(folder)
 
 
@@ -276,10 +276,10 @@ def _owner(path: Path) -> str | None:
     """Read which process holds a lock file; empty where it says nothing, None if it is no lock."""
     try:
         with path.open("rb") as file:
-            said = file.read(len(_SIGNED) + 20).decode("ascii", "replace")
+            head = file.read(len(_SIGNED) + 20).decode("ascii", "replace")
     except OSError:
         return ""
-    return None if said and not said.startswith(_SIGNED) else said.removeprefix(_SIGNED).strip()
+    return None if head and not head.startswith(_SIGNED) else head.removeprefix(_SIGNED).strip()
 
 
 def _is_still(path: Path, before: os.stat_result) -> bool:
@@ -333,7 +333,7 @@ def _swap(building: Path, target: Path) -> None:
     if not target.exists():
         building.rename(target)
         return
-    earlier = _hidden(_EARLIER, target)
+    earlier = _hidden_folder(_EARLIER, target)
     kept = earlier / target.name
     try:
         _make_ours(earlier)

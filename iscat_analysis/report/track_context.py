@@ -49,12 +49,12 @@ def tracks_context(
     tracks = tracks_of(analysis)
     numbered = tracks.rename(columns={"track": "event"})
     images = event_details(analysis, numbered)
-    said = tracks_headline(analysis, fits)
+    headlines = tracks_headline(analysis, fits)
     return {
         "n_events": len(tracks),
-        "headline": [text for text in said if text != NOT_A_MASS],
+        "headline": [text for text in headlines if text != NOT_A_MASS],
         "flagged": bool(len(tracks)) and tracks_caution(tracks) is not None,
-        "cautions": [text for text in said if text == NOT_A_MASS],
+        "cautions": [text for text in headlines if text == NOT_A_MASS],
         "tiles": _tiles(analysis, fits),
         "events": track_rows(analysis),
         "images": {str(row): list(packed) for row, packed in images.items()},

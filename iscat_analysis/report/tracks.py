@@ -47,9 +47,9 @@ def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
     )
     if (flagged := tracks_caution(tracks)) is not None:
         return [f"{text} {flagged}", *spread_lines(analysis, fits), *warned]
-    said = [f"{label} {value}" for label, value in medians(analysis)]
-    if said:
-        text += f" Medians over tracks: {', '.join(said)}."
+    labelled = [f"{label} {value}" for label, value in medians(analysis)]
+    if labelled:
+        text += f" Medians over tracks: {', '.join(labelled)}."
     return [text, *spread_lines(analysis, fits), *warned]
 
 
@@ -115,7 +115,7 @@ TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
 
 def advice(tracks: pd.DataFrame) -> Iterator[str]:
     """Explain the remarks on tracks."""
-    remarks = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
+    flag_counts = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
     for status in TrackStatus:
-        if remarks[status.value]:
-            yield f"{count(remarks[status.value], 'track')} {status}: {status.advice}"
+        if flag_counts[status.value]:
+            yield f"{count(flag_counts[status.value], 'track')} {status}: {status.advice}"

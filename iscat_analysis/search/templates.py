@@ -218,7 +218,7 @@ def find_particles(
                 z_nm=float(templates.z_nm[peak.layer]),
                 mass_kda=_mass(likelihood.model, templates, float(strength[at]) * higher),
                 snr=float(snr[at]) * higher,
-                beside=_beside(best, peak, known, roi_px),
+                beside=_strongest_lobe(best, peak, known, roi_px),
             )
         )
     return tuple(found)
@@ -253,7 +253,7 @@ def _peaks(
     return [_Peak(*each) for each in zip(*columns, strict=True) if each[-1] > threshold]
 
 
-def _beside(
+def _strongest_lobe(
     best: FloatArray, peak: _Peak, known: Sequence[tuple[float, float]], roi_px: float
 ) -> float:
     """Size of what known particles left over, at a candidate's distance from each.
@@ -263,12 +263,12 @@ def _beside(
     place = peak.x_px, peak.y_px
     away = {k: math.hypot(k[0] - place[0], k[1] - place[1]) for k in known}
     near = sorted((k for k in away if away[k] < LARGEST_IMAGE * roi_px), key=lambda k: away[k])
-    beside = 0.0
+    lobe = 0.0
     for k in near:
-        beside = max(beside, size_on_ring(best, k, place, [o for o in near if o is not k]))
-        if is_hidden(peak.height, EXCEEDS * beside):
+        lobe = max(lobe, size_on_ring(best, k, place, [o for o in near if o is not k]))
+        if is_hidden(peak.height, EXCEEDS * lobe):
             break
-    return beside
+    return lobe
 
 
 def refuse_flood(

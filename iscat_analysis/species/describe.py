@@ -231,10 +231,10 @@ def _table(
     seen = share.sum(axis=0)
     outlier = seen < LEAST_SPECIES - 0.5
     efficiency = best.chance(events).mean(axis=0)
-    hidden = efficiency < LEAST_EFFICIENCY
-    hidden[known:] = False
+    undetectable = efficiency < LEAST_EFFICIENCY
+    undetectable[known:] = False
     some = np.arange(best.weight.size) < known
-    some &= ~hidden
+    some &= ~undetectable
     some &= ~outlier | outlier[some].all()
 
     def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -270,7 +270,7 @@ def _table(
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
             "efficiency": searched * efficiency,
-            "stay_frames": _stay(events, best, window_frames),
+            "stay_frames": _residence(events, best, window_frames),
             "count_corrected": best.weight * best.arrived(events) / searched,
             "corrected_low": came_low / searched,
             "corrected_high": came_high / searched,
@@ -281,7 +281,7 @@ def _table(
     unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
     if found.structure is None:
         unknown += ["mass_se", "mass_low", "mass_high"]
-    table.loc[hidden, unknown] = math.nan
+    table.loc[undetectable, unknown] = math.nan
     if found.structure is not None:
         table["background"] = np.arange(best.weight.size) >= known
     if found.steps:
@@ -329,7 +329,7 @@ def _doubts(ladder: LadderFit | None) -> list[str]:
     ]
 
 
-def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
+def _residence(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
     """Frames that a particle of each species must stay to be found every other time."""
     if window_frames is None or events.efficiency is None:
         return np.full(best.mean.shape, math.nan)
@@ -348,15 +348,15 @@ def _remarks(species: pd.DataFrame) -> list[str]:
     """Say of which species not to believe everything."""
     if "background" in species:
         species = species[~species["background"]]
-    hidden = species["efficiency"] < LEAST_EFFICIENCY
+    undetectable = species["efficiency"] < LEAST_EFFICIENCY
     cases = (
         (
-            hidden,
+            undetectable,
             f"of what lies at {{}} kDa or below fewer than {100 * LEAST_EFFICIENCY:g} % are "
             "detected: its mass and number are not determined, and fractions are of the others",
         ),
         (
-            (species["efficiency"] < 0.5) & ~hidden,
+            (species["efficiency"] < 0.5) & ~undetectable,
             "fewer than half of the particles of {} kDa are detected: their mass and number rest "
             "on the detection model",
         ),
@@ -382,14 +382,14 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
     known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
     if window_frames is None or known.empty:
         return []
-    stays = ", ".join(
+    residence = ", ".join(
         f"{row.mass_kda:.3g} kDa from {count(round(row.stay_frames), 'frame')}"
         for row in known.itertuples()
     )
     return [
         "efficiencies and corrected counts are of particles that stay "
         f"{count(window_frames, 'frame')} or longer; briefer visitors are missed more often and "
-        f"appear lighter: every other one is found of {stays}"
+        f"appear lighter: every other one is found of {residence}"
     ]
 
 

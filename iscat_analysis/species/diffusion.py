@@ -299,13 +299,15 @@ def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, floa
     diagonal[1:-1] = track.linked[1:] & track.linked[:-1]
     if not diagonal.any():
         return math.nan, math.nan
-    beside = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
+    off_diagonal = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
     time = 2 * float(track.gaps_s @ diagonal) * len(steps)
-    total = float(np.sum(diagonal * steps**2) + 2 * np.sum(beside * steps[:, 1:] * steps[:, :-1]))
+    total = float(
+        np.sum(diagonal * steps**2) + 2 * np.sum(off_diagonal * steps[:, 1:] * steps[:, :-1])
+    )
     variance = 0.0
     for error, band in zip(*track.error, strict=True):
         main, next_ = error + d_nm2_s * track.rate[0], band + d_nm2_s * track.rate[1]
-        variance += 2 * _square_trace((diagonal, beside), (main, next_))
+        variance += 2 * _square_trace((diagonal, off_diagonal), (main, next_))
     return total / time, math.sqrt(variance) / time
 
 

@@ -96,13 +96,13 @@ def _powers(at: FloatArray) -> tuple[float, float]:
 
 def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArray, float]:
     """Step to the vertex of the parabola within a range, and what the likelihood gains there."""
-    bends = here.curvature
-    if not (bends[1, 1] > 0 and np.linalg.det(bends) > 0):
-        bends = here.information
-    alpha = float(np.clip(np.linalg.solve(bends, here.slope)[1], least[1], most[1]))
-    ln_d = (here.slope[0] - bends[0, 1] * alpha) / bends[0, 0]
+    curvature = here.curvature
+    if not (curvature[1, 1] > 0 and np.linalg.det(curvature) > 0):
+        curvature = here.information
+    alpha = float(np.clip(np.linalg.solve(curvature, here.slope)[1], least[1], most[1]))
+    ln_d = (here.slope[0] - curvature[0, 1] * alpha) / curvature[0, 0]
     step: FloatArray = np.array([float(np.clip(ln_d, least[0], most[0])), alpha])
-    return step, float(here.slope @ step - step @ bends @ step / 2)
+    return step, float(here.slope @ step - step @ curvature @ step / 2)
 
 
 def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
@@ -112,16 +112,16 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
     )
     motion = covariance(lags, there)
     turn = covariance(lags, (after - before) / (2 * _PART))
-    bend = covariance(lags, (after - 2 * there + before) / _PART**2)
+    motion_curvature = covariance(lags, (after - 2 * there + before) / _PART**2)
     n = len(motion)
     value, slope = -0.5 * track.steps_nm.size * math.log(2 * math.pi), np.zeros(2)
     curvature, information = np.zeros((2, 2)), np.zeros((2, 2))
-    for main, beside, steps in zip(*track.error, track.steps_nm, strict=True):
+    for main, off_diagonal, steps in zip(*track.error, track.steps_nm, strict=True):
         sigma = motion.copy()
         flat = sigma.reshape(n * n)
         flat[:: n + 1] += main
-        flat[1 :: n + 1] += beside
-        flat[n :: n + 1] += beside
+        flat[1 :: n + 1] += off_diagonal
+        flat[n :: n + 1] += off_diagonal
         try:
             inverse, log_determinant = _inverse(sigma)
         except np.linalg.LinAlgError:
@@ -130,21 +130,21 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
         z = inverse @ steps
         value -= float(steps @ z) / 2
         by_d = -main[:, None] * inverse  # Σ_a W
-        by_d[1:] -= beside[:, None] * inverse[:-1]
-        by_d[:-1] -= beside[:, None] * inverse[1:]
+        by_d[1:] -= off_diagonal[:, None] * inverse[:-1]
+        by_d[:-1] -= off_diagonal[:, None] * inverse[1:]
         by_d.reshape(n * n)[:: n + 1] += 1
         by_alpha = turn @ inverse
         force = np.array([by_d @ steps, by_alpha @ steps])  # Σ_a z
         trace = np.array([np.trace(by_d), np.trace(by_alpha)])
         slope += (force @ z - trace) / 2
-        told = np.empty((2, 2))
-        told[0, 0], told[1, 1] = (np.einsum("ij,ji", by, by) / 2 for by in (by_d, by_alpha))
-        told[0, 1] = told[1, 0] = np.einsum("ij,ji", by_d, by_alpha) / 2
+        fisher = np.empty((2, 2))
+        fisher[0, 0], fisher[1, 1] = (np.einsum("ij,ji", by, by) / 2 for by in (by_d, by_alpha))
+        fisher[0, 1] = fisher[1, 0] = np.einsum("ij,ji", by_d, by_alpha) / 2
         second = np.empty((2, 2))  # z·Σ_ab z − tr WΣ_ab
         second[0] = second[:, 0] = force @ z - trace
-        second[1, 1] = z @ bend @ z - np.einsum("ij,ij", inverse, bend)
-        curvature += force @ inverse @ force.T - told - second / 2
-        information += told
+        second[1, 1] = z @ motion_curvature @ z - np.einsum("ij,ij", inverse, motion_curvature)
+        curvature += force @ inverse @ force.T - fisher - second / 2
+        information += fisher
     return _There(value, slope, curvature, information)
 
 

@@ -215,11 +215,11 @@ def confinement_test(
     free = most_likely(track)
     if not free > 0:
         return ConfinementTest(1.0, 0.0, math.inf, 0.0)
-    ratio, d, stiffness = _well(track, free)
+    ratio, d, stiffness = _harmonic_trap(track, free)
     larger, p_value = 0, math.nan
     for number in range(1, turns + 1):
         drawn = _free_track(track, free, draw)
-        larger += _well(drawn, most_likely(drawn))[0] >= ratio
+        larger += _harmonic_trap(drawn, most_likely(drawn))[0] >= ratio
         p_value = (larger + 1) / (number + 1)
         if larger == enough:
             p_value = larger / number
@@ -268,7 +268,7 @@ def steadiness_test(
     return float(chdtrc(count - 1, max(ratio, 0.0)))
 
 
-def _well(track: Displacements, free: float) -> tuple[float, float, float]:
+def _harmonic_trap(track: Displacements, free: float) -> tuple[float, float, float]:
     """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
     none = track.likelihood(free).value
     scale = free or float(np.mean(track.steps_nm**2 / track.rate[0]))

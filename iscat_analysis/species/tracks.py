@@ -67,7 +67,7 @@ SLOWED = 0.05
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
-_LITTLE_TOLD = 0.05  # of the information on a mass is left by the background
+_LITTLE_KNOWN = 0.05  # of the information on a mass is left by the background
 _SEEN = 0.9  # of all frames, in which a particle that hardly moves is seen at least
 _VAGUE = 0.02  # of a mass, which the background makes too uncertain for the error to be trusted
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
@@ -177,11 +177,11 @@ def _record(
             "mass_scatter": mass.scatter,
             "p_mass": mass.p_value,
         }
-    told = exact.get("told", 1.0)
+    known_share = exact.get("told", 1.0)
     if all(np.isfinite(value) for value in exact.values()):
         record |= {name: value for name, value in exact.items() if name != "told"}
-    scale = _scale_error(record, told)
-    record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
+    scale = _scale_error(record, known_share)
+    record["short_way"] = known_share < _LITTLE_KNOWN and scale > 2 * _VAGUE
     massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
     each = of_known(np.median, massive.contrast / massive.mass_kda)
     record["contrast"] = record["mass_kda"] * each
@@ -201,7 +201,7 @@ def _record(
     return record | _ends(rows, setup, record["d_um2_s"])
 
 
-def _scale_error(record: Mapping[str, Any], told: float) -> float:
+def _scale_error(record: Mapping[str, Any], known_share: float) -> float:
     """Relative error of D by a background that was learnt with the track.
 
     What the frames of a particle that hardly moves have beyond their mean, which the background
@@ -209,7 +209,7 @@ def _scale_error(record: Mapping[str, Any], told: float) -> float:
     are too small by it, and D, as their square, by twice as much.
     """
     relative = record["sigma_mass_kda"] / (abs(record["mass_kda"]) or math.nan)
-    return 2 * relative * math.sqrt(1 - told) if np.isfinite(relative) else 0.0
+    return 2 * relative * math.sqrt(1 - known_share) if np.isfinite(relative) else 0.0
 
 
 def _wider(found: Diffusion, end: int, scale: float) -> float:
@@ -360,11 +360,11 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
         step_nm = 3 * float(np.sqrt(2 * d_um2_s * _UM2 / setup.frame_rate_hz))
     border, room = setup.near_nm + step_nm, _room(rows, setup)
-    said = {}
+    ends = {}
     for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):
         where = "border" if room[at] < border else "inside"
-        said[which] = "movie" if rows.frame[at] == frame else where
-    return said
+        ends[which] = "movie" if rows.frame[at] == frame else where
+    return ends
 
 
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from iscat_analysis.diagnosis.noise import Noise, judge_beside
 from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.aligned import Aligned, align
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
@@ -101,15 +101,17 @@ def analyse_block(
 
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
-        pictures = beside(align, context, moving)
-        judged = beside(judge_beside, context, movie, camera, span, seen, field.used, without)
+        pictures = start_in_thread(align, context, moving)
+        judged = start_in_thread(
+            judge_beside, context, movie, camera, span, seen, field.used, without
+        )
     table, inside = moving_table(context, moving, first), field.holds(rows.theta)
     masses = common_masses(context, moving)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
     aligned, noise = None, Noise()
     if not goes_on[0]:
         aligned = pictures.result()
-        noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
+        noise = judged.result().compared_with_fits(table["chi2_reduced"].to_numpy(float))
         smeared = smear_warning(context.config, table, moving.smear_nm)
         if smeared:  # what is left over of pictures, far around them, is not the camera's
             noise = Noise(messages=(smeared,))

@@ -123,12 +123,14 @@ def plan_blocks(
         )
     if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < _SMALLEST_PX:
         return Plan(_spans(first, last, count))
-    way, stiffness = follow_light(movie, camera, (first, last), config, check=check, mapper=mapper)
-    if way is None:
+    motion, stiffness = follow_light(
+        movie, camera, (first, last), config, check=check, mapper=mapper
+    )
+    if motion is None:
         return Plan(_spans(first, last, count))
-    shift = way.at(np.arange(first, last, dtype=float))
+    shift = motion.at(np.arange(first, last, dtype=float))
     moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * _unrest(way.shift_px)))
+    unrest = float(np.sum(stiffness * _unrest(motion.shift_px)))
 
     def cost_of(count: int) -> float:
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
@@ -194,11 +196,11 @@ def follow_light(
         return None, np.zeros((2, 2))
     power = light * lengths.sum() / light.sum()
     middle = np.array([(low + high - 1) / 2 for low, high in spans])
-    way = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
+    motion = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
     inside = trusted(usable)
-    if way is None or not inside.any() or not np.isfinite(way.shift_px).all():
+    if motion is None or not inside.any() or not np.isfinite(motion.shift_px).all():
         return None, np.zeros((2, 2))
-    return way, _stiffness(sums / lengths[:, None, None], read, inside, lengths)
+    return motion, _stiffness(sums / lengths[:, None, None], read, inside, lengths)
 
 
 def _stiffness(
@@ -219,8 +221,8 @@ def _unrest(shift_px: FloatArray) -> FloatArray:
 
     It is that of second differences, over 6, in which a steady drift does not show.
     """
-    bends = np.diff(shift_px, n=2, axis=0)
-    return bends.T @ bends / (6 * max(len(bends), 1))
+    second_difference = np.diff(shift_px, n=2, axis=0)
+    return second_difference.T @ second_difference / (6 * max(len(second_difference), 1))
 
 
 def _spans(first: int, last: int, count: int) -> tuple[tuple[int, int], ...]:

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from iscat_analysis.records import BoolArray, FloatArray, Status
 from iscat_analysis.species.track_rows import NO_PLACE
 
-LEAST_TOGETHER = 3
+FEWEST_PARTICLES = 3
 """Particles in a pair of frames, at least."""
 
-WORTH_SAYING = 0.05
+LEAST_COMMON_SHARE = 0.05
 """Of the square of a particle's step, what is common to all, from which on it is said."""
 
 MANY = 8
@@ -66,17 +66,17 @@ def warnings_of(
     steps = _steps_of(fits, ticks)
     if steps is None:
         return
-    shaken = _shaking(steps, frame_rate_hz)
+    shaken = _shared_steps(steps, frame_rate_hz)
     if shaken:
         yield shaken
     jumps, dropped = _jumps(steps), _dropped(steps)
-    many = [said for missing, said in jumps if missing >= MANY]
+    many = [text for missing, text in jumps if missing >= MANY]
     if many:
         yield from many
     elif dropped and not shaken:
         yield dropped
     else:
-        yield from (said for _, said in jumps)
+        yield from (text for _, text in jumps)
 
 
 def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
@@ -95,18 +95,18 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
         mine = track == k
         if mine.sum() >= _LEAST_STEPS:
             variance[mine] = np.median((xy[mine] ** 2).sum(axis=1)) / (2 * math.log(2))
-    told = variance > 0
-    numbers, count = np.unique(frame[told], return_counts=True)
-    numbers = numbers[count >= LEAST_TOGETHER]
-    told &= np.isin(frame, numbers)
+    used = variance > 0
+    numbers, count = np.unique(frame[used], return_counts=True)
+    numbers = numbers[count >= FEWEST_PARTICLES]
+    used &= np.isin(frame, numbers)
     if len(numbers) < _LEAST_PAIRS:
         return None
-    order = np.flatnonzero(told)[np.argsort(frame[told], kind="stable")]
+    order = np.flatnonzero(used)[np.argsort(frame[used], kind="stable")]
     pair = np.searchsorted(numbers, frame[order]).astype(np.int64)
     return _Steps(pair, numbers.astype(np.int64), xy[order], variance[order])
 
 
-def _shaking(steps: _Steps, frame_rate_hz: float | None) -> str:
+def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> str:
     """Say that all particles move by the same from frame to frame; empty where they do not.
 
     What two particles have in common is the mean product of their steps, of which the product of
@@ -121,7 +121,9 @@ def _shaking(steps: _Steps, frame_rate_hz: float | None) -> str:
     product = both[0] + both[1] - own
     mean, error = product.mean(), product.std() / math.sqrt(len(product))
     common = float(product.sum() / (2 * pairs.sum()))  # variance along each axis
-    if mean < _SIGNIFICANT * error or common < WORTH_SAYING * float(np.median(steps.variance)):
+    if mean < _SIGNIFICANT * error or common < LEAST_COMMON_SHARE * float(
+        np.median(steps.variance)
+    ):
         return ""
     by = ""
     if frame_rate_hz is not None:

@@ -33,7 +33,7 @@ class _End:
 
     track: int
     frame: int
-    way: int
+    direction: int
 
 
 def extended(
@@ -61,7 +61,7 @@ def extended(
     while ends:
         proposed: dict[int, dict[int, _End]] = {}
         for end in ends:
-            t = end.frame + end.way
+            t = end.frame + end.direction
             if not 0 <= t < field.frames or end.track in frames[t]:
                 continue
             here = frames[end.frame][end.track]
@@ -81,24 +81,24 @@ def extended(
             of_frame = np.flatnonzero(fitted.frame == t)
             found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
             sure = {int(fitted.track[i]): bool(good[i]) for i in of_frame}
-            kept = []
+            accepted = []
             for k, end in new.items():
                 theta, last = found[k], frames[end.frame][k]
-                beside = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
-                alone = min(beside, default=np.inf) > meeting
+                distances = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
+                alone = min(distances, default=np.inf) > meeting
                 heavy = theta[3] > LEAST_SHARE * typical[k]
                 step = np.hypot(*(theta - last)[:2])
-                apart = min(beside, default=np.inf) > same
+                apart = min(distances, default=np.inf) > same
                 if sure[k] and (alone or heavy) and apart and step < reach_nm:
-                    kept.append(end)
-            if not kept:
+                    accepted.append(end)
+            if not accepted:
                 continue
             for k, theta in found.items():
-                if k in frames[t] or k in {end.track for end in kept}:
+                if k in frames[t] or k in {end.track for end in accepted}:
                     frames[t][k] = theta
-            added += len(kept)
+            added += len(accepted)
             refitted[t] = fitted.only(of_frame)
-            ends += [_End(end.track, t, end.way) for end in kept]
+            ends += [_End(end.track, t, end.direction) for end in accepted]
     rows = replace(rows, group=blur[rows.track])
     if not refitted:
         return rows, 0

@@ -22,8 +22,8 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import (
     fixed_height_warning,
     misfit_warning,
+    pattern_jitter_warning,
     pixel_warnings,
-    shaking_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
@@ -47,7 +47,7 @@ from iscat_analysis.records import (
     make_rows,
 )
 from iscat_analysis.search.sliding import DARK, well_lit
-from iscat_analysis.threads import beside, threads
+from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.tracking.blocks import Plan, plan_blocks
 from iscat_analysis.tracking.frame_search import link
@@ -74,14 +74,14 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         run.warn(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
-    shaking = beside(shaking_warning, movie, camera, (first, last))
+    jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
     if message := plan.message(movie.name):
         run.warn(message)
-    shaken = shaking.result()
-    if shaken:
-        run.warn(f"{movie.name}: {shaken}")
+    jitter_warning = jitter_future.result()
+    if jitter_warning:
+        run.warn(f"{movie.name}: {jitter_warning}")
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
@@ -118,7 +118,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
             if held:
                 run.warn(held)
     windows = joined.followed.windows
-    for text in () if shaken else blocks[0].noise:
+    for text in () if jitter_warning else blocks[0].noise:
         run.warn(text)
     for text in pixel_warnings(*windows.left_out):
         run.warn(text)
@@ -218,15 +218,15 @@ def _analysed(
 ) -> Block:
     """Give a block of a movie, kept or analysed now."""
     count, span = len(plan.spans), plan.spans[number]
-    told = progress if count == 1 else _part_of(progress, number, count)
+    block_progress = progress if count == 1 else _part_of(progress, number, count)
     block = store.load(number, span)
     if block is not None:
-        told("track", 1, 1)
+        block_progress("track", 1, 1)
         return block
     block = analyse_block(
         context, movie, camera, span,
         goes_on=(number > 0, number + 1 < count),
-        check=check, pool=pool, progress=told, cautious=cautious,
+        check=check, pool=pool, progress=block_progress, cautious=cautious,
     )  # fmt: skip
     store.save(number, block)
     return block
@@ -235,11 +235,11 @@ def _analysed(
 def _part_of(progress: Progress, number: int, count: int) -> Progress:
     """Tell the progress of one block as that of all; reading is no stage of its own."""
 
-    def told(stage: str, done: int, total: int) -> None:
+    def of_all(stage: str, done: int, total: int) -> None:
         if stage == "track":
             progress(stage, round(_STEPS * (number + done / total)), _STEPS * count)
 
-    return told
+    return of_all
 
 
 def track_frames(

@@ -94,9 +94,9 @@ class FrameFilter:
         """
         parts: list[FloatArray] = []
         threshold = self._templates.threshold
-        together = max(_FIELDS // len(self._layers), 1)
-        for start in range(0, len(residual_e), together):
-            stop = start + together
+        fields_at_once = max(_FIELDS // len(self._layers), 1)
+        for start in range(0, len(residual_e), fields_at_once):
+            stop = start + fields_at_once
             snr = self._snr(residual_e[start:stop], power[start:stop])
             best = snr.max(axis=1)
             at = maxima(best, SAMPLED * threshold, (0, 1, 1))
@@ -149,10 +149,10 @@ class FrameFilter:
     ) -> BoolArray:
         """Whether peaks may be side lobes of others, which are higher."""
         apart_x, apart_y = x[one] - x[other], y[one] - y[other]
-        beside = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
-        lobe = height[one] < height[other] * np.where(beside, self._lobe, FAR_LOBE)
+        within_region = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
+        lobe = height[one] < height[other] * np.where(within_region, self._lobe, FAR_LOBE)
         lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
-        return np.asarray(lobe | beside if self._cautious else lobe)
+        return np.asarray(lobe | within_region if self._cautious else lobe)
 
     def _are_left_over(
         self,

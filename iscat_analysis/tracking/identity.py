@@ -119,9 +119,11 @@ class _Typical:
         took = int(after.frames[0] - before.frames[1])
         if took <= 0:
             return -math.inf  # one particle is not twice in a frame
-        way = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
+        distance_squared = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
         moved = (
-            self._marginal(before.steps + after.steps + 1, before.square + after.square + way)
+            self._marginal(
+                before.steps + after.steps + 1, before.square + after.square + distance_squared
+            )
             - self._marginal(before.steps, before.square)
             - self._marginal(after.steps, after.square)
             + math.log(self.near_nm**2 / (2 * took))
@@ -298,11 +300,11 @@ def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
     one, two = one[order], two[order]
     frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
     others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
-    for together in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
-        if together.size:
-            first, last = frame[together[[0, -1]]].tolist()
-            of = int(tracks[together[0], 0]), int(tracks[together[0], 1])
-            yield _Pair(first, last, of, np.stack([one[together], two[together]], axis=1))
+    for run in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
+        if run.size:
+            first, last = frame[run[[0, -1]]].tolist()
+            of = int(tracks[run[0], 0]), int(tracks[run[0], 1])
+            yield _Pair(first, last, of, np.stack([one[run], two[run]], axis=1))
 
 
 def _groups(rows: Localizations, track: IntArray) -> IntArray:

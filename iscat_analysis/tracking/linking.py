@@ -135,8 +135,8 @@ def alone(
     near = crowded(rows, _BESIDE * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
-    kept = (free >= _least(config, rows, inner)) & seen(context, rows)
-    return numbered(rows.only(kept[rows.track]))
+    keep = (free >= _least(config, rows, inner)) & seen(context, rows)
+    return numbered(rows.only(keep[rows.track]))
 
 
 def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
@@ -148,8 +148,8 @@ def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
     snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
     plain = snr > AS_FOUND * context.templates.threshold
     tracks = int(rows.track.max(initial=-1)) + 1
-    fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
-    return np.asarray(2 * sights > fits)
+    fits, detections = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
+    return np.asarray(2 * detections > fits)
 
 
 def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Localizations, int]:
@@ -161,9 +161,11 @@ def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Local
         if _step_nm2(rows, mine) * _BRIDGE_FRAMES > reach**2:
             continue
         middle = float(np.median(rows.theta[mine, 3]))
-        for end, way in ((mine[0], -1), (mine[-1], 1)):
+        for end, direction in ((mine[0], -1), (mine[-1], 1)):
             first = int(rows.frame[end])
-            held = np.clip(first + way * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1)
+            held = np.clip(
+                first + direction * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1
+            )
             for t in np.unique(held[held != first]):
                 frame.append(int(t))
                 track.append(int(k))
@@ -177,14 +179,14 @@ def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Local
 
 def trimmed(rows: Localizations) -> Localizations:
     """Cut tracks where they begin and end with frames that hold too little of their mass."""
-    kept = np.ones(len(rows.frame), dtype=bool)
+    keep = np.ones(len(rows.frame), dtype=bool)
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)
         amplitude = rows.theta[mine, 3]
         full = np.flatnonzero(amplitude > LEAST_SHARE * np.median(amplitude))
         if len(full):
-            kept[mine[: full[0]]] = kept[mine[full[-1] + 1 :]] = False
-    return rows.only(kept)
+            keep[mine[: full[0]]] = keep[mine[full[-1] + 1 :]] = False
+    return rows.only(keep)
 
 
 def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:

@@ -21,7 +21,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.species.diffusion import estimate_diffusion
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.extension import extended
 from iscat_analysis.tracking.frame_search import FrameCandidates, load_linker
 from iscat_analysis.tracking.heights import decide_heights
@@ -134,7 +134,7 @@ def follow(
             break
         rows = _joined(context, rows, found)
         if len(rows.frame) > _SEVERAL * len(np.unique(rows.frame)):  # there will be a choice
-            beside(load_linker)
+            start_in_thread(load_linker)
         rows, ground, done = fit_jointly(
             field,
             ground,
@@ -185,7 +185,7 @@ def follow(
         ground = replace(ground, level=found_ground.level) if follow_level else ground
         if added <= (_FEW_TRIED if number < _HELD_ROUNDS else _FEW) * len(rows.frame):
             break
-    rows = _told_apart(config, trimmed(rows))
+    rows = _with_identities(config, trimmed(rows))
     for stage in range(2):
         give_back(context, field, movie, camera, span[0], ground, rows)
         if context.mode == "joint":
@@ -244,14 +244,14 @@ def _in_their_fringes(
     )  # fmt: skip
 
 
-def _told_apart(config: Config, rows: Localizations) -> Localizations:
+def _with_identities(config: Config, rows: Localizations) -> Localizations:
     """Give particles that met their own numbers again."""
     if not len(rows.frame):
         return rows
     error = mass_error(config, rows, typical_error(rows.fisher))
     resolution = config.optics.wavelength_nm / config.optics.na
-    told = identified(rows, near_nm=resolution, error=error)
-    return numbered(told)
+    rows_identified = identified(rows, near_nm=resolution, error=error)
+    return numbered(rows_identified)
 
 
 def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidates) -> Localizations:

@@ -101,7 +101,7 @@ def table_of_tracks(
     judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
     status = [str(status) for status, _ in judged]
     flags = [";".join(map(str, flags)) for _, flags in judged]
-    status, flags = (np.array(said, dtype=object)[2 * numbers + off] for said in (status, flags))
+    status, flags = (np.array(text, dtype=object)[2 * numbers + off] for text in (status, flags))
     return make_rows(table, {"status": status, "flags": flags})
 
 
@@ -215,7 +215,7 @@ def _flags(
     texts = [""]  # of every set of remarks; in the number of one, each remark has its bit
     for _, mark in marks:
         texts += [f"{text};{mark}".lstrip(";") for text in texts]
-    numbers = sum(told.astype(np.int64) << bit for bit, (told, _) in enumerate(marks))
+    numbers = sum(applies.astype(np.int64) << bit for bit, (applies, _) in enumerate(marks))
     return np.asarray(np.array(texts, dtype=object)[numbers])
 
 

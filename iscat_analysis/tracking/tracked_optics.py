@@ -19,7 +19,7 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.instrument.learner import (
@@ -113,7 +113,7 @@ def learn_from_tracks(
     name: str,
     pool: ThreadPoolExecutor,
     warn: Callable[[str], None],
-    notify: Callable[[str], None] = unheard,
+    notify: Callable[[str], None] = notify_nobody,
 ) -> tuple[Begun, dict[str, Any]]:
     """Follow the first frames, test the optics on them, and learn better ones where they fail.
 
@@ -136,18 +136,18 @@ def learn_from_tracks(
     if noisy and cause is None and optics.calibrate != "always":
         return begun, tested | {"calibrated": False, "reason": _NOISE}
 
-    def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+    def as_configured(message: str, reason: str) -> tuple[Begun, dict[str, Any]]:
         if trouble is not None and cause is None:
             raise trouble
         if trouble is not None:
-            raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
-        warn(said)
+            raise DataError(f"{message}; nothing can be followed with them: {trouble}") from trouble
+        warn(message)
         return begun, tested | {"calibrated": False, "reason": reason}
 
     learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
     if not learns or (cause is not None and cause.name == PIXEL):
-        said = _said(left, cause, learns=learns)
-        return as_configured(said, said)
+        message = _message(left, cause, learns=learns)
+        return as_configured(message, message)
     reason = ""
     notify("learning the optics from the tracks of the movie, which may take minutes…")
     # with free heights rings are taken for many particles, each with its own: that takes long
@@ -157,23 +157,23 @@ def learn_from_tracks(
             trial = begin(config, cautious=True) if cautious and trouble is None else begun
             found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
             if found is not None:
-                learned, told = taken(
+                learned, optics_summary = taken(
                     found, config, tested, left.verdict, pictures_of="pictures of tracks", warn=warn
                 )
-                return begin(learned), told
+                return begin(learned), optics_summary
             if trouble is not None and near is not None:
                 warn(f"{left.verdict}; others are used that describe them better, but: {why}")
                 rest = near.left.share if near.left is not None else 0.0
-                told = {"calibrated": True, "reason": why, "left_over_then": rest}
-                return near, tested | told
+                optics_summary = {"calibrated": True, "reason": why, "left_over_then": rest}
+                return near, tested | optics_summary
         except (DataError, ConfigError) as error:  # or what was learned asks for too much memory
             why = str(error)
         reason = reason or why
     if left.rejected:
-        said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
+        message = f"{_message(left, cause, learns=True)} (other optics were not learned: {reason})"
     else:
-        said = f"{left.verdict}: {reason}; the analysis goes on as configured"
-    return as_configured(said, reason)
+        message = f"{left.verdict}: {reason}; the analysis goes on as configured"
+    return as_configured(message, reason)
 
 
 def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
@@ -302,7 +302,7 @@ def _cause(begun: Begun) -> Cause | None:
     return likely_cause(context.config, fits)
 
 
-def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
+def _message(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
     """Say what is wrong, and what to do."""
     if cause is None:
         return (

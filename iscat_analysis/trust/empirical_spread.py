@@ -116,23 +116,23 @@ def likely_noise(
     """
     excess = found.over_crb**2 - 1
     single = found.fast2
-    said, doubt = [], ""
+    causes, doubt = [], ""
     if single - 1 > _SHARE * excess:
         over_shot = [v for v in noise.get("noise_variance_over_shot", ()) if v is not None]
         pixels = over_shot[0] if over_shot else single
         if abs(pixels - 1) > _SHARE * (single - 1):
-            said.append(
+            causes.append(
                 f"single frames have {single:.3g} times the variance that the camera's numbers "
                 "give: a wrong camera.gain_e_per_adu, or a source or camera with noise of its own"
             )
         else:
-            said.append(
+            causes.append(
                 "the noise of single pixels is as expected but that of an image is not: "
                 "neighbouring pixels are correlated, by crosstalk or a filter in the camera"
             )
     if found.empty:
         if found.slow2 > _SHARE * excess:
-            said.append(_slow(found, sliding))
+            causes.append(_slow(found, sliding))
             if rejected:
                 doubt = (
                     "it may be what a wrong model of the image leaves over of other particles: "
@@ -140,10 +140,10 @@ def likely_noise(
                 )
         own = found.over_crb**2 - found.empty[-1] ** 2
         if own > _SHARE * excess:
-            said.append(
+            causes.append(
                 "it is larger at the particles than elsewhere: they move or change in the light"
             )
-    return doubt + ("; ".join(said) or "its kind is not clear")
+    return doubt + ("; ".join(causes) or "its kind is not clear")
 
 
 def _slow(found: EmpiricalSpread, sliding: bool) -> str:

@@ -57,18 +57,18 @@ class Extension:
     def of(
         cls,
         table: pd.DataFrame,
-        told: Evidence,
+        evidence: Evidence,
         in_time: Mapping[str, EmpiricalSpread],
         wiggle_nm: float = 0.0,
     ) -> Extension | None:
         """Judge the evidence of rows, beyond a wiggle that is known; None where none has any."""
-        said = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
-        q, se = told.spread_nm2, told.sigma_spread_nm2
-        known = np.isfinite(q) & np.isfinite(se) & np.isfinite(told.sigma_across_nm2)
+        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
+        q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
+        known = np.isfinite(q) & np.isfinite(se) & np.isfinite(evidence.sigma_across_nm2)
         if not known.any():
             return None
-        own = known & (q > 0) & (np.nan_to_num(told.chi2_spread) > chdtri(3, _CHANCE))
+        own = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         many = good & known
         mean, error = math.nan, math.nan
         shift = np.zeros(len(table))
@@ -76,13 +76,13 @@ class Extension:
             mean, error = max(
                 (
                     _mean(q[many], se[many]),
-                    _length(*(part[many] for part in told[7:10])),
+                    _length(*(part[many] for part in evidence[7:10])),
                     _wiggle(table[many], in_time, wiggle_nm),
                 ),
                 key=lambda found: found[0] / found[1],
             )
         if mean > _DOUBTFUL * error:
-            shift = np.abs(np.nan_to_num(told.mass_per_spread)) * mean
+            shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * mean
         if mean > _SIGNIFICANT * error:
             own = own | (known & (shift > _MATTERS * table["sigma_mass_kda"].to_numpy(float)))
         return cls(mean, error, own, shift)

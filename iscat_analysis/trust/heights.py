@@ -31,20 +31,20 @@ class Heights:
 
     @classmethod
     def of(
-        cls, config: Config, table: pd.DataFrame, told: Evidence, *, learned_optics: bool
+        cls, config: Config, table: pd.DataFrame, evidence: Evidence, *, learned_optics: bool
     ) -> Heights | None:
         """Judge the evidence of every row; None where there is too little."""
         held = not has_prior(config)
         kinds = _DESCRIBED if held else {Status.OK.value}
-        said = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in said])
-        spread = spread_of_heights(told.z_nm[good], told.sigma_z_nm[good])
+        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in marks])
+        spread = spread_of_heights(evidence.z_nm[good], evidence.sigma_z_nm[good])
         if spread is None:
             return None
         shift = np.zeros(len(table))
         if held and spread.is_spread:
             off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
-            shift = np.abs(np.nan_to_num(told.mass_per_z)) * off
+            shift = np.abs(np.nan_to_num(evidence.mass_per_z)) * off
         return cls(spread, held, shift, learned_optics)
 
     @property

@@ -132,12 +132,12 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
 def test_noise_that_all_fits_have_is_told() -> None:
     noise = Noise(("set camera.gain_e_per_adu = 12.9",), True, ExcessNoise(1.55, ""))
     spread = np.linspace(-0.1, 0.1, 50)
-    assert noise.beside(1.55 + spread) is noise
-    assert noise.beside(3.0 + spread) is noise  # of a wrong microscope as well
-    assert not noise.beside(np.append(3.0 + spread, [1.1] * 10)).messages
-    assert noise.beside(np.full(5, 1.0)) is noise  # too few to tell
+    assert noise.compared_with_fits(1.55 + spread) is noise
+    assert noise.compared_with_fits(3.0 + spread) is noise  # of a wrong microscope as well
+    assert not noise.compared_with_fits(np.append(3.0 + spread, [1.1] * 10)).messages
+    assert noise.compared_with_fits(np.full(5, 1.0)) is noise  # too few to tell
     less = Noise(("set camera.gain_e_per_adu = 30",), True)
-    assert less.beside(1.0 + spread) is less
+    assert less.compared_with_fits(1.0 + spread) is less
 
 
 def test_tracks_near_saturated_pixels_are_flagged() -> None:

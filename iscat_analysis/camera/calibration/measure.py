@@ -120,8 +120,8 @@ def measure_camera(
     used &= ~unsteady(found, used)
     masked["hot"] |= ~(used | masked["saturated"] | masked["dead"] | masked["clipped"])
 
-    said: list[str] = []
-    result = solve(found, used, dark_found, offset_adu, said)
+    flicker_notes: list[str] = []
+    result = solve(found, used, dark_found, offset_adu, flicker_notes)
     longest = int(np.argmax([item.n_frames for item in found]))
     spectrum = _spectrum(light[longest], ~used, result)
     if spectrum is not None and any(spectrum.shared):
@@ -130,13 +130,13 @@ def measure_camera(
             replace(item, variance=moments_of(stack, used, _nothing, flickering=lines).variance)
             for stack, item in zip(light, found, strict=True)
         ]
-        said = [
+        flicker_notes = [
             f"whole {lines} flicker ({100 * max(spectrum.shared):.2g} % of the noise variance); "
             f"the flicker of each of the {lines} was taken out"
         ]
-        result = solve(found, used, dark_found, offset_adu, said)
+        result = solve(found, used, dark_found, offset_adu, flicker_notes)
         spectrum = _spectrum(light[longest], ~used, result)
-    notes += [*said, *mask_notes(masked)]
+    notes += [*flicker_notes, *mask_notes(masked)]
     noise = noise_curve(light[longest], found[longest], used, result, progress)
     if spectrum is not None and spectrum.correlated:
         result = _with_neighbours(result, spectrum, notes)

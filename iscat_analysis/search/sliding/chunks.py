@@ -252,10 +252,10 @@ def plan_chunks(
     # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
     per_block = 32 if config.background.follows_pattern else 20
-    beside = per_block * pixels // stride
-    if (last - first) * (reader.frame_bytes + beside) <= budget - 40 * pixels:
+    buffers_bytes = per_block * pixels // stride
+    if (last - first) * (reader.frame_bytes + buffers_bytes) <= budget - 40 * pixels:
         return [((first, last), (first, last))]
-    per_frame = reader.held_bytes + beside
+    per_frame = reader.held_bytes + buffers_bytes
     room = (budget - 40 * pixels) // per_frame
     core = (room - 2 * halo) // stride * stride
     if core < stride:

@@ -195,8 +195,8 @@ def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
     )
     light = gain * (counts[:, ends].mean(axis=2, dtype=np.float64) - offset)
     usual = np.median(light, axis=0)
-    told = (usual > _EDGE * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
-    found: BoolArray = ((light < _EDGE * usual) & told).any(axis=1)
+    bright_enough = (usual > _EDGE * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
+    found: BoolArray = ((light < _EDGE * usual) & bright_enough).any(axis=1)
     return found
 
 

@@ -80,7 +80,7 @@ def measure_noise(
 
     Shapes: `counts` (t, y, x).
     """
-    strip = _Strip.of(counts, camera, together=follows)
+    strip = _Strip.of(counts, camera, adjacent=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
     found = mapper(strip.compared, lengths)
@@ -92,7 +92,7 @@ def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
 
     Shapes: `counts` (t, y, x).
     """
-    return _Strip.of(counts, camera, together=True).compared(length).motion
+    return _Strip.of(counts, camera, adjacent=True).compared(length).motion
 
 
 class _Compared(NamedTuple):
@@ -111,21 +111,21 @@ class _Strip:
     gain: FloatArray
     offset: FloatArray
     read: FloatArray
-    together: bool
+    adjacent: bool
 
     @classmethod
-    def of(cls, counts: NDArray[Any], camera: Camera, *, together: bool) -> _Strip:
+    def of(cls, counts: NDArray[Any], camera: Camera, *, adjacent: bool) -> _Strip:
         """Take rows all over the field, or some that lie together."""
         height = counts.shape[1]
         rows: Any = np.linspace(0, height - 1, min(_ROWS, height)).astype(int)
-        if together:
+        if adjacent:
             first = max(height - _ROWS_TOGETHER, 0) // 2
             rows = slice(first, first + _ROWS_TOGETHER)
         shape = (height, counts.shape[2])
         gain, offset = (
             np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
         )
-        return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], together)
+        return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], adjacent)
 
     def compared(self, n: int) -> _Compared:
         """Compare averages of n frames; of rows that do not lie together nothing tells motion."""
@@ -140,7 +140,7 @@ class _Strip:
         sigma = np.sqrt((before + read) / before**2 + (after + read) / after**2)
         change = (contrast / sigma)[:, lit]
         noise = _variance(change)
-        if not self.together:
+        if not self.adjacent:
             return _Compared(noise, math.nan, math.nan)
         light = before + after
         slopes = np.stack(
@@ -149,10 +149,10 @@ class _Strip:
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
         usual = np.abs(change) < _PARTICLE * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
-        told = turned @ change[..., None]
-        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ told
+        projection = turned @ change[..., None]
+        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ projection
         by_chance = moved.size  # of χ²
-        motion = (float(np.sum(told * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
+        motion = (float(np.sum(projection * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
         return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
 
 

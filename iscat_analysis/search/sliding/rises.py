@@ -78,7 +78,7 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
     curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAYS]
     better = float(_gains(np.concatenate(curves), w, y).max()) - best
     p_line = float(erfc(np.sqrt(max(better, 0.0))))  # of χ² with one degree of freedom
-    return Rise(rise, centre, _beside(heights, weight, centre, rise // 2 + 1), p_line)
+    return Rise(rise, centre, _gain_beyond(heights, weight, centre, rise // 2 + 1), p_line)
 
 
 def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
@@ -91,17 +91,17 @@ def _settling(frames: IntArray, decay: float, begin: FloatArray) -> FloatArray:
     return np.asarray(-np.expm1(-np.maximum(frames + 0.5 - begin, 0.0) / decay))
 
 
-def _gains(courses: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
+def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
     """Log-likelihood of each course with a height of its own, over that of a constant.
 
     Shapes: `courses` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
     """
-    courses = courses - (courses @ weight / weight.sum())[:, None]
-    along, known = courses @ (weight * heights), (courses**2) @ weight
+    traces = traces - (traces @ weight / weight.sum())[:, None]
+    along, known = traces @ (weight * heights), (traces**2) @ weight
     return np.where(along > 0, 0.5 * along**2 / np.maximum(known, 1e-300), 0.0)
 
 
-def _beside(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
+def _gain_beyond(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
     """Give what frames after a gap have beyond those before it.
 
     Shapes: `heights` (t,), `weight` (t,).

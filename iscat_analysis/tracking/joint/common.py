@@ -204,13 +204,13 @@ def common_amplitudes(
         covariance[used, :-1, :-1] = _inverse(fisher[used], index[:-1])
         coupling = Coupling(field, ground, judged.slopes, mine)
         off = estimate - mean
-        mode, pulled = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
+        mode, sent_offset = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
         total = weight.sum()
         answer, taken = _answer(coupling, covariance, mode, total)
         left = total - taken
         out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
         if left > _SINGULAR * total:
-            out[:2, k] = mean + (weight @ off - answer @ pulled) / left, 1 / left
+            out[:2, k] = mean + (weight @ off - answer @ sent_offset) / left, 1 / left
 
     field.share(of_one, len(tracks))
     return CommonAmplitudes(*out)
@@ -236,21 +236,21 @@ def _answer(
     That is infinite where 1 − E' is singular.
     """
     answer, taken = np.zeros_like(image), 0.0
-    left, way = image.copy(), image.copy()
+    left, direction = image.copy(), image.copy()
     size = float(left @ left)
     for _ in range(_MOST_STEPS):
-        turned = way - coupling.followed(covariance, way[None])[1][0]
-        bend = float(way @ turned)
-        if not bend > _SINGULAR * float(way @ way):
+        turned = direction - coupling.followed(covariance, direction[None])[1][0]
+        curvature = float(direction @ turned)
+        if not curvature > _SINGULAR * float(direction @ direction):
             return answer, np.inf
-        step = size / bend
-        answer += step * way
+        step = size / curvature
+        answer += step * direction
         taken += step * size
         if step * size < _UNSOLVED * (total - taken):
             break
         left -= step * turned
         before, size = size, float(left @ left)
-        way = left + size / before * way
+        direction = left + size / before * direction
     return answer, taken
 
 

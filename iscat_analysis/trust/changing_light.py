@@ -62,7 +62,7 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
     return flagged
 
 
-def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
+def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]:
     """Tell which steps may rise as others do, unseen; and over how many frames those rise.
 
     Where many of those that rise go on rising after their lines, all may.
@@ -73,7 +73,7 @@ def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
     Shapes: result (rows,).
     """
     nothing = np.zeros(len(table), dtype=bool), 0.0
-    rise = np.nan_to_num(told.rise_frames)
+    rise = np.nan_to_num(evidence.rise_frames)
     rising = rise > 0
     if rising.sum() < _FEWEST:
         return nothing
@@ -90,7 +90,7 @@ def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
     return (~rising & ~seen) | alike, frames
 
 
-def rise_said(frames: float, unseen: int, rising: int, rows: int) -> str:
+def rise_message(frames: float, unseen: int, rising: int, rows: int) -> str:
     """Say that particles take their time; empty where none does."""
     if not frames:
         return ""
