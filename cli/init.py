@@ -76,7 +76,7 @@ def init(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        from iscat_analysis.pipeline.setup import preview_said, write_setup
+        from iscat_analysis.pipeline.setup import preview_lines, write_setup
 
         given = {
             "camera.pixel_size_nm": pixel_size_nm,
@@ -101,7 +101,7 @@ def init(
         for note in found.notes:
             messages.notify(note)
         print_result(shown)
-        for line in preview_said(found):
+        for line in preview_lines(found):
             print_result(line)
         print_result(f"written: {found.out}")
 

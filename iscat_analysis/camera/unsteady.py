@@ -98,7 +98,7 @@ def find_unsteady(
             continue
         limit = chdtri(number, _CHANCE) / number
         more = ratio > usual * limit
-        more &= scatter.beside < least_beside * scatter.squares
+        more &= scatter.neighbour_products < least_beside * scatter.squares
         more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
         if more.any():  # by those around as well, which takes longest
             more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
@@ -129,7 +129,7 @@ class _Scatter:
         add_image(image, self.squares, self.products)
 
     @property
-    def beside(self) -> FloatArray:
+    def neighbour_products(self) -> FloatArray:
         """Products with the pixels beside along y or x, whichever follow more."""
         largest: FloatArray = self.products.max(axis=0)
         return largest
@@ -146,8 +146,8 @@ def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: 
         excess = np.nanmedian(seen, axis=axis) - usual
         spread = _NORMAL * float(np.median(np.abs(excess - np.median(excess))))
         padded = np.pad(excess, 1, mode="reflect")
-        beside = np.maximum(padded[:-2], padded[2:])
+        neighbours = np.maximum(padded[:-2], padded[2:])
         off = excess > max(_LINE * usual, _LINE_SIGMAS * spread)
-        odd = lines[off & (beside < least_beside * excess)]
+        odd = lines[off & (neighbours < least_beside * excess)]
         noisy[(slice(None), odd) if axis == 0 else odd] = True
     return noisy

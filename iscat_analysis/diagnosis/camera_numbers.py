@@ -17,7 +17,7 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum
 _SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
 SAID = ("other light", "read noise")
-"""Laws by which noise is not what the camera's numbers predict, as `law_said` has it."""
+"""Laws by which noise is not what the camera's numbers predict, as `law_messages` has it."""
 
 _OTHERS = {
     "offset": "an offset that is too high",
@@ -35,7 +35,7 @@ def zero_by_law(law: Law, level_e: float) -> LightZero | None:
     return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
 
 
-def law_said(known: LearnedCamera) -> tuple[str, ...]:
+def law_messages(known: LearnedCamera) -> tuple[str, ...]:
     """Say that counts are not in proportion to light, by which law, and what to do."""
     law = known.camera.law
     if law is None:
@@ -117,7 +117,7 @@ def _effect(share: float) -> str:
     return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
 
 
-def offset_said(zero: LightZero, camera: Camera) -> str:
+def offset_message(zero: LightZero, camera: Camera) -> str:
     """Say where the light is zero, and what a wrong offset does."""
     per_count = float(np.mean(camera.gain_e_per_adu))
     counts = zero.electrons / per_count
@@ -141,7 +141,7 @@ def offset_said(zero: LightZero, camera: Camera) -> str:
     return message
 
 
-def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
+def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
     """Say that an offset may be as wrong as a gain, where the noise fits both.
 
     An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.

@@ -21,9 +21,9 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import (
     SAID,
     allow_for_correlation,
-    either_said,
     offset_is_wrong,
-    offset_said,
+    offset_message,
+    offset_or_gain_message,
     zero_by_law,
 )
 from iscat_analysis.errors import DataError
@@ -130,9 +130,10 @@ def judge_counts(
         zero = None  # the variance of a pixel is then of its neighbours' light as well
     wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
     if wrong is not None:
-        message = offset_said(wrong, camera)
+        message = offset_message(wrong, camera)
     else:
-        message = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+        message = "" if additive else offset_or_gain_message(gain, zero, camera)
+        message = message or gain.message or ""
     if gain.shakes and follows is False:
         message += ", or set background.drift_correction = true, with which it is followed"
     excess = ExcessNoise(gain.noise_ratio, message) if gain.off and gain.noise_ratio > 1 else None

@@ -16,7 +16,7 @@ def followed(config: Config, *, moves: bool) -> Config:
     return config.model_copy(update={"background": background})
 
 
-def motion_said(movie: FrameSource, opening: NoiseSurvey) -> str:
+def motion_message(movie: FrameSource, opening: NoiseSurvey) -> str:
     """Say that the fixed pattern of a landing movie moves."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"

@@ -25,7 +25,7 @@ from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
 
-__all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
+__all__ = ["ArrayLike", "Frames", "Stack", "open_stack", "path_beside"]
 
 _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     signature: kind.open for kind in FORMATS for signature in kind.signatures

@@ -31,7 +31,7 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
-from iscat_analysis.movie import Stack, beside, open_stack
+from iscat_analysis.movie import Stack, open_stack, path_beside
 from iscat_analysis.pipeline.bound import find_bound
 from iscat_analysis.pipeline.finish import gather
 from iscat_analysis.pipeline.injection import injected
@@ -107,7 +107,7 @@ def fit_stack(
     if not isinstance(config, Config):
         raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
     inject = int(number_in("`inject`", inject, least=0, whole=True))
-    folder = beside(stack, ".iscat") if out is None else out
+    folder = path_beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
     way = background_mode(config)
     figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES

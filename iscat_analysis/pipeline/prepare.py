@@ -14,7 +14,7 @@ from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.camera.processed import find_processing
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.camera_numbers import law_said
+from iscat_analysis.diagnosis.camera_numbers import law_messages
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
@@ -26,7 +26,7 @@ from iscat_analysis.diagnosis.recognise import (
     changes_summary,
     look_at_changes,
 )
-from iscat_analysis.diagnosis.stage import followed, motion_said
+from iscat_analysis.diagnosis.stage import followed, motion_message
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode, describe_background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, tracked_frames
@@ -67,7 +67,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
-    for text in (*known.messages, *law_said(known)):
+    for text in (*known.messages, *law_messages(known)):
         run.warn(f"{movie.name}: {text}")
     if auto:
         run.notify(f"{movie.name}: {known.description}")
@@ -167,7 +167,7 @@ def _landing_light(
     def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
         noise_survey = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
-        motion = motion_said(seen, noise_survey) if left_open else ""
+        motion = motion_message(seen, noise_survey) if left_open else ""
         if not motion:
             sum_first_chunk(noise_survey.reader, config, noise_survey.window)
         return noise_survey, motion

@@ -309,7 +309,7 @@ def _get(config: Config, key: str) -> Any:
     return getattr(getattr(config, section), name)
 
 
-def preview_said(setup: Setup) -> list[str]:
+def preview_lines(setup: Setup) -> list[str]:
     """Say in a few lines what the search saw."""
     seen = setup.preview
     total, places = sum(seen["candidates"]), len(seen["frames"])

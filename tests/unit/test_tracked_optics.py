@@ -24,7 +24,7 @@ from iscat_analysis.tracking.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,
     LeftOver,
-    _said,
+    _message,
     learn_from_tracks,
     mass_error,
 )
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_named(movie: Wanderers, wrong: dict[str, Any], named: 
 
 def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() -> None:
     """As where the light under the particles changes slowly: learning optics would not help."""
-    said = _said(LeftOver(0.15, True, 10), None, learns=False)
+    said = _message(LeftOver(0.15, True, 10), None, learns=False)
     assert "15%" in said
     assert "no part of the microscope" in said
     assert "optics.calibrate" not in said

@@ -21,7 +21,7 @@ from tiff_files import write_ome_set
 import iscat_analysis as ia
 import iscat_analysis.day as day_module
 from iscat_analysis.day import run
-from iscat_analysis.day.watch import PATIENCE, Look, _Folder
+from iscat_analysis.day.watch import PATIENCE, Ready, _Folder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
-def _names(look: Look | None) -> list[str] | None:
+def _names(look: Ready | None) -> list[str] | None:
     return None if look is None else [row.path.name for row in look[0].rows]
 
 

@@ -20,7 +20,7 @@ from iscat_analysis.fitting.background_mode import (
     describe_background_mode,
 )
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
@@ -153,7 +153,7 @@ def test_remarks_on_surroundings_are_put_in_order() -> None:
         saturated = np.zeros(event.region.shape, dtype=bool)
         saturated[row + away - top, column - left] = True
         windows = replace(event.windows, saturated=saturated)
-        said = remarks(context, event, windows, sidelobe=True, too_close=True)
+        said = fit_flags(context, event, windows, sidelobe=True, too_close=True)
         assert said[0] == Status.SIDELOBE
         assert Status.TOO_CLOSE in said
         assert (Status.SATURATED in said) is spoiled
