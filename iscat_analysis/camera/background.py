@@ -31,7 +31,7 @@ _BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
 _NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
-_OUTSHONE = 0.1
+_LARGEST_SIGNAL_SHARE = 0.1
 _LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
 
 Check = Callable[[NDArray[Any], int], None]
@@ -131,7 +131,7 @@ def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> 
     """
     used = ~windows.masked
     if additive:
-        used &= explained < _OUTSHONE * windows.power_ratio * windows.before_e
+        used &= explained < _LARGEST_SIGNAL_SHARE * windows.power_ratio * windows.before_e
     if windows.before_e[used].sum() < _LEAST_TOTAL_E:
         return windows
     after, before = windows.after_e[used], windows.before_e[used]

@@ -32,7 +32,7 @@ _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is wi
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
 _LEAP = 0.75  # of the largest number, from one frame to the next
 _BRIGHT = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
-_OVERFLOWN = 1e-4  # of a frame's pixels that leap; more than blink
+_LARGEST_OVERFLOW_SHARE = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
@@ -278,7 +278,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     for before, after in pairwise(counts):
         high = np.maximum(before, after)
         leap = (high - np.minimum(before, after) > _LEAP * largest) & (high < largest)
-        if _OVERFLOWN < leap.mean() < 1 / 2 and not _lights_up(before, after):
+        if _LARGEST_OVERFLOW_SHARE < leap.mean() < 1 / 2 and not _is_shutter(before, after):
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
                 f"{name}: counts have overflowed {8 * counts.dtype.itemsize} bits: pixels leap "
@@ -288,7 +288,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
             )
 
 
-def _lights_up(before: NDArray[Any], after: NDArray[Any]) -> bool:
+def _is_shutter(before: NDArray[Any], after: NDArray[Any]) -> bool:
     """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
     low, high = sorted(float(np.quantile(frame, _BRIGHT)) for frame in (before, after))
     return low < high / 2

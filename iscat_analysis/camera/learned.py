@@ -43,8 +43,8 @@ _DARK = 0.5  # of the usual counts, below which a frame may be without light
 _LEAST = 0.01  # of the usual counts, by which dark frames may differ
 # of what the counts of dark frames would show, if they were light: its error, and itself
 _LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
-_BLINKS = 4.0  # times the median, of the noise of a pixel in the dark that is left out
-_QUIET = 0.5  # of the noise that its counts would have if they were light
+_LARGEST_NOISE_RATIO = 4.0  # times the median, of the noise of a pixel in the dark that is left out
+_DARK_NOISE_SHARE = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
 _FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
@@ -217,7 +217,7 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     if error < _LIT_SHARE_ERROR * as_light:
         return abs(share) < _LIT_SHARE * as_light + 3 * error
     noise = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
-    return noise < _QUIET * as_light * _noise_adu2(lit)
+    return noise < _DARK_NOISE_SHARE * as_light * _noise_adu2(lit)
 
 
 class _Learning:
@@ -272,7 +272,7 @@ class _Learning:
             self._set("offset_adu", float(np.mean(pixels)), error, DARK)
         if "read_noise_e" in self.free and len(dark) > 1:
             variance = np.mean(np.diff(dark.astype(np.float64), axis=0) ** 2, axis=0) / 2
-            usual = variance < _BLINKS * np.median(variance)
+            usual = variance < _LARGEST_NOISE_RATIO * np.median(variance)
             self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
     def learn(self) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray
 
-MATTERS = 0.02
+LEAST_CONTRAST_SHARE = 0.02
 """Of the noise variance of a pixel between two windows, below which no change does."""
 
 _LEAST_LIGHT = 0.1  # of the median pixel's
@@ -65,7 +65,7 @@ class Changes:
 
     def least(self, window: int) -> float:
         """Give the mean square contrast of two windows below which a change does not matter."""
-        return MATTERS * float(2 / (window * self.light_e[self.used].mean()))
+        return LEAST_CONTRAST_SHARE * float(2 / (window * self.light_e[self.used].mean()))
 
     def divided(self, factors: FloatArray) -> Changes:
         """Divide the sums.

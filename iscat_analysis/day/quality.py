@@ -20,7 +20,7 @@ SMALL_P = 0.01
 MANY_SMALL = 0.1
 """Share of small p-values, ten times the expected one, above which the model is doubted."""
 
-LOUD = 1.5
+LARGEST_NOISE_RATIO = 1.5
 """Noise over that of the photoelectrons, as a variance, that is told."""
 
 FAR_PX = 1.0
@@ -60,7 +60,7 @@ def judge(
     """
     cautions: list[str] = []
     noise, frames = noise_of(summary)
-    if noise is not None and noise > LOUD:
+    if noise is not None and noise > LARGEST_NOISE_RATIO:
         cautions.append(f"noise {noise:.2g} times shot noise at {frames} frames")
     landing = summary.get("landing") or summary.get("background") or {}
     drift = landing.get("drift_px")

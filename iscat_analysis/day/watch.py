@@ -32,7 +32,7 @@ from iscat_analysis.species.mass_action import Model
 
 __all__ = ["watch"]
 
-PATIENCE = 6
+MOST_CHECKS = 6
 """Looks without a change after which a movie that cannot be read, or is gone, is taken as it is."""
 
 FOLDER = "batch"
@@ -169,7 +169,7 @@ class _MovieFiles:
     @property
     def settled(self) -> bool:
         """Whether it is to be waited for no longer."""
-        return self.checks >= PATIENCE or (self.checks > 0 and self.readable)
+        return self.checks >= MOST_CHECKS or (self.checks > 0 and self.readable)
 
 
 class _Folder:

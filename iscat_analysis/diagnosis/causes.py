@@ -34,7 +34,7 @@ _LEAST_PIXELS = 100  # away from particles, of which the light is said to be une
 _GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
-_CARRIED = 0.01  # change of the scale that makes it worth a line
+_LEAST_SCALE_CHANGE = 0.01  # change of the scale that makes it worth a line
 _SWAPPED = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
@@ -82,15 +82,15 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
 def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
     """Say how many pixels are left out, and why."""
     if defects:
-        yield f"{count(defects, 'dead, hot or noisy pixel')} {_be(defects)} left out"
+        yield f"{count(defects, 'dead, hot or noisy pixel')} {_verb_be(defects)} left out"
     if saturated:
         yield (
-            f"{count(saturated, 'pixel')} {_be(saturated)} saturated in some frame and left out; "
-            "lower the exposure or the laser power"
+            f"{count(saturated, 'pixel')} {_verb_be(saturated)} saturated in some frame and left "
+            "out; lower the exposure or the laser power"
         )
 
 
-def _be(number: int) -> str:
+def _verb_be(number: int) -> str:
     return "is" if number == 1 else "are"
 
 
@@ -196,7 +196,7 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
 def scale_warning(scale: MassScale) -> str:
     """Say how far the scale of masses was carried from the optics of its standards, or refused."""
     line = scale.calibration
-    if line is None or (not scale.refusal and abs(scale.carried - 1) < _CARRIED):
+    if line is None or (not scale.refusal and abs(scale.carried - 1) < _LEAST_SCALE_CHANGE):
         return ""
     whose = "the configured optics, at which its gradient is taken" if line.optics_assumed else (
         "the optics of its standards"

@@ -25,7 +25,7 @@ from iscat_analysis.medians import middle
 from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.smoothing import smoothed, spot_response
 
-CLEAR = 12.0
+LEAST_CHANGE_SIGMAS = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
 tenth."""
 
@@ -36,7 +36,7 @@ of others make less."""
 _PICTURE = 0.1  # singular value of a picture over the norm of the change
 _ABOVE = 1.5  # the same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
 _SHARED = 0.5  # of the picture's share beside its centre, which the pixels there have at least
-_QUIET = 4.0  # standard deviations of noise
+_NOISE_SIGMAS = 4.0  # standard deviations of noise
 _SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
 _NEAR = 4.5  # standard deviations of a spot, within which a picture is looked at
@@ -74,7 +74,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     size = smooth[3:-1] - smooth[1:-3]
     np.abs(size, out=size)
     apart = round(2 * _NEAR * spot_px)
-    peaks = maxima(size, max(CLEAR * noise, 0.0), (_AROUND, apart, apart))
+    peaks = maxima(size, max(LEAST_CHANGE_SIGMAS * noise, 0.0), (_AROUND, apart, apart))
     peaks = peaks[_of_spots(blocks, peaks, spot_px)]
     if not len(peaks):
         return NO_CHANGES
@@ -82,7 +82,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
     change = size[block, *position]
     neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(_QUIET * noise / change, LEAST_STEP_SHARE)
+    quiet = np.maximum(_NOISE_SIGMAS * noise / change, LEAST_STEP_SHARE)
     pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
     staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))

@@ -21,7 +21,7 @@ _NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
-class _Darkened:
+class _DarkFramesReplaced:
     """A movie some of whose frames are dark; attributes as those of a `Stack`."""
 
     source: Stack
@@ -82,5 +82,5 @@ def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Sta
     )
     if cut.size:
         dark = np.broadcast_to(np.floor(camera.offset_adu), movie.shape[1:]).astype(movie.dtype)
-        movie = movie.seen_as(_Darkened(movie, cut, dark))
+        movie = movie.seen_as(_DarkFramesReplaced(movie, cut, dark))
     return movie, message

@@ -26,10 +26,11 @@ PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones."""
 
 _LEAST_PAIRS = 3  # of a range of frames
-_TOGETHER = 8  # frames that are summed there
+_FRAMES_SUMMED = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
 _NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
-_EVERY = 2  # of the places in a background whose frames are compared with those after it as well
+# Every how many-th place in the background is also compared with the frames after it.
+_BACKGROUND_STRIDE = 2
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
@@ -121,7 +122,7 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     """
     total, mode, pairs_wanted = movie.shape[0], background_mode(config), PAIRS
     given = config.background.recorded, config.fit.frames
-    frames_each = _TOGETHER
+    frames_each = _FRAMES_SUMMED
     if mode != "fixed":
         first, last = given[1] or (0, total)
         spans = [(first, min(last, total))]
@@ -164,9 +165,9 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     ]
     if len(spans) == 2:
         apart = [p for p in read if p.first >= spans[1][0]]
-        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_EVERY]
+        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_BACKGROUND_STRIDE]
         read += [
             Pair(one.first, one.before, other.later, other.after)
-            for one, other in zip(firsts, apart[::_EVERY], strict=False)
+            for one, other in zip(firsts, apart[::_BACKGROUND_STRIDE], strict=False)
         ]
     return [p for p in read if len(p.before) and len(p.after)], window

@@ -29,7 +29,7 @@ LEAST_MOVING = 0.4
 more from 0.1 to 1 µm²/s.  Where landings crowd, one and a leaving to 70 pixels in 400 frames, it
 is 0.14, and 0.36 at most."""
 
-DOUBT = 0.03
+LARGEST_CHANCE = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
 
 
@@ -64,7 +64,7 @@ def look_at_changes(
 
 def as_landing(changes: Changes, name: str) -> str:
     """Say that a movie in mode ``track`` shows landings."""
-    if _chance(changes.number, changes.staying, MOST_STAYING) > DOUBT:
+    if _chance(changes.number, changes.staying, MOST_STAYING) > LARGEST_CHANCE:
         return ""
     return (
         f"{name}: its particles land or leave rather than move: of {changes.number} clear changes "
@@ -75,7 +75,7 @@ def as_landing(changes: Changes, name: str) -> str:
 
 def as_moving(changes: Changes, name: str) -> str:
     """Say that a movie with sliding windows shows particles that move."""
-    clear = _chance(changes.number, changes.moving, MOST_MOVING) <= DOUBT
+    clear = _chance(changes.number, changes.moving, MOST_MOVING) <= LARGEST_CHANCE
     if not (clear and changes.moving >= LEAST_MOVING):
         return ""
     return (

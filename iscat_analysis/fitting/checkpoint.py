@@ -20,7 +20,7 @@ from iscat_analysis.files import whole_file
 from iscat_analysis.reading import npz_of, read_bytes, read_json, read_parquet
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 
-GOES_ON = "what was finished is kept, and the same command goes on from there"
+RESUMPTION_HINT = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
 _PART = re.compile(r"[0-9a-f]{32}-\d{5}\.(parquet|npz)(\.\d+-[0-9a-f]+\.partial)?")
@@ -182,7 +182,7 @@ def parts_kept(folder: Path | None) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         if folder is None or not any(folder.glob("*.npz")):
             raise
-        raise saying(stop, GOES_ON) from None
+        raise saying(stop, RESUMPTION_HINT) from None
 
 
 def is_resumable(folder: Path) -> bool:

@@ -23,10 +23,10 @@ from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, FloatArray
 
-WORTH_NAMING = 0.3
+LEAST_EXPLAINED_SHARE = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
-MOST_OF_IT = 0.6
+LARGE_EXPLAINED_SHARE = 0.6
 """Share below which more may be wrong, and a correction of that parameter alone is no advice."""
 
 PIXEL = "camera.pixel_size_nm"
@@ -123,7 +123,7 @@ class Cause:
         """One line for the user."""
         elsewhere = "" if self.learned else " with an interferometric movie of the same microscope"
         remedy = f"correct it, or calibrate the optics{elsewhere}"
-        if self.share < MOST_OF_IT:
+        if self.share < LARGE_EXPLAINED_SHARE:
             remedy = f"that explains only a part, so calibrate the optics{elsewhere}"
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
@@ -142,7 +142,7 @@ def likely_cause(
     if excess <= 0:
         return None
     found = {name: _explained_by(config, name, left, excess) for name in _NAMES}
-    named = {name: tried for name, tried in found.items() if tried[0][0] > WORTH_NAMING}
+    named = {name: tried for name, tried in found.items() if tried[0][0] > LEAST_EXPLAINED_SHARE}
     if not named:  # a share is above 1 where there is less noise than the camera's numbers say
         return None
     name = max(named, key=lambda name: named[name][0][0])
@@ -184,7 +184,7 @@ def _explained_by(
         steps = _angle(steps)
     if (
         graded
-        and share > WORTH_NAMING
+        and share > LEAST_EXPLAINED_SHARE
         and (there := _neighbours(config, name, reach, float(steps[0])))
     ):
         share, asked = _explained(left, there, excess)

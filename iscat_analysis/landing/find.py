@@ -32,7 +32,7 @@ from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
-from iscat_analysis.landing.merging import Done, Merged
+from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.records import CountSource, Progress, Status, silent
@@ -115,7 +115,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     return config.model_copy(update={"particle": particle.model_copy(update=learned)})
 
 
-def _nothing(context: AnalysisContext) -> None:
+def _do_nothing(context: AnalysisContext) -> None:
     """Do nothing."""
 
 
@@ -126,7 +126,7 @@ def analyse_landings(
     *,
     warn: Notify,
     progress: Progress,
-    prepare: Callable[[AnalysisContext], None] = _nothing,
+    prepare: Callable[[AnalysisContext], None] = _do_nothing,
     partial: Path | None = None,
     identity: str = "",
     lines: Lines | None = None,
@@ -159,11 +159,11 @@ def analyse_landings(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
-    merged = Merged(reader.shape)
+    merged = MergedChunks(reader.shape)
     interrupted = False
     with threads(executor.threads(config.compute.workers, len(plan))) as pool:
 
-        def finish(number: int) -> Done:
+        def finish(number: int) -> FinishedChunk:
             done = None if posterior else store.load(number)
             if done is None:
                 core, span = plan[number]
@@ -172,7 +172,7 @@ def analyse_landings(
                 if executor.distant:
                     reader.forget()  # whoever does it has a reader of its own
 
-                def here() -> Done:
+                def here() -> FinishedChunk:
                     chunk = reader.chunk(span, stride, pool)
                     return analyse_chunk(
                         context, chunk, core, window, pool, budget, noise.excess, earlier
@@ -225,7 +225,7 @@ def analyse_landings(
         **searched,
         "frames_left_out": merged.left_out(),
         "drift_px": drift,
-        **_way(merged.trajectory()),
+        **_trajectory_summary(merged.trajectory()),
         "chunks": len(plan),
     }
     return DetectionResult(
@@ -251,7 +251,11 @@ def analyse_landings(
 
 
 def _finished(
-    finish: Callable[[int], Done], count: int, executor: Executor, merged: Merged, posterior: bool
+    finish: Callable[[int], FinishedChunk],
+    count: int,
+    executor: Executor,
+    merged: MergedChunks,
+    posterior: bool,
 ) -> Generator[tuple[int, bool]]:
     """Finish chunks and merge them in their order, whichever comes first.
 
@@ -259,7 +263,7 @@ def _finished(
     has the posteriors that those before it left to sample: with posteriors, one follows another.
     """
 
-    def results() -> Iterator[tuple[int, Done]]:
+    def results() -> Iterator[tuple[int, FinishedChunk]]:
         alone = 0
         while posterior and alone < count and merged.sampled < POSTERIORS:
             yield alone, finish(alone)
@@ -267,7 +271,7 @@ def _finished(
         for number, done in executor.each(finish, range(alone, count)):
             yield alone + number, done
 
-    waiting: dict[int, Done] = {}
+    waiting: dict[int, FinishedChunk] = {}
     ready = frames = 0
     for number, done in results():
         waiting[number] = done
@@ -291,7 +295,7 @@ def _counted(table: pd.DataFrame) -> dict[str, int]:
     return {"landings": int((~left).sum()), "leavings": int(left.sum())}
 
 
-def _way(trajectory: Trajectory | None) -> dict[str, Any]:
+def _trajectory_summary(trajectory: Trajectory | None) -> dict[str, Any]:
     """Give what the summary says of a trajectory."""
     if trajectory is None:
         return {

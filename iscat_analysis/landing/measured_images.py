@@ -35,7 +35,8 @@ _FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
 _LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
 _LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
-_WANDER = 0.35  # of a region, that the centre may lie from where the model's fit found it
+# Farthest that the centre may lie from the fit of the model, in sides of the region.
+_LARGEST_SHIFT_SHARE = 0.35
 
 
 def with_measured_images(
@@ -86,7 +87,7 @@ def _hides_others(step: Step, threshold: float) -> bool:
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
     """Whether a step lies in the middle of the picture of a brighter one, and at its time."""
-    near = distance_px(step, brighter) < 2 * _WANDER * roi_px
+    near = distance_px(step, brighter) < 2 * _LARGEST_SHIFT_SHARE * roi_px
     return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
 
 
@@ -121,7 +122,7 @@ def _measured(
     sigma = np.sqrt((1 / before + 1 / after) * (1 + contrast) ** 2)
     weight = np.where(used, 1 / sigma, 0.0)
     place = step.start.y_px - rows[0], step.start.x_px - columns[0]
-    centre = _centre(contrast * weight, place, _WANDER * roi_px)
+    centre = _centre(contrast * weight, place, _LARGEST_SHIFT_SHARE * roi_px)
     image = ring_average(contrast, weight, centre)
     half = roi_px // 2
     y, x = (max(round(c) - half, 0) for c in place)

@@ -25,7 +25,7 @@ _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
 
 @dataclass(frozen=True)
-class Done:
+class FinishedChunk:
     """What is kept of a finished chunk."""
 
     core: tuple[int, int]
@@ -49,11 +49,11 @@ class Done:
     searched: Searched | None = None  # share of the field at each boundary
 
 
-class Merged:
+class MergedChunks:
     """Finished chunks, in order."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        self._done: list[Done] = []
+        self._done: list[FinishedChunk] = []
         self._dated: dict[int, NDArray[np.int64]] = {}
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
@@ -61,7 +61,7 @@ class Merged:
         self.empty: EmptySpread | None = None
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
 
-    def note(self, number: int, done: Done) -> None:
+    def note(self, number: int, done: FinishedChunk) -> None:
         """Note when the events of a finished chunk happen, whose turn may not have come yet."""
         frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
         self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
@@ -71,7 +71,7 @@ class Merged:
         known = list(self._dated.items())  # other threads note theirs
         return sum(int((dated < frame).sum()) for n, dated in known if n < number)
 
-    def add(self, done: Done) -> None:
+    def add(self, done: FinishedChunk) -> None:
         """Take one more."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
@@ -109,7 +109,7 @@ class Merged:
             finished |= (frame >= done.core[0]) & (frame < done.core[1])
         kept = np.flatnonzero(own)
         for stranger in np.flatnonzero(~own & finished):
-            if not _same(table, int(stranger), kept):
+            if not _is_same_step(table, int(stranger), kept):
                 kept = np.append(kept, stranger)
         order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
         views, repeats = [], []
@@ -193,7 +193,7 @@ class Merged:
         return int(np.sum(masked & ~saturated)), int(saturated.sum())
 
 
-def _same(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
+def _is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
     """Whether some other row describes the same step."""
     frame, error, x, y, mass = (
         table[name].to_numpy(dtype=float)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.diagnosis.causes import pixel_warnings
 from iscat_analysis.diagnosis.fixed_pattern import DRIFT_PX
-from iscat_analysis.landing.merging import Merged
+from iscat_analysis.landing.merging import MergedChunks
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import listed
 
@@ -23,7 +23,7 @@ LOST = 0.05
 
 def frame_warnings(
     name: str,
-    merged: Merged,
+    merged: MergedChunks,
     drift: list[float] | None,
     light: FloatArray,
     first: int,
@@ -61,7 +61,7 @@ def frame_warnings(
 
 
 def _drift_warnings(
-    name: str, merged: Merged, drift: list[float] | None, windows: float, corrected: bool
+    name: str, merged: MergedChunks, drift: list[float] | None, windows: float, corrected: bool
 ) -> Iterator[str]:
     """Say how the fixed pattern moved, and what was done about it."""
     way = merged.trajectory()

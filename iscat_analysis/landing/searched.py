@@ -100,17 +100,17 @@ def searched_shares(
             continue
         asked = np.full(chunk.shape, threshold)
         for peak in waits:
-            _raise_beside(asked, peak, roi_px)
+            _raise_near_unsubtracted(asked, peak, roi_px)
         for step in near:
             part = max(1 - abs(step.at.frame - now) / window, 0.0)
             inside = part * math.sqrt(EXPLAINS * step.excess)
-            _raise_around(asked, step, snr[j], inside, roi_px)
+            _raise_near_fitted(asked, step, snr[j], inside, roi_px)
         sizes = np.sort(asked[chunk.usable]) / threshold
         shares[row] = np.searchsorted(sizes, LEVELS * (1 + 1e-9)) / sizes.size
     return Searched(frames[own].astype(np.int64), shares)
 
 
-def _raise_beside(asked: FloatArray, peak: Peak, roi_px: int) -> None:
+def _raise_near_unsubtracted(asked: FloatArray, peak: Peak, roi_px: int) -> None:
     """Ask of others what they must exceed not to wait for a peak that was not subtracted."""
     for half, share in ((LARGEST_IMAGE * roi_px, FAR_LOBE), (roi_px, SIDELOBE)):
         box = tuple(
@@ -120,7 +120,7 @@ def _raise_beside(asked: FloatArray, peak: Peak, roi_px: int) -> None:
         np.maximum(asked[box], share * abs(peak.snr), out=asked[box])
 
 
-def _raise_around(
+def _raise_near_fitted(
     asked: FloatArray, step: Step, snr: NDArray[Any], inside: float, roi_px: int
 ) -> None:
     """Ask what the fit of a bright step left over, along rings around it and in its region."""

@@ -1,12 +1,12 @@
 """The main job: load → calibrate → background → detect → fit → posterior → bounds → report.
 
-`analyse` is that line.  `prepare` loads and calibrates; one of `FIND` measures the background,
-searches, fits, samples and bounds; `gather` makes the rows, and describes tracks and species.
-Which of `FIND` is asked follows from ``background.method`` alone (`ways`).
+`analyse` does it in this order.  `prepare` loads and calibrates.  One of `FINDERS`, chosen by
+``background.method`` alone (`background_mode`), measures the background, searches, fits, samples
+posteriors and computes bounds.  `make_analysis` makes the table, and describes tracks and species.
 
-An event is a candidate, then `Fitted` while its neighbours are being found, then an `Event` with
-the verdict on it.  Its row is made when all events are there, with its number and with the errors
-that are known only then (`rows`).
+An event is first a candidate, then `Fitted` while its neighbours are still being found, then an
+`Event` with its verdict.  Its row is made when all events are known, because its number and some
+of its errors depend on all of them (`rows`).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
 from iscat_analysis.movie import Stack, open_stack, path_beside
-from iscat_analysis.pipeline.bound import find_bound
-from iscat_analysis.pipeline.finish import gather
+from iscat_analysis.pipeline.before_after import find_before_after
+from iscat_analysis.pipeline.finish import make_analysis
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.records import Analysis, Progress, silent
@@ -41,8 +41,8 @@ from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import check_output, claim_output
 from iscat_analysis.tracking.find import find_moving
 
-FIND: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
-    "fixed": find_bound,
+FINDERS: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
+    "fixed": find_before_after,
     "sliding": find_landings,
     "tracks": find_moving,
 }
@@ -162,10 +162,10 @@ def analyse(
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         # background, detect, fit, posterior, bounds
-        found = FIND[ready.background_mode](ready, run)
+        found = FINDERS[ready.background_mode](ready, run)
         with parts_kept(None if ready.background_mode == "fixed" else partial):
             extra, stopped = injected(ready, run, found)
             stopped = stopped or found.interrupted
-            return gather(
+            return make_analysis(
                 ready, run, found, extra, command=command, started=started, interrupted=stopped
             )

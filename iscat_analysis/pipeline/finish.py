@@ -44,7 +44,7 @@ from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
 
 
-def gather(
+def make_analysis(
     ready: Prepared,
     run: Run,
     found: DetectionResult,
@@ -154,7 +154,7 @@ def gather(
         "interrupted": interrupted,
         "warnings": run.warnings,
     }
-    frames, first = _each_once(compared)
+    frames, first = _unique_frames(compared)
     analysis = Analysis(
         config_toml=config_to_toml(as_given(config)),
         mode=context.mode,
@@ -183,7 +183,7 @@ def gather(
     return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 
 
-def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Give the frames of both ranges in their order, and where the light of each stands.
 
     Where particles move, both ranges are the whole movie, and each frame stands there twice.

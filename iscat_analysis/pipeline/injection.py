@@ -35,7 +35,7 @@ from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
-STAY_WINDOWS = 3
+FEWEST_WINDOWS_PRESENT = 3
 """Windows between landing and leaving."""
 
 _SAME_PX = 2.0
@@ -210,7 +210,7 @@ def draw_particles(
     if not good.size:
         good = np.array([context.model.material.mass_kda])
     margin = min(context.roi_px / 2, (min(field_px) - 1) / 2)
-    stay = STAY_WINDOWS * window
+    stay = FEWEST_WINDOWS_PRESENT * window
     first = frames[0] + window
     last = max(frames[1] - window - stay, first + 1)
     landings = np.sort(rng.integers(first, last, count))

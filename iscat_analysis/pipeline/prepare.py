@@ -26,7 +26,7 @@ from iscat_analysis.diagnosis.recognise import (
     changes_summary,
     look_at_changes,
 )
-from iscat_analysis.diagnosis.stage import followed, motion_message
+from iscat_analysis.diagnosis.stage import motion_message, with_drift_correction
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode, describe_background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, tracked_frames
@@ -92,7 +92,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         if way == "sliding":
             judged, noise_survey, motion = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
-                config = followed(config, moves=bool(motion))
+                config = with_drift_correction(config, moves=bool(motion))
             if motion:
                 run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
                 judged, noise_survey, _ = _landing_light(movie, config, camera, span)

@@ -45,10 +45,10 @@ from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Loca
 from iscat_analysis.tracking.moving import blurred_rows
 from iscat_analysis.tracking.moving_field import (
     exposure_of,
-    give_back,
+    initial_background,
     load_field,
-    opening_ground,
-    track_scene,
+    restore_particle_light,
+    tracking_context,
 )
 
 Redraw = Callable[[int], EventView]
@@ -77,7 +77,7 @@ def redraw(
     if way == "tracks":
         blocks = int(summary["blocks"]["number"])
         return _moving(seen, config, camera, lines, table, tracks, blocks)
-    return _bound(seen, config, camera, lines, table)
+    return _before_after(seen, config, camera, lines, table)
 
 
 def _landings(
@@ -137,7 +137,7 @@ def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
     return neighbours.draw(-1 if mass < 0 else 1, at, start)
 
 
-def _bound(
+def _before_after(
     movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
 ) -> Redraw:
     """Draw what is there after the background, or in mode ``track`` in a frame after it."""
@@ -202,7 +202,7 @@ def _moving(
     """Draw particles in single frames, over the background of their block under all of them."""
     first, last = fitted_frames(movie, config)
     shape = movie.shape[1], movie.shape[2]
-    context = track_scene(config, shape, max(last - first, 1), lines)
+    context = tracking_context(config, shape, max(last - first, 1), lines)
     edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
     known = table["mass_kda"].notna() & table["track"].notna()
     _, exposure_s = exposure_of(config)
@@ -233,8 +233,8 @@ def _moving(
             field = load_field(context, movie, camera, (start, stop), check, pool, silent)
             field.set_blurs(variances)
             follows = config.background.power_normalization
-            ground = opening_ground(config, field)
-            give_back(context, field, movie, camera, start, ground, rows)
+            ground = initial_background(config, field)
+            restore_particle_light(context, field, movie, camera, start, ground, rows)
             for _ in range(_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level

@@ -35,7 +35,7 @@ ANSWER, DEFAULT, MEASURED = "your answer", "default", "measured here"
 SAMPLES = ("protein", "gold", "silica", "polystyrene")
 """Kinds of samples: what the particles are made of."""
 
-_LOOKS = 5  # places in a movie at which the search looks
+_PREVIEW_PLACES = 5  # places in a movie at which the search looks
 _LIT = 16  # frames whose light is averaged
 _MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
 
@@ -50,12 +50,12 @@ class Question:
     choices: tuple[str, ...] = ()
 
 
-_NOBODY = Config()  # what is taken where nobody says anything
+_DEFAULTS = Config()  # what is taken where nobody says anything
 _QUESTIONS = (
     Question("camera.pixel_size_nm", "size of a pixel in the sample plane [nm]", None),
-    Question("optics.wavelength_nm", "wavelength in vacuum [nm]", _NOBODY.optics.wavelength_nm),
-    Question("optics.na", "numerical aperture of the objective", _NOBODY.optics.na),
-    Question("particle.kind", "kind of sample", _NOBODY.particle.kind, SAMPLES),
+    Question("optics.wavelength_nm", "wavelength in vacuum [nm]", _DEFAULTS.optics.wavelength_nm),
+    Question("optics.na", "numerical aperture of the objective", _DEFAULTS.optics.na),
+    Question("particle.kind", "kind of sample", _DEFAULTS.particle.kind, SAMPLES),
 )
 _STANDING = ("optics.n_immersion", "optics.n_sample")  # shown, since they may have to be changed
 _EACH_MOVIE = ("camera.exposure_ms", "camera.frame_rate_hz")  # left to the metadata of each
@@ -132,7 +132,7 @@ def write_setup(
     with open_stack(movie) as stack:
         frames, rows, columns = stack.shape
         warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
-        known = _known(stack.metadata, answers or {})
+        known = _known_values(stack.metadata, answers or {})
         warn(_metadata_line(stack))
         values, config = _ask_the_rest(known, ask, warn)
         if config.camera.pixel_size_nm is None:
@@ -140,7 +140,7 @@ def write_setup(
                 f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
                 "guess: give `pixel_size_nm`, in the sample plane"
             )
-        values += [Value(key, _get(_NOBODY, key), DEFAULT) for key in _STANDING]
+        values += [Value(key, _config_value(_DEFAULTS, key), DEFAULT) for key in _STANDING]
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
         values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.camera)]
@@ -150,16 +150,16 @@ def write_setup(
             values=tuple(values),
             config=preview.config,
             notes=preview.notes,
-            preview=_look_around(preview),
+            preview=_search_preview(preview),
             out=target,
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(target) as partial:
-        partial.write_text(_toml(found), encoding="utf-8")
+        partial.write_text(_toml_text(found), encoding="utf-8")
     return found
 
 
-def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
+def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
     """Collect what answers and metadata say of what would be asked; answers win."""
     known = []
     for question in _QUESTIONS:
@@ -167,7 +167,7 @@ def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[
         if question.key in answers:
             known.append(Value(question.key, answers[question.key], ANSWER))
         elif value is not None:
-            known.append(Value(question.key, value, _of_file(metadata)))
+            known.append(Value(question.key, value, _origin_in_file(metadata)))
     return known
 
 
@@ -191,7 +191,7 @@ def _ask_the_rest(
                 warn(str(error))
         if answer is None:
             continue
-        given = _get(config, question.key)
+        given = _config_value(config, question.key)
         values.append(Value(question.key, given, DEFAULT if given == question.default else ANSWER))
     config = configure(None, settings={each.key: each.value for each in values})
     return values, config
@@ -210,7 +210,7 @@ def _each_movie(metadata: StackMetadata) -> list[Value]:
     """Show what the metadata of every movie say, and its configuration should not."""
     stated = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
     return [
-        Value(key, value, _of_file(metadata), written=False)
+        Value(key, value, _origin_in_file(metadata), written=False)
         for key, value in stated.items()
         if value is not None
     ]
@@ -226,11 +226,11 @@ def _camera_values(camera: LearnedCamera) -> list[Value]:
     return values
 
 
-def _look_around(preview: Preview) -> dict[str, Any]:
+def _search_preview(preview: Preview) -> dict[str, Any]:
     """Search at places all over the movie that have no frame in common."""
     (first, last), window = preview.frames, preview.window
     apart = 1 if preview.config.fit.mode == "track" else window
-    places = max(1, min(_LOOKS, (last - first) // (2 * apart)))
+    places = max(1, min(_PREVIEW_PLACES, (last - first) // (2 * apart)))
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
     found = [look.found() for look in looks]
@@ -256,7 +256,7 @@ def _spread(image: np.ndarray[Any, Any]) -> float:
     return float(_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
 
 
-def _toml(setup: Setup) -> str:
+def _toml_text(setup: Setup) -> str:
     """Write the file: each value with what it is and where it comes from."""
     lines = [
         f"# Configuration for {in_toml(setup.movie)}, written by `iscat init`; iscat-fit finds it",
@@ -300,11 +300,11 @@ def _metadata_line(stack: Stack) -> str:
     return f"{stack.name}: its {metadata.source} metadata say " + ", ".join(parts)
 
 
-def _of_file(metadata: StackMetadata) -> str:
+def _origin_in_file(metadata: StackMetadata) -> str:
     return f"the file's metadata ({metadata.source})"
 
 
-def _get(config: Config, key: str) -> Any:
+def _config_value(config: Config, key: str) -> Any:
     section, _, name = key.partition(".")
     return getattr(getattr(config, section), name)
 

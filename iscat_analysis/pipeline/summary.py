@@ -57,7 +57,7 @@ def summary_of(
         "emission": context.model.optics.emission,
         "convention": context.model.optics.convention,
         "mass_scale": "calibration" if context.config.calibration else "absolute model",
-        **_carried(context),
+        **_scale_transfer(context),
         "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
         "frames_before": list(compared.frames_before),
@@ -78,7 +78,7 @@ def summary_of(
     }
 
 
-def _carried(context: AnalysisContext) -> dict[str, Any]:
+def _scale_transfer(context: AnalysisContext) -> dict[str, Any]:
     """Say how far the scale was carried from the optics of its standards."""
     scale = context.model.scale
     if scale.calibration is None:
@@ -98,7 +98,7 @@ def species_of(
     """Describe the species of all events, of which so large a share could be seen."""
     good = table[table["status"] == Status.OK]
     distribution = _distribution(context, good, searched or 1.0)
-    across = _across(context, table, distribution)
+    across = _species_width(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
 
@@ -152,7 +152,7 @@ def _distribution(
     return found.to_dict()
 
 
-def _across(
+def _species_width(
     context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""

@@ -27,7 +27,7 @@ EXCEEDS = 1.5
 EXPLAINS = 0.5
 """Share of the χ² in excess that a particle inside the fitted region must explain."""
 
-DWARFS = 3.0
+DOMINANT_RATIO = 3.0
 """Times the signal-to-noise ratio of an event from which on another one near it dwarfs it."""
 
 LISTED = 0.7
@@ -64,7 +64,9 @@ class Described:
         """
         brightest = max(others, key=lambda other: other.snr, default=self)
         own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
-        return brightest.snr > DWARFS * self.snr and self.snr**2 < EXPLAINS * (self.excess - own)
+        return brightest.snr > DOMINANT_RATIO * self.snr and self.snr**2 < EXPLAINS * (
+            self.excess - own
+        )
 
 
 def is_hidden(snr: float, size: float) -> bool:

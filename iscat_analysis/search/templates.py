@@ -46,7 +46,7 @@ wrong, the first ring of a bright particle can be as high as the particle."""
 LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
 
-FLOOD = 1000
+MOST_CANDIDATES = 1000
 """Candidates beyond which a search is given up where they are noise."""
 
 _NOISE_SHARE = 0.1  # of these that noise must account for; particles have a thousand times as many
@@ -284,7 +284,7 @@ def refuse_flood(
     The rings of many particles look like noise as well, but normal noise of that variance would
     hardly pass the threshold.
     """
-    if excess_noise is None or candidates <= FLOOD:
+    if excess_noise is None or candidates <= MOST_CANDIDATES:
         return
     if images * templates.reached_by(excess_noise.ratio) > _NOISE_SHARE * candidates:
         raise FloodError(

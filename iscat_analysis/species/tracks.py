@@ -67,12 +67,13 @@ SLOWED = 0.05
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _DOUBT = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
-_LITTLE_KNOWN = 0.05  # of the information on a mass is left by the background
+_LEAST_KNOWN_SHARE = 0.05  # of the information on a mass is left by the background
 _SEEN = 0.9  # of all frames, in which a particle that hardly moves is seen at least
-_VAGUE = 0.02  # of a mass, which the background makes too uncertain for the error to be trusted
+# Relative error of a mass beyond which the error of D that it makes is reported.
+_LARGEST_SCALE_ERROR = 0.02
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
-_LOOKS = 3  # at D, on which it depends which displacements tell it
+_DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
 _UM2 = 1e6  # nm²
 
 
@@ -181,7 +182,7 @@ def _record(
     if all(np.isfinite(value) for value in exact.values()):
         record |= {name: value for name, value in exact.items() if name != "told"}
     scale = _scale_error(record, known_share)
-    record["short_way"] = known_share < _LITTLE_KNOWN and scale > 2 * _VAGUE
+    record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
     massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
     each = of_known(np.median, massive.contrast / massive.mass_kda)
     record["contrast"] = record["mass_kda"] * each
@@ -238,7 +239,7 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
     gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     inside, positions = np.ones(room.size, dtype=bool), placed.positions()
-    for _ in range(_LOOKS):
+    for _ in range(_DISPLACEMENT_PASSES):
         counted = inside
         d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
         inside = room > _STEPS * np.sqrt(2 * d_um2_s * _UM2 * gaps_s)

@@ -31,7 +31,7 @@ from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.common import variances_left
-from iscat_analysis.tracking.moving import Moving
+from iscat_analysis.tracking.moving import TrackedRows
 
 PHASES = 3
 """Parts of a pixel along each axis."""
@@ -103,7 +103,7 @@ class Aligned:
         )  # fmt: skip
 
 
-def align(context: AnalysisContext, moving: Moving) -> Aligned:
+def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
     """Put the frames of the brightest tracks on top of each other."""
     side = _side(context)
     empty = np.zeros((0, side, side))
@@ -136,7 +136,7 @@ def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
     return np.asarray(good & np.isin(track, best[enough[best]]))
 
 
-def _single(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
+def _single(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
     """Take frames of their own, from all heights alike."""
     rows = moving.rows
     ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
@@ -156,7 +156,7 @@ def _single(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Align
     return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
 
 
-def _summed(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
+def _summed(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
     """Add up what is left over of rows, by track and part of the pixel."""
     rows, field, ground = moving.rows, moving.field, moving.ground
     side, pixel = _side(context), context.pixel_nm

@@ -23,7 +23,7 @@ from iscat_analysis.tracking.aligned import Aligned, align
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.linking import typical_error
-from iscat_analysis.tracking.moving import follow
+from iscat_analysis.tracking.moving import find_rows_and_background
 from iscat_analysis.tracking.moving_table import common_masses, moving_table
 
 
@@ -88,7 +88,7 @@ def analyse_block(
     # Nearer to a border than this a track may go on in the next block.
     near = context.config.track.memory_frames + 1
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
-    moving = follow(
+    moving = find_rows_and_background(
         context, movie, camera, span,
         check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
     )  # fmt: skip

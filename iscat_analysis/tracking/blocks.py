@@ -8,7 +8,7 @@ variance ∇Bᵀ V(T) ∇B/B², V the covariance of s within a block.  Of these 
     C(T) = T Σ_ij K_ij V_ij(T),   K_ij = ⟨∂_i B ∂_j B/B⟩ over the pixels,
 
 times the first.  A steady velocity v has V = v² T²/12, so that both are equal, C = 1, where
-T³ = 12/(K v²); blocks are longer by a factor of 1.7, `WORTH_COUNTING`.
+T³ = 12/(K v²); blocks are longer by a factor of 1.7, `MOST_DRIFT_OVER_COUNTING`.
 
 In the noise curve of landing movies, the variance between neighbouring averages of n frames over
 that of the light, the same drift is 1 + K v² n³/2.  But the curve is no measure of it here: where
@@ -43,7 +43,7 @@ SHORTEST = 25
 """Frames of a block at least, where drift makes it short: in fewer, particles hardly leave where
 they are, and are taken for background."""
 
-WORTH_COUNTING = 5.0
+MOST_DRIFT_OVER_COUNTING = 5.0
 """Drift over counting noise, C, that a block may have.  A particle pays more for counting noise
 than a pixel does: it stays at a place for many frames and makes the same error in all of them,
 while the errors that a steady drift makes before and after the middle of a block cancel."""
@@ -88,7 +88,7 @@ class Plan:
             f"{name}: the fixed pattern moves, by {x:+.3f} pixels in x and {y:+.3f} in y in all; "
             f"{len(self.spans)} blocks of {self.frames} frames have backgrounds of their own"
         )
-        if self.drift_over_counting > WORTH_COUNTING:
+        if self.drift_over_counting > MOST_DRIFT_OVER_COUNTING:
             text += (
                 f", which still change by {self.drift_over_counting:.2g} times their counting "
                 "noise: masses scatter more than their errors say; let the stage settle, or record "
@@ -130,14 +130,14 @@ def plan_blocks(
         return Plan(_spans(first, last, count))
     shift = motion.at(np.arange(first, last, dtype=float))
     moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * _unrest(motion.shift_px)))
+    unrest = float(np.sum(stiffness * _jitter_covariance(motion.shift_px)))
 
     def cost_of(count: int) -> float:
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
         return max(whole - unrest * frames / count, 0.0)
 
     least, most, cost = count, max(count, frames // SHORTEST), cost_of(count)
-    while cost > WORTH_COUNTING and count < most:
+    while cost > MOST_DRIFT_OVER_COUNTING and count < most:
         count += 1
         cost = cost_of(count)
     return Plan(_spans(first, last, count), moved, cost, count > least)
@@ -216,7 +216,7 @@ def _stiffness(
     return total / len(means_e)
 
 
-def _unrest(shift_px: FloatArray) -> FloatArray:
+def _jitter_covariance(shift_px: FloatArray) -> FloatArray:
     """Covariance (2, 2) of what pulls at single shifts, as bright particles do.
 
     It is that of second differences, over 6, in which a steady drift does not show.

@@ -23,7 +23,7 @@ FEWEST_PARTICLES = 3
 LEAST_COMMON_SHARE = 0.05
 """Of the square of a particle's step, what is common to all, from which on it is said."""
 
-MANY = 8
+MANY_FRAMES_MISSING = 8
 """Frames missing at once, which are not the run of two or three where single ones are dropped."""
 
 _SOUND = 0.5  # of a track's rows that are ok: others may be two halves of something else
@@ -70,7 +70,7 @@ def warnings_of(
     if shaken:
         yield shaken
     jumps, dropped = _jumps(steps), _dropped(steps)
-    many = [text for missing, text in jumps if missing >= MANY]
+    many = [text for missing, text in jumps if missing >= MANY_FRAMES_MISSING]
     if many:
         yield from many
     elif dropped and not shaken:
@@ -135,7 +135,7 @@ def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> str:
     )
 
 
-def _surprise(steps: _Steps) -> tuple[FloatArray, FloatArray]:
+def _normalized_squares(steps: _Steps) -> tuple[FloatArray, FloatArray]:
     """|step|²/2v of each step, 1 on average, and how many steps each pair of frames has."""
     square = (steps.step**2).sum(axis=1) / (2 * steps.variance)
     return square, steps.total(np.ones(len(steps.frame)))
@@ -143,7 +143,7 @@ def _surprise(steps: _Steps) -> tuple[FloatArray, FloatArray]:
 
 def _jumps(steps: _Steps) -> list[tuple[int, str]]:
     """Say where all particles go so far that frames must be missing, and how many."""
-    surprise, particles = _surprise(steps)
+    surprise, particles = _normalized_squares(steps)
     total = steps.total(surprise)
     largest = np.zeros(len(total))
     np.maximum.at(largest, steps.frame, surprise)
@@ -171,7 +171,7 @@ def _jumps(steps: _Steps) -> list[tuple[int, str]]:
 
 def _dropped(steps: _Steps) -> str:
     """Say that many single frames are missing; empty where they are not."""
-    surprise, particles = _surprise(steps)
+    surprise, particles = _normalized_squares(steps)
     clipped = np.minimum(surprise, _CLIPPED)
     # mean of exp(½ min(e, c)) over e of mean 1: what the clipped odds must be divided by
     norm = 2 - math.exp(-_CLIPPED / 2)

@@ -27,7 +27,7 @@ from iscat_analysis.diagnosis.causes import (
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.checkpoint import GOES_ON, saying
+from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, saying
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import fit_field
@@ -54,13 +54,13 @@ from iscat_analysis.tracking.frame_search import link
 from iscat_analysis.tracking.frame_subset import keep_frames
 from iscat_analysis.tracking.held_height import held_height_warning
 from iscat_analysis.tracking.joining import join_blocks
-from iscat_analysis.tracking.moving_field import track_scene
-from iscat_analysis.tracking.tracked_optics import Begun, learn_from_tracks
+from iscat_analysis.tracking.moving_field import tracking_context
+from iscat_analysis.tracking.tracked_optics import TrialTracks, learn_from_tracks
 from iscat_analysis.trust.null_field import FrameNoise
 
 _STEPS = 100  # of the progress of a block
 _PATTERN = 6  # places in a frame that are taken for the light's unevenness,
-_NEARLY_ALL = 0.8  # where so many of them are no particles
+_PATTERN_SHARE = 0.8  # where so many of them are no particles
 
 
 def find_moving(ready: Prepared, run: Run) -> DetectionResult:
@@ -90,15 +90,15 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         shelves.append(BlockStore(folder, config, identity, ready.shape, (first, last), camera))
         return shelves[-1]
 
-    with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
+    with _with_resumption_hint(shelves, plan), threads(config.compute.workers) as pool:
 
-        def begin(config: Config, *, cautious: bool = False) -> Begun:
-            context = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
+        def begin(config: Config, *, cautious: bool = False) -> TrialTracks:
+            context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
             block = _analysed(
                 context, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
                 check=check, pool=pool, progress=run.progress, cautious=cautious,
             )  # fmt: skip
-            return Begun(config, context, block)
+            return TrialTracks(config, context, block)
 
         begun, learned = learn_from_tracks(
             config, begin, name=movie.name, pool=pool, warn=run.warn, notify=run.notify
@@ -123,7 +123,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
     for text in pixel_warnings(*windows.left_out):
         run.warn(text)
     if not len(joined.fits) and not interrupted:
-        run.warn(f"{movie.name}: {_nothing_found(context, blocks[0])}")
+        run.warn(f"{movie.name}: {_no_particle_message(context, blocks[0])}")
     run.clock.lap("track")
     found = DetectionResult(
         context=replace(context, mode="track", config=config),
@@ -141,13 +141,13 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
 
 
 @contextmanager
-def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
+def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
     """Say in an interrupt whether a block was finished, from which the same command goes on."""
     try:
         yield
     except KeyboardInterrupt as stop:
         if any(shelf.kept for shelf in shelves):
-            raise saying(stop, GOES_ON) from None
+            raise saying(stop, RESUMPTION_HINT) from None
         parts = f"in {len(plan.spans)} of them, of which the first is not"
         if len(plan.spans) == 1:
             parts = f"in one of {plan.frames} frames, which is not"
@@ -158,7 +158,7 @@ def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[
         raise saying(stop, nothing) from None
 
 
-def _nothing_found(context: AnalysisContext, block: Block) -> str:
+def _no_particle_message(context: AnalysisContext, block: Block) -> str:
     """Say why a movie may show no particle: how far one stands out of a frame's noise."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     light, mass = float(block.level[block.used].mean()), model.material.mass_kda
@@ -314,7 +314,7 @@ def track_frames(
 def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
     """Refuse to follow what is fixed, where it is that which is found in a frame."""
     poor = sum(Status.POOR_FIT in event.flags for event in events)
-    if len(events) >= _PATTERN and poor >= _NEARLY_ALL * len(events):
+    if len(events) >= _PATTERN and poor >= _PATTERN_SHARE * len(events):
         raise DataError(
             f"of {len(events)} places in frame {frame} that look like particles {poor} do not look "
             f"like the model's picture, and would be followed through all frames: {doubt}"

@@ -46,7 +46,7 @@ class _Frames(SelectedFrames[Stack]):
 
 
 @dataclass(frozen=True)
-class Kept:
+class FrameSubset:
     """What is left of a movie."""
 
     movie: Stack
@@ -76,12 +76,12 @@ class Kept:
 
 def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
-) -> Kept:
+) -> FrameSubset:
     """Leave out frames that show nothing new."""
     dark, repeats = _odd(movie, camera, span, additive=additive)
     good = ~(dark | repeats)
     if good.all() or not good.any():
-        return Kept(movie, span)
+        return FrameSubset(movie, span)
     numbers = span[0] + np.flatnonzero(good)
     seen = movie.seen_as(_Frames(movie, numbers))
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
@@ -96,7 +96,7 @@ def keep_frames(
             f"; {share:.0%} of the frames: if the file holds each of the camera's several times, D "
             "is too small by as much; export it with each once, at the camera's own rate"
         )
-    return Kept(seen, (0, len(numbers)), numbers, message)
+    return FrameSubset(seen, (0, len(numbers)), numbers, message)
 
 
 def _odd(

@@ -60,9 +60,11 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
     for k, met in enumerate(meetings):
         later = met_rows[number > k]
         labels = np.unique(track[met.rows])
-        sides = [_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0]
-        for path in _paths(sides, typical):
-            _follow(rows, track, path, met)
+        sides = [
+            _track_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0
+        ]
+        for path in _chains(sides, typical):
+            _continue_chain(rows, track, path, met)
     kept = track >= 0
     group = _groups(rows, track)
     return Localizations.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
@@ -170,7 +172,7 @@ class _Side:
     ends: bool
 
 
-def _side(
+def _track_side(
     rows: Localizations,
     track: IntArray,
     one: int,
@@ -190,7 +192,7 @@ def _side(
     return _Side(one, first, last, before, after, bool(begins), bool(ends))
 
 
-def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
+def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
     """Give those of which each goes on as the next one did; a cycle ends with its first."""
     come = [side for side in sides if not side.begins]
     go = [side for side in sides if not side.ends]
@@ -213,7 +215,7 @@ def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
         yield path
 
 
-def _follow(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
+def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
     """Let each of a path go on as the next one did, all from one frame on."""
     numbers = [side.track for side in path]
     mine = [np.flatnonzero(track == k) for k in numbers]

@@ -25,7 +25,7 @@ AS_FOUND = 0.9
 """Of the threshold, that a fit must keep to have found its particle."""
 
 _STEP = 0.1  # of the farthest that a particle goes: what an error of the mass counts in linking
-_UNSURE = 0.25  # of the mass, where z is free
+_MASS_ERROR_FREE_Z = 0.25  # of the mass, where z is free
 _BESIDE = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 _MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
@@ -101,7 +101,7 @@ def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
 def mass_error(config: Config, rows: Localizations, error: float) -> float:
     """Say by how much the amplitude of one particle may change from frame to frame."""
     if config.track.free == "joint" and len(rows.frame):
-        return max(error, _UNSURE * float(np.median(rows.theta[:, 3])))
+        return max(error, _MASS_ERROR_FREE_Z * float(np.median(rows.theta[:, 3])))
     return error
 
 
@@ -152,7 +152,9 @@ def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
     return np.asarray(2 * detections > fits)
 
 
-def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Localizations, int]:
+def extrapolated(
+    config: Config, field: MovingField, rows: Localizations
+) -> tuple[Localizations, int]:
     """Let slow particles stay where they were before and after they were seen, to be tried."""
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
@@ -163,10 +165,10 @@ def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Local
         middle = float(np.median(rows.theta[mine, 3]))
         for end, direction in ((mine[0], -1), (mine[-1], 1)):
             first = int(rows.frame[end])
-            held = np.clip(
+            extrapolated = np.clip(
                 first + direction * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1
             )
-            for t in np.unique(held[held != first]):
+            for t in np.unique(extrapolated[extrapolated != first]):
                 frame.append(int(t))
                 track.append(int(k))
                 theta.append(np.append(rows.theta[end, :3], [middle, 0.0]))
@@ -195,10 +197,10 @@ def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
     Shapes: result (n,).
     """
     error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
-    return unlike(rows.track, rows.theta[:, 3], error)
+    return has_other_mass(rows.track, rows.theta[:, 3], error)
 
 
-def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
+def has_other_mass(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
     """Tell which rows have a mass that is not that of their track.
 
     Shapes: `track` (n,), `mass, error` (n,), result (n,).

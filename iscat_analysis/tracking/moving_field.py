@@ -49,7 +49,7 @@ def exposure_of(config: Config) -> tuple[float, float]:
     return rate, 1 / rate if exposure is None else exposure / 1e3
 
 
-def track_scene(
+def tracking_context(
     config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
 ) -> AnalysisContext:
     """Make models and matched filter for single frames."""
@@ -58,7 +58,7 @@ def track_scene(
     return make_context(tracked, field_px, searches=frames, lines=lines)
 
 
-def opening_ground(config: Config, field: MovingField) -> BackgroundEstimate:
+def initial_background(config: Config, field: MovingField) -> BackgroundEstimate:
     """Give the background before there are tracks; of all frames together, it remains so."""
     ground = first_background(field, follow_power=config.background.power_normalization)
     if config.background.method == "fixed":
@@ -116,7 +116,7 @@ def load_field(
     )  # fmt: skip
 
 
-def give_back(
+def restore_particle_light(
     context: AnalysisContext,
     field: MovingField,
     movie: CountSource,

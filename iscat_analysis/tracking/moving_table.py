@@ -16,8 +16,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray, Status, make_rows, verdict
 from iscat_analysis.tracking.joint.common import variances_left
-from iscat_analysis.tracking.linking import unlike
-from iscat_analysis.tracking.moving import Moving
+from iscat_analysis.tracking.linking import has_other_mass
+from iscat_analysis.tracking.moving import TrackedRows
 from iscat_analysis.tracking.paths import path_covariances
 
 LARGEST_LOSS = 0.2
@@ -31,7 +31,7 @@ _TESTS = 2
 _APART = 0.05  # relative step of a blur
 
 
-def moving_table(context: AnalysisContext, moving: Moving, first_frame: int) -> pd.DataFrame:
+def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int) -> pd.DataFrame:
     """Make a line of ``fits.csv`` for every row, without its number and its verdict.
 
     Notes
@@ -96,7 +96,7 @@ def table_of_tracks(
     off = np.zeros(len(table), dtype=np.bool_)
     if parted:
         names = ("track", "mass_kda", "crb_mass_kda")
-        off = unlike(*(table[name].to_numpy() for name in names))
+        off = has_other_mass(*(table[name].to_numpy() for name in names))
     numbers, texts = pd.factorize(table["flags"])
     judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
     status = [str(status) for status, _ in judged]
@@ -111,7 +111,7 @@ def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
     return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
 
-def common_masses(context: AnalysisContext, moving: Moving) -> pd.DataFrame:
+def common_masses(context: AnalysisContext, moving: TrackedRows) -> pd.DataFrame:
     """Give the mass of each track that the exact likelihood of all its frames has."""
     common, scale = moving.common, context.model.scale
     known = np.isfinite(common.amplitude)
@@ -138,7 +138,7 @@ def common_masses(context: AnalysisContext, moving: Moving) -> pd.DataFrame:
     return table.set_index(pd.Index(tracks, name="track"))
 
 
-def losses_to_blur(context: AnalysisContext, moving: Moving) -> FloatArray:
+def losses_to_blur(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
     """Share of the mass that the blur of each group takes, to first order: −d ln m / d ln q.
 
     Shapes: result (groups,).
@@ -158,7 +158,7 @@ def losses_to_blur(context: AnalysisContext, moving: Moving) -> FloatArray:
     return np.abs(np.array(out, dtype=np.float64))
 
 
-def _path_errors(context: AnalysisContext, moving: Moving, losses: FloatArray) -> FloatArray:
+def _path_errors(context: AnalysisContext, moving: TrackedRows, losses: FloatArray) -> FloatArray:
     """Errors of (x, y, z, a) of each row that the unknown path of its exposure makes, (n, 4)."""
     out = np.zeros((len(losses), 4))
     if moving.field.free[2]:
@@ -178,7 +178,7 @@ def _p_values(
     return np.asarray(-np.expm1(_TESTS * np.log1p(-least)))
 
 
-def _off_line(context: AnalysisContext, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
+def _off_line(context: AnalysisContext, moving: TrackedRows, sigma_kda: FloatArray) -> BoolArray:
     """Tell whose masses a calibration does not tell: by that of the track where it is known."""
     track, common, scale = moving.rows.track, moving.common, context.model.scale
     own, shared = moving.rows.theta[:, 3], common.amplitude[track]
@@ -190,7 +190,7 @@ def _off_line(context: AnalysisContext, moving: Moving, sigma_kda: FloatArray) -
 
 def _flags(
     context: AnalysisContext,
-    moving: Moving,
+    moving: TrackedRows,
     sigma: FloatArray,
     p_value: FloatArray,
     losses: FloatArray,

@@ -38,7 +38,7 @@ from iscat_analysis.instrument.unknown_heights import learn_with_heights
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block
-from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.tracking.iterated_optics import Round, Rounds
 from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
 from iscat_analysis.units import count
 
@@ -50,13 +50,13 @@ ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
 tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
 
-_ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
+_MOST_FAILED_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
 
 
 @dataclass(frozen=True)
-class LeftOver:
+class Misfit:
     """What the model leaves over of all pictures of tracks together."""
 
     share: float
@@ -80,7 +80,7 @@ class LeftOver:
 
 
 @dataclass(frozen=True)
-class Begun:
+class TrialTracks:
     """The first frames of a movie, followed with some optics."""
 
     config: Config
@@ -88,9 +88,9 @@ class Begun:
     block: Block
 
     @cached_property
-    def left(self) -> LeftOver | None:
+    def left(self) -> Misfit | None:
         """What the model leaves over of all pictures; None where there is none."""
-        return _left_over(self.block, self.context)
+        return _misfit(self.block, self.context)
 
     @property
     def described(self) -> bool:
@@ -98,23 +98,23 @@ class Begun:
         return self.left is not None and not self.left.rejected
 
 
-class Begin(Protocol):
+class TrackFirstFrames(Protocol):
     """Follows the first frames of a movie."""
 
-    def __call__(self, config: Config, *, cautious: bool = False) -> Begun:
-        """Follow them with some optics; `cautious` as in `follow`."""
+    def __call__(self, config: Config, *, cautious: bool = False) -> TrialTracks:
+        """Follow them with some optics; `cautious` as in `find_rows_and_background`."""
         ...
 
 
 def learn_from_tracks(
     config: Config,
-    begin: Begin,
+    begin: TrackFirstFrames,
     *,
     name: str,
     pool: ThreadPoolExecutor,
     warn: Callable[[str], None],
     notify: Callable[[str], None] = notify_nobody,
-) -> tuple[Begun, dict[str, Any]]:
+) -> tuple[TrialTracks, dict[str, Any]]:
     """Follow the first frames, test the optics on them, and learn better ones where they fail.
 
     Through optics that are very wrong a particle leaves rings which are taken for others, until
@@ -136,7 +136,7 @@ def learn_from_tracks(
     if noisy and cause is None and optics.calibrate != "always":
         return begun, tested | {"calibrated": False, "reason": _NOISE}
 
-    def as_configured(message: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+    def as_configured(message: str, reason: str) -> tuple[TrialTracks, dict[str, Any]]:
         if trouble is not None and cause is None:
             raise trouble
         if trouble is not None:
@@ -176,7 +176,7 @@ def learn_from_tracks(
     return as_configured(message, reason)
 
 
-def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
+def _first(config: Config, begin: TrackFirstFrames) -> tuple[TrialTracks, DataError | None]:
     """Follow the first frames, cautiously where there is trouble, which is given then."""
     try:
         return begin(config), None
@@ -188,24 +188,24 @@ def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
 
 
 def _described(
-    trial: Begun,
-    begin: Begin,
+    trial: TrialTracks,
+    begin: TrackFirstFrames,
     config: Config,
     cause: Cause | None,
     *,
     name: str,
     pool: ThreadPoolExecutor,
-) -> tuple[OpticsCalibration | None, Begun | None, str]:
+) -> tuple[OpticsCalibration | None, TrialTracks | None, str]:
     """Measure optics from tracks that were followed with optics that describe them.
 
     Where none are good enough: what was followed last, if it is described, and why.
     """
     reason = "what was learned does not describe them either"
     near = trial if trial.described else None
-    best: tuple[Round, Begun] | None = None
+    best: tuple[Round, TrialTracks] | None = None
     rounds = Rounds()
     for number in range(ROUNDS):
-        if number == _ROUGH_ROUNDS and near is None and best is None:
+        if number == _MOST_FAILED_ROUNDS and near is None and best is None:
             break
         known = None
         if number:
@@ -239,14 +239,14 @@ def mass_error(summary: Mapping[str, Any]) -> float:
     return MASS_SHARE * share if rejected else 0.0
 
 
-def _left_over(block: Block, context: AnalysisContext) -> LeftOver | None:
+def _misfit(block: Block, context: AnalysisContext) -> Misfit | None:
     """Add up what the model leaves over of all pictures; None where there is none."""
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
     tracks = len(np.unique(aligned.track))
     if context.mode == "joint":
-        return _left_over_singly(aligned, context, tracks)
+        return _misfit_of_single_pictures(aligned, context, tracks)
     rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
     for number, theta in enumerate(aligned.theta):
         likelihood = aligned.likelihood(context, number)
@@ -259,10 +259,12 @@ def _left_over(block: Block, context: AnalysisContext) -> LeftOver | None:
     square = rest[used] ** 2 / variance[used] / usual
     power = float(np.sum(signal[used] ** 2 / variance[used])) / usual
     share = _share(float(np.sum(square - 1)), power)
-    return LeftOver(share, float(square.mean()) > REJECTED_CHI2, tracks)
+    return Misfit(share, float(square.mean()) > REJECTED_CHI2, tracks)
 
 
-def _left_over_singly(aligned: Aligned, context: AnalysisContext, tracks: int) -> LeftOver | None:
+def _misfit_of_single_pictures(
+    aligned: Aligned, context: AnalysisContext, tracks: int
+) -> Misfit | None:
     """Say the same of pictures that no two have in common, as of particles at other heights."""
     excess, power, p_values = 0.0, 0.0, []
     for number, theta in enumerate(aligned.theta):
@@ -272,7 +274,7 @@ def _left_over_singly(aligned: Aligned, context: AnalysisContext, tracks: int) -
         excess += (chi2 - 1) * likelihood.n_pixels
         power += float(np.sum(signal**2 * likelihood.signal_information(signal)))
         p_values.append(p_value)
-    return LeftOver(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
+    return Misfit(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
 
 
 def _share(excess: float, power: float) -> float:
@@ -292,7 +294,7 @@ def _brightest(aligned: Aligned, most: int) -> list[int]:
     return order
 
 
-def _cause(begun: Begun) -> Cause | None:
+def _cause(begun: TrialTracks) -> Cause | None:
     """Name the part of the microscope that what is left over looks most like."""
     aligned, context = begun.block.aligned, begun.context
     if aligned is None:
@@ -302,7 +304,7 @@ def _cause(begun: Begun) -> Cause | None:
     return likely_cause(context.config, fits)
 
 
-def _message(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
+def _message(left: Misfit, cause: Cause | None, *, learns: bool) -> str:
     """Say what is wrong, and what to do."""
     if cause is None:
         return (
@@ -328,7 +330,7 @@ def _start(config: Config, cause: Cause | None) -> Config:
 
 
 def _measured(
-    begun: Begun,
+    begun: TrialTracks,
     start: Config,
     name: str,
     pool: ThreadPoolExecutor,

@@ -52,7 +52,7 @@ _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this
 _NAMED = 3  # of pairs of tracks that met, in a message
 _TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
 _ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
-_ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
+_LEAST_ABSORPTION = 1e-6  # of a permittivity, where a refractive index says it all no more
 
 
 def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
@@ -137,7 +137,7 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
     resolution_nm = config.optics.wavelength_nm / config.optics.na
-    absorbs = abs(matter.permittivity.imag) > _ABSORBS or matter.permittivity.real <= 0
+    absorbs = abs(matter.permittivity.imag) > _LEAST_ABSORPTION or matter.permittivity.real <= 0
     return TrackSetup(
         frame_rate_hz=config.camera.frame_rate_hz,
         exposure_ms=config.camera.exposure_ms,

@@ -22,11 +22,15 @@ from iscat_analysis.records import BoolArray, Status
 SAME_NM = 150.0
 """Distance within which two steps are at one place."""
 
-_MUCH = 3.0  # times a step's own mass that a particle must have, whose light the step may be of
-_ALIKE = 3.0  # ratio of masses up to which two steps close in time may be the halves of one
-_SEEN = 10.0  # log-likelihood by which a rise is expected to be told from a step, to be always seen
+# Mass of a particle over that of a step, from which on the step may be a change of its light.
+_LEAST_MASS_RATIO = 3.0
+# Ratio of masses up to which two steps close in time may be two halves of one landing.
+_MOST_MASS_RATIO = 3.0
+# Expected gain in log-likelihood of a rise over a step, from which on rises are always seen.
+_LEAST_GAIN_SEEN = 10.0
 _FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
-_SEEN_TO_GO_ON = 0.1  # share of rising steps that go on, beyond which all may; 0.002 by chance
+# Share of rising steps that go on rising, beyond which all may; by chance it is 0.002.
+_LEAST_SHARE_CONTINUING = 0.1
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
@@ -55,9 +59,9 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
         near = apart < max(window[i], window[j])
         there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
         gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
-        if (there or near) and not gone and abs(mass[i]) > _MUCH * abs(mass[j]):
+        if (there or near) and not gone and abs(mass[i]) > _LEAST_MASS_RATIO * abs(mass[j]):
             flagged[real[j]] = True
-        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _ALIKE * abs(mass[j]):
+        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _MOST_MASS_RATIO * abs(mass[j]):
             flagged[real[[i, j]]] = True
     return flagged
 
@@ -81,11 +85,11 @@ def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]
     mass, crb = (table[name].to_numpy(float) for name in ("mass_kda", "crb_mass_kda"))
     before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
     one2 = (mass / crb) ** 2 * (before + after) / (before * after)
-    seen = np.nan_to_num(one2) * frames / 24 > _SEEN
+    seen = np.nan_to_num(one2) * frames / 24 > _LEAST_GAIN_SEEN
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
-    many = (goes_on & rising).sum() >= max(_FEWEST, _SEEN_TO_GO_ON * rising.sum())
+    many = (goes_on & rising).sum() >= max(_FEWEST, _LEAST_SHARE_CONTINUING * rising.sum())
     alike = rising if many else nothing[0]
     return (~rising & ~seen) | alike, frames
 

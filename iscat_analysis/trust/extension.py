@@ -29,7 +29,8 @@ FEWEST = 6
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it,
 _DOUBTFUL = 2.5  # and beyond which systematic errors have it
 _CHANCE = 1e-5  # of one event that is flagged with no spread, and of pictures of all that are long
-_MATTERS = 0.5  # of σ, by which a mass is too small before its row is flagged for that of all
+# Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
+_LEAST_SHIFT_SIGMAS = 0.5
 _OUTLYING = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
@@ -84,7 +85,9 @@ class Extension:
         if mean > _DOUBTFUL * error:
             shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * mean
         if mean > _SIGNIFICANT * error:
-            own = own | (known & (shift > _MATTERS * table["sigma_mass_kda"].to_numpy(float)))
+            own = own | (
+                known & (shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float))
+            )
         return cls(mean, error, own, shift)
 
     @property

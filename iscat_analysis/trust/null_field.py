@@ -33,7 +33,7 @@ MOST_DISTANCES = 6
 """Distances between a frame and its background at which the noise is told apart."""
 
 _NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
-_OUTSHONE = 0.1
+_LARGEST_SIGNAL_SHARE = 0.1
 _EXACTLY = 1e-12  # variance of a background that is given, over that of one frame
 _WHOLE = CONTRASTS.index("whole")
 
@@ -70,7 +70,10 @@ def taken_by(
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
     )  # fmt: skip
     if context.additive:
-        taken |= photons_scale(context, windows) * signal > _OUTSHONE * windows.after_e.mean()
+        taken |= (
+            photons_scale(context, windows) * signal
+            > _LARGEST_SIGNAL_SHARE * windows.after_e.mean()
+        )
     return taken
 
 

@@ -38,7 +38,7 @@ NOISE_FRAMES = 800
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
-_LOOKS = 24  # frames all over a movie, that tell how much light there is
+_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
@@ -227,7 +227,7 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
     """Read frames of a landing movie."""
     dark_e = -math.inf
     if config.optics.scheme != "darkfield" and span[0] < span[1]:
-        numbers = np.linspace(span[0], span[1] - 1, _LOOKS).astype(int).tolist()
+        numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
         some = np.concatenate([movie.read(k, k + 1) for k in numbers])
         light = measure_frames(some, camera)[0]
         lit = light[well_lit(light)]

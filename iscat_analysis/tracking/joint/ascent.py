@@ -44,14 +44,14 @@ def ascend(
             continue
         best, kept = max(best, value), (rows, found)
         damping = max(_SOFTER * damping, _DAMPING)
-        step, gain = _uphill(field, move, counts, damping)
+        step, gain = _damped_step(field, move, counts, damping)
         ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
         if gain < _ENOUGH:
             return field.followed(rows, step), ground, done
     return *kept, done
 
 
-def _uphill(
+def _damped_step(
     field: MovingField, move: FloatArray, counts: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
     """Give Newton's step, damped until it climbs, and by how much it should."""

@@ -86,20 +86,20 @@ def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
     inner = turned @ coupling.own() @ root
     most = float(np.linalg.eigvalsh(inner)[:, -1].max())
     # as no eigenvalue is larger than their sum
-    if _left(most, float(np.einsum("nii->", inner))) > _LEFT:
-        more = _beyond(coupling, root, most)
+    if _variance_left_out(most, float(np.einsum("nii->", inner))) > _LEFT:
+        more = _krylov_part(coupling, root, most)
         if more is None:
             return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
         inner += more
     return np.asarray(root @ inner @ turned)
 
 
-def _left(most: float, largest: float) -> float:
+def _variance_left_out(most: float, largest: float) -> float:
     """Tell how much of the variance of a row is left out with eigenvalues of E, at most."""
     return most * largest / (1 - largest) if largest < 1 else np.inf
 
 
-def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
+def _krylov_part(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
     """P (1 − E)⁻¹ Pᵀ − P Pᵀ of every row, but for what is small; None where 1 − E is singular."""
     n, free = root.shape[:2]
     covariance = root @ np.swapaxes(root, 1, 2)
@@ -108,7 +108,7 @@ def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | N
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
-    while len(basis) < rank and _left(most, largest) > _LEFT:
+    while len(basis) < rank and _variance_left_out(most, largest) > _LEFT:
         added = _orthonormal(images, basis)[: rank - len(basis)]
         seen, images = coupling.followed(covariance, added)
         seen = seen @ root
@@ -206,7 +206,7 @@ def common_amplitudes(
         off = estimate - mean
         mode, sent_offset = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
         total = weight.sum()
-        answer, taken = _answer(coupling, covariance, mode, total)
+        answer, taken = _solve_conjugate_gradients(coupling, covariance, mode, total)
         left = total - taken
         out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
         if left > _SINGULAR * total:
@@ -228,7 +228,7 @@ def _at_their_mean(
     return mean, more
 
 
-def _answer(
+def _solve_conjugate_gradients(
     coupling: Coupling, covariance: FloatArray, image: FloatArray, total: float
 ) -> tuple[FloatArray, float]:
     """Solve (1 − E') answer = image by conjugate gradients; give image · answer as well.
