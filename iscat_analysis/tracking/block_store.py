@@ -29,7 +29,7 @@ from iscat_analysis.tracking.moving_table import common_masses, moving_table
 
 @dataclass(frozen=True)
 class Block:
-    """What was found in a block of frames."""
+    """The results of a block of frames."""
 
     span: tuple[int, int]
     rows: Localizations
@@ -83,7 +83,7 @@ def analyse_block(
     progress: Progress,
     cautious: bool = False,
 ) -> Block:
-    """Follow the particles of a block of frames."""
+    """Analyse the particles of a block of frames."""
     first, frames = span[0], span[1] - span[0]
     # Nearer to a border than this a track may go on in the next block.
     near = context.config.track.memory_frames + 1
@@ -161,7 +161,7 @@ def row_view(
 
 
 class BlockStore(Checkpoint):
-    """Finished blocks of frames on disk."""
+    """Results of blocks on disk."""
 
     def load(self, number: int, span: tuple[int, int]) -> Block | None:
         """Give a finished block, or None."""

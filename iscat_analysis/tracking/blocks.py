@@ -80,7 +80,7 @@ class Plan:
         }
 
     def message(self, name: str) -> str:
-        """Say in one line why there are several blocks; empty where nothing needs to be said."""
+        """Say why there are several blocks; empty where that needs no message."""
         if not self.drifts or self.moved_px is None or self.drift_over_counting is None:
             return ""
         y, x = self.moved_px
@@ -166,7 +166,7 @@ def follow_light(
     check: Callable[[NDArray[Any], int], None],
     mapper: Mapper = map,
 ) -> tuple[Trajectory | None, FloatArray]:
-    """Follow the fixed pattern through a movie, and say how much light its motion moves.
+    """Measure how the fixed pattern moves through a movie, and its stiffness per squared pixel.
 
     Shapes: `stiffness` (2, 2).
     """
@@ -217,9 +217,9 @@ def _stiffness(
 
 
 def _jitter_covariance(shift_px: FloatArray) -> FloatArray:
-    """Covariance (2, 2) of what pulls at single shifts, as bright particles do.
+    """Covariance (2, 2) of errors of single shifts, such as bright particles make.
 
-    It is that of second differences, over 6, in which a steady drift does not show.
+    It is that of second differences over 6, in which a steady drift does not show.
     """
     second_difference = np.diff(shift_px, n=2, axis=0)
     return second_difference.T @ second_difference / (6 * max(len(second_difference), 1))

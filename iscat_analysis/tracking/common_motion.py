@@ -1,7 +1,7 @@
-"""What all particles of a movie do at once: none of them moves because another does.
+"""Motion that all particles of a movie share, although none moves because of another.
 
-A stage or a beam that vibrates moves all of them by the same; a frame that is missing makes all of
-them go as far as in two.  Both make D too large, and no single track shows it.
+A vibrating stage or beam moves all of them by the same.  Where a frame is missing, all of them go
+as far as in two frames.  Both make D too large, and no single track shows it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class _Steps:
 def warnings_of(
     fits: pd.DataFrame, frame_rate_hz: float | None, ticks: IntArray | None = None
 ) -> Iterator[str]:
-    """Say what all particles do at once; `ticks` (t,) tells which frames are missing."""
+    """Warn of motion that all particles share; `ticks` (t,) tells which frames are missing."""
     steps = _steps_of(fits, ticks)
     if steps is None:
         return
@@ -109,8 +109,7 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
 def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> str:
     """Say that all particles move by the same from frame to frame; empty where they do not.
 
-    What two particles have in common is the mean product of their steps, of which the product of
-    a particle's step with itself, and so what one does that is lost, is no part.
+    The variance of the common step is the mean product of the steps of two different particles.
     """
     length = np.hypot(*steps.step.T) / np.sqrt(steps.variance)
     cut = steps.step * np.minimum(1, _LONGEST / np.maximum(length, _LONGEST))[:, None]
@@ -136,13 +135,13 @@ def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> str:
 
 
 def _normalized_squares(steps: _Steps) -> tuple[FloatArray, FloatArray]:
-    """|step|²/2v of each step, 1 on average, and how many steps each pair of frames has."""
+    """Give |step|²/2v of each step, 1 on average, and the number of steps of each frame pair."""
     square = (steps.step**2).sum(axis=1) / (2 * steps.variance)
     return square, steps.total(np.ones(len(steps.frame)))
 
 
 def _jumps(steps: _Steps) -> list[tuple[int, str]]:
-    """Say where all particles go so far that frames must be missing, and how many."""
+    """Find frames between which all particles go so far that frames must be missing."""
     surprise, particles = _normalized_squares(steps)
     total = steps.total(surprise)
     largest = np.zeros(len(total))

@@ -44,7 +44,7 @@ def extended(
     resolution_nm: float,
     reach_nm: float,
 ) -> tuple[Localizations, int]:
-    """Let tracks go on from their ends as far as the movie shows them."""
+    """Continue tracks beyond their ends as long as the movie shows their particles."""
     tracks = int(rows.track.max(initial=-1)) + 1
     if not tracks:
         return rows, 0
@@ -113,7 +113,7 @@ def extended(
 
 
 class _Frames(dict[int, dict[int, FloatArray]]):
-    """θ of every particle by frame and track, made where it is asked for."""
+    """Parameters of every particle by frame and track; an entry is made when it is asked for."""
 
     def __init__(self, rows: Localizations, frames: int) -> None:
         super().__init__()
@@ -133,7 +133,7 @@ def _starts(
     blur: np.ndarray,
     meeting_nm: float,
 ) -> Localizations:
-    """Give the rows of the frames in question, those that meet at their predictions."""
+    """Give the starting rows of frames into which tracks are extended, with their neighbours."""
     frame, track, theta = [], [], []
     for t, new in proposed.items():
         rows = {k: value.copy() for k, value in frames[t].items()}

@@ -142,7 +142,7 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
 
 @contextmanager
 def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
-    """Say in an interrupt whether a block was finished, from which the same command goes on."""
+    """Add to an interrupt whether a block was finished, from which the same command resumes."""
     try:
         yield
     except KeyboardInterrupt as stop:
@@ -159,7 +159,7 @@ def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator
 
 
 def _no_particle_message(context: AnalysisContext, block: Block) -> str:
-    """Say why a movie may show no particle: how far one stands out of a frame's noise."""
+    """Say why a movie may show no particle: compare its signal with the noise of a frame."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     light, mass = float(block.level[block.used].mean()), model.material.mass_kda
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
@@ -216,7 +216,7 @@ def _analysed(
     progress: Progress,
     cautious: bool = False,
 ) -> Block:
-    """Give a block of a movie, kept or analysed now."""
+    """Load a finished block, or analyse it."""
     count, span = len(plan.spans), plan.spans[number]
     block_progress = progress if count == 1 else _part_of(progress, number, count)
     block = store.load(number, span)
@@ -233,7 +233,7 @@ def _analysed(
 
 
 def _part_of(progress: Progress, number: int, count: int) -> Progress:
-    """Tell the progress of one block as that of all; reading is no stage of its own."""
+    """Report the progress of one block as progress of all blocks."""
 
     def of_all(stage: str, done: int, total: int) -> None:
         if stage == "track":
@@ -312,7 +312,7 @@ def track_frames(
 
 
 def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
-    """Refuse to follow what is fixed, where it is that which is found in a frame."""
+    """Refuse a movie in which the fixed pattern was found instead of particles."""
     poor = sum(Status.POOR_FIT in event.flags for event in events)
     if len(events) >= _PATTERN and poor >= _PATTERN_SHARE * len(events):
         raise DataError(

@@ -47,7 +47,7 @@ class _Frames(SelectedFrames[Stack]):
 
 @dataclass(frozen=True)
 class FrameSubset:
-    """What is left of a movie."""
+    """The frames of a movie that are analysed."""
 
     movie: Stack
     span: tuple[int, int]
@@ -55,7 +55,7 @@ class FrameSubset:
     message: str = ""
 
     def put_back(self, found: DetectionResult) -> DetectionResult:
-        """Give frames the numbers that they have in the movie."""
+        """Give frames their numbers in the movie."""
         if self.numbers is None or found.followed is None:
             return found
         numbers, followed = self.numbers, found.followed
@@ -77,7 +77,7 @@ class FrameSubset:
 def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
 ) -> FrameSubset:
-    """Leave out frames that show nothing new."""
+    """Leave out frames that repeat others or have no light."""
     dark, repeats = _odd(movie, camera, span, additive=additive)
     good = ~(dark | repeats)
     if good.all() or not good.any():
@@ -114,7 +114,7 @@ def _odd(
 
 
 def _renumbered(windows: Windows, numbers: IntArray) -> Windows:
-    """Give a range of kept frames its numbers in the movie, without light in those left out."""
+    """Give a range of kept frames its numbers in the movie; frames left out get no light."""
     first, last = windows.frames_after
     kept = numbers[first:last]
     span = int(kept[0]), int(kept[-1]) + 1

@@ -29,7 +29,7 @@ def decide_heights(
     fringe_nm: float,
     z_range_nm: tuple[float, float],
 ) -> Localizations:
-    """Put every row into the fringe that its track says."""
+    """Choose the interference fringe of every row by the likelihood of its whole track."""
     if not len(rows.frame):
         return rows
     starts = rows.starts(field.frames)
@@ -70,7 +70,10 @@ def _ladder(
     fringe_nm: float,
     z_range_nm: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit some rows in every fringe, one rung from the next, with the others of their frames.
+    """Fit some rows in every fringe, each fit starting from the one in the fringe before.
+
+    The other rows of their frames stay as they are.  Returns the fits, shape (n, rungs, 5), and
+    their log-likelihoods, (n, rungs).
 
     Returns what was fitted, shape (n, rungs, 5), and its log-likelihood, (n, rungs).
     """
@@ -119,7 +122,7 @@ def _values(field: MovingField, ground: BackgroundEstimate, rows: Localizations)
 
 
 def _best_path(heights: FloatArray, gains: FloatArray, variances: FloatArray) -> np.ndarray:
-    """Give the state of every frame, (n,), of the likeliest sequence of states (n, states)."""
+    """Find the likeliest sequence of states by the Viterbi algorithm, shape (n,)."""
     score = gains[0]
     back = np.zeros(heights.shape, dtype=np.int64)
     for t in range(1, len(heights)):

@@ -47,7 +47,7 @@ def held_height_warning(
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
 ) -> str:
-    """Say that particles seem to stay at one height, where free heights lead nowhere."""
+    """Say that particles seem to stay at one height, where fits with free heights fail."""
     if config.track.free != "joint" or not len(fits):
         return ""
     first, last = span[0], min(span[1], span[0] + _LOOKED_AT)
@@ -75,5 +75,5 @@ def held_height_warning(
 
 
 def _rejected(rows: pd.DataFrame) -> BoolArray:
-    """Tell which rows are not described."""
+    """Tell which rows the model does not describe."""
     return np.asarray(rows["flags"].fillna("").str.contains(_REJECTED), dtype=np.bool_)

@@ -72,7 +72,7 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
 
 @dataclass(frozen=True)
 class _Part:
-    """What a track did for a while."""
+    """Steps, mass and positions of a track before or after a meeting."""
 
     steps: float
     square: float
@@ -84,7 +84,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Typical:
-    """What is expected of a particle of which nothing is known."""
+    """Prior of a particle: step, mass and its variance, from all particles of the movie."""
 
     step_nm2: float
     mass: float
@@ -94,7 +94,7 @@ class _Typical:
 
     @classmethod
     def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
-        """Gather it from all rows."""
+        """Estimate it from all rows."""
         order = np.lexsort((rows.frame, rows.track))
         next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
         step = _step_nm2(np.diff(rows.theta[order, :2], axis=0)[next_])
@@ -103,7 +103,7 @@ class _Typical:
         return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
 
     def part(self, rows: Localizations, mine: IntArray) -> _Part | None:
-        """Gather what some of the rows say; None if there are none."""
+        """Summarise some rows of a track; None where there are none."""
         if not mine.size:
             return None
         theta, frame = rows.theta[mine], rows.frame[mine]
@@ -115,7 +115,7 @@ class _Typical:
         return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
 
     def evidence(self, before: _Part | None, after: _Part | None) -> float:
-        """Logarithm of the Bayes factor that both are one particle; 0 where one is not known."""
+        """Log Bayes factor that two parts are of one particle; 0 where a part is missing."""
         if before is None or after is None:
             return 0.0
         took = int(after.frames[0] - before.frames[1])
@@ -153,7 +153,7 @@ def _normal(off: float, variance: float) -> float:
 
 
 class _Meeting(NamedTuple):
-    """When tracks were within reach of one another."""
+    """Rows of the tracks that met, and their pairs, the closest first."""
 
     rows: IntArray
     pairs: IntArray
@@ -161,7 +161,7 @@ class _Meeting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """A track in a meeting."""
+    """A track in a meeting: its parts before and after, and whether it begins or ends there."""
 
     track: int
     first: int
@@ -180,7 +180,7 @@ def _track_side(
     later: IntArray,
     typical: _Typical,
 ) -> _Side:
-    """Gather what a track does; `later` are the rows of the meetings to come."""
+    """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
     mine = np.flatnonzero(track == one)
     frame = rows.frame[mine]
     first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
@@ -193,7 +193,12 @@ def _track_side(
 
 
 def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
-    """Give those of which each goes on as the next one did; a cycle ends with its first."""
+    """Find tracks whose continuations are exchanged, by the assignment with the most evidence.
+
+    In a chain each track is continued by the rows that the next track has after the meeting.  Where
+    tracks are exchanged in a cycle, as when two are swapped, the first track stands at the end
+    again.
+    """
     come = [side for side in sides if not side.begins]
     go = [side for side in sides if not side.ends]
     if not come or not go:
@@ -216,7 +221,10 @@ def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
 
 
 def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
-    """Let each of a path go on as the next one did, all from one frame on."""
+    """Give each track of a chain the rows that the next one has after the meeting.
+
+    All are cut at one frame, that in which the tracks were closest.
+    """
     numbers = [side.track for side in path]
     mine = [np.flatnonzero(track == k) for k in numbers]
     low, high = max(side.first for side in path), min(side.last for side in path)
@@ -239,7 +247,7 @@ def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met
 
 
 class _Pair(NamedTuple):
-    """When two tracks were within reach of each other: frames, tracks and pairs of rows."""
+    """A time during which two tracks were close: its frames, the tracks and their pairs of rows."""
 
     first: int
     last: int
@@ -248,7 +256,7 @@ class _Pair(NamedTuple):
 
 
 def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
-    """Give the meetings in order."""
+    """Join close pairs into meetings, sorted by frame."""
     pairs = sorted(_pairs(rows, near_nm))
     number = np.arange(len(pairs))
     for one, two in _of_one(rows, pairs):
@@ -262,9 +270,10 @@ def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
 
 
 def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
-    """Give those that are of one meeting: a track is in both, at once or soon after one another.
+    """Find pairs of tracks that belong to one meeting.
 
-    What ends beside another meets it until, beside that, something begins.
+    Two pairs do if they share a track, at once or shortly after one another.  A track that ends
+    close to another one is taken to be merged with it until a new track begins close to that one.
     """
     numbers, firsts = np.unique(rows.track, return_index=True)
     begins = dict(zip(numbers.tolist(), rows.frame[firsts].tolist(), strict=True))
@@ -294,7 +303,7 @@ def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]
 
 
 def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
-    """Give the meetings of every pair of tracks."""
+    """Find the times during which two tracks are closer than `near_nm`."""
     one, two = rows.pairs_within(near_nm).T
     swapped = rows.track[one] > rows.track[two]
     one, two = np.where(swapped, two, one), np.where(swapped, one, two)
@@ -310,7 +319,7 @@ def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
 
 
 def _groups(rows: Localizations, track: IntArray) -> IntArray:
-    """Give every row the blur that most rows of its track have."""
+    """Give each row the blur that most rows of its new track have."""
     group = rows.group.copy()
     for k in np.unique(track[track != rows.track]):
         mine = track == k

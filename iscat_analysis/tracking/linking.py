@@ -1,4 +1,4 @@
-"""From rows to tracks: which rows are one particle, and which tracks are particles."""
+"""Linking of rows to tracks, and the rejection of tracks that are no particles."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def linked(
     bridged: bool = False,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
-    """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place.
+    """Link rows, drop tracks that are too short, and fill gaps; tracks are numbered in time order.
 
     Shapes: `places` (n, axes).
     """
@@ -66,7 +66,7 @@ def linked(
 
 
 def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -> IntArray:
-    """Frames that each track must have: one that may go on elsewhere, no more than it has here."""
+    """Frames that each track must have; one that may continue in another block needs fewer."""
     counts = np.bincount(rows.track, minlength=1)
     least = np.full(counts.size, config.track.min_frames)
     if inner is not None:
@@ -77,10 +77,10 @@ def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -
 
 
 def mass_places(config: Config, rows: Localizations) -> FloatArray:
-    """Places by which rows are linked: x, y, and the mass as a length.
+    """Positions for linking: x, y, and the mass expressed as a length.
 
-    A step of the mass by its own error counts as much as one of `_STEP` of the farthest that a
-    particle goes, so that particles of unlike mass keep their numbers where they cross.
+    A change of the mass by its own error counts as `_STEP` of the largest step, so that particles
+    of different mass keep their identities where they cross.
 
     Shapes: result (n, 3).
     """
@@ -90,7 +90,7 @@ def mass_places(config: Config, rows: Localizations) -> FloatArray:
 
 
 def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
-    """Add the mass to the places, as a length.
+    """Append the mass, as a length, to positions.
 
     Shapes: result (n, 3).
     """
@@ -99,7 +99,7 @@ def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
 
 
 def mass_error(config: Config, rows: Localizations, error: float) -> float:
-    """Say by how much the amplitude of one particle may change from frame to frame."""
+    """Give the error of the mass that linking assumes between frames."""
     if config.track.free == "joint" and len(rows.frame):
         return max(error, _MASS_ERROR_FREE_Z * float(np.median(rows.theta[:, 3])))
     return error
@@ -128,7 +128,7 @@ def alone(
     *,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
-    """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
+    """Leave out tracks that are rarely isolated or rarely seen: they may be parts of neighbours."""
     config = context.config
     if not len(rows.frame):
         return rows
@@ -140,7 +140,7 @@ def alone(
 
 
 def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
-    """Tell which tracks are seen in most of the frames in which they are fitted.
+    """Tell which tracks are detected in most of the frames in which they are fitted.
 
     Shapes: result (tracks,).
     """
@@ -155,7 +155,7 @@ def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
 def extrapolated(
     config: Config, field: MovingField, rows: Localizations
 ) -> tuple[Localizations, int]:
-    """Let slow particles stay where they were before and after they were seen, to be tried."""
+    """Add trial rows where slow particles were not detected, at their last and next positions."""
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
     for k in np.unique(rows.track):
@@ -180,7 +180,7 @@ def extrapolated(
 
 
 def trimmed(rows: Localizations) -> Localizations:
-    """Cut tracks where they begin and end with frames that hold too little of their mass."""
+    """Cut frames with too little mass off both ends of tracks."""
     keep = np.ones(len(rows.frame), dtype=bool)
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)
@@ -192,7 +192,7 @@ def trimmed(rows: Localizations) -> Localizations:
 
 
 def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
-    """Tell which rows differ so much from their track's mass that they hold part of another's.
+    """Tell which rows hold a part of the mass of another track.
 
     Shapes: result (n,).
     """
@@ -215,7 +215,7 @@ def has_other_mass(track: IntArray, mass: FloatArray, error: FloatArray) -> Bool
 
 
 def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
-    """Tell which rows have another particle of their frame nearer than a limit.
+    """Tell which rows have another row of their frame within a distance.
 
     Shapes: result (n,).
     """
@@ -227,7 +227,7 @@ def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
 def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
     """Tell which rows are of particles that meet: crowded, or shortly before or after that.
 
-    While two are so near that one fit takes the light of both, the other has no row beside it.
+    While one fit takes the light of two close particles, the other particle has no row.
 
     Shapes: result (n,).
     """
@@ -244,9 +244,9 @@ def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
 
 
 def bridge(config: Config, rows: Localizations) -> IntArray:
-    """Join tracks of a particle that hardly moved while it was not seen.
+    """Join tracks of a particle that hardly moved while it was not detected.
 
-    What moves slowly hides in the first background, which is that of most of the frames; it is seen
+    A slow particle is a part of the first background, the median of the frames, and is detected
     again near where it was.  In the gap it must not have gone farther than a resolution.
 
     Shapes: result (n,).
@@ -277,7 +277,7 @@ def _step_nm2(rows: Localizations, mine: IntArray) -> float:
 
 
 def mean_square(steps: FloatArray) -> float:
-    """Give the mean square of normal steps, from its median, to which stray ones do little.
+    """Mean square of normal steps from their median, which is robust against outliers.
 
     Shapes: `steps` (n, 2).
     """
@@ -285,7 +285,7 @@ def mean_square(steps: FloatArray) -> float:
 
 
 def numbered(rows: Localizations) -> Localizations:
-    """Give tracks numbers by their first frame and place."""
+    """Give tracks numbers by first frame and position."""
     _, first = np.unique(rows.track, return_index=True)
     numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)
     order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))

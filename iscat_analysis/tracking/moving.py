@@ -83,7 +83,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class TrackedRows:
-    """What was found in a movie."""
+    """All that was found in a movie of moving particles."""
 
     rows: Localizations
     ground: BackgroundEstimate
@@ -224,7 +224,7 @@ def find_rows_and_background(
 
 
 def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> None:
-    """Refuse a frame with more rows than particles that could be told apart."""
+    """Refuse a frame with more rows than particles that could be resolved."""
     side_um = field.pixel_nm / 1e3
     area = side_um**2 * float(field.used.sum())
     resolution = config.optics.wavelength_nm / config.optics.na / 1e3
@@ -241,7 +241,7 @@ def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> No
 def _with_fringes_decided(
     context: AnalysisContext, field: MovingField, ground: BackgroundEstimate, rows: Localizations
 ) -> Localizations:
-    """Put every row into the fringe that its track says."""
+    """Choose the interference fringe of every row by its track."""
     return decide_heights(
         field, ground, rows,
         fringe_nm=context.model.fringe_nm, z_range_nm=context.config.fit.z_range_nm,
@@ -249,7 +249,7 @@ def _with_fringes_decided(
 
 
 def _with_identities(config: Config, rows: Localizations) -> Localizations:
-    """Give particles that met their own numbers again."""
+    """Exchange the identities of particles after meetings, where that is more likely."""
     if not len(rows.frame):
         return rows
     error = mass_error(config, rows, typical_error(rows.fisher))
@@ -259,7 +259,7 @@ def _with_identities(config: Config, rows: Localizations) -> Localizations:
 
 
 def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidates) -> Localizations:
-    """Add candidates to the rows."""
+    """Add candidates to the rows as starting points of fits."""
     n = len(found.frame)
     pixel = context.pixel_nm
     theta = np.column_stack([
@@ -273,7 +273,7 @@ def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidate
 def _credible(
     context: AnalysisContext, field: MovingField, rows: Localizations, done: BoolArray
 ) -> Localizations:
-    """Keep the rows that a particle explains, each particle once."""
+    """Keep rows that are bright enough to be particles, and each particle once."""
     # of light that is no picture a fit may be lost
     known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
     rows, done = rows.only(known), done[known]
@@ -293,16 +293,16 @@ def _credible(
 def _with_blurs(
     config: Config, field: MovingField, rows: Localizations
 ) -> tuple[Localizations, FloatArray, FloatArray]:
-    """Give tracks their blurs, with the variances that these number and the D they are made of."""
+    """Give tracks their blurs, with the variances and the D that these come from."""
     diffusion = diffusion_of(config, field.free, rows)
     _, exposure = exposure_of(config)
     return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
 def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatArray:
-    """Fit D to the places of every track, where it is alone.
+    """Fit D to each track where its particle is isolated.
 
-    Places in a meeting are off by more than their errors say, and would count as steps.
+    Positions during a meeting have larger errors than stated, and would count as steps.
 
     Shapes: `free` (5,), result (tracks, 2).
     """
@@ -330,7 +330,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
 def blurred_rows(
     rows: Localizations, diffusion: FloatArray, exposure_s: float
 ) -> tuple[Localizations, FloatArray]:
-    """Give the blurs of tracks numbers, those that hardly differ the same.
+    """Give the blurs of tracks numbers; those that hardly differ get the same one.
 
     Shapes: `diffusion` (tracks, 1 or more), `variances_nm2` (groups,).
     """

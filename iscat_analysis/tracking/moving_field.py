@@ -59,7 +59,7 @@ def tracking_context(
 
 
 def initial_background(config: Config, field: MovingField) -> BackgroundEstimate:
-    """Give the background before there are tracks; of all frames together, it remains so."""
+    """Give the background before there are tracks: the median of the frames."""
     ground = first_background(field, follow_power=config.background.power_normalization)
     if config.background.method == "fixed":
         ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
@@ -75,7 +75,7 @@ def load_field(
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> MovingField:
-    """Read the frames, which stay as they are stored where that takes less memory."""
+    """Read the frames; they stay integers where that takes less memory."""
     first, last = span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     if frames < LEAST_FRAMES:
@@ -125,10 +125,10 @@ def restore_particle_light(
     ground: BackgroundEstimate,
     rows: Localizations,
 ) -> None:
-    """Give frames back what of particles was divided out with the light.
+    """Undo what dividing frames by their unsteady light took from the particles.
 
-    A particle is part of the light of its lines, and of whatever else each frame was divided by.
-    Where it is known, that light is known without it.
+    A particle adds to the light of its rows and columns, and of whatever else a frame was divided
+    by.  Where its signal is known, that light is known without it.
     """
     lines = context.lines
     if lines is None or not len(rows.frame):
@@ -143,7 +143,7 @@ def restore_particle_light(
 
 
 def _room_for(shape: tuple[int, int, int], stored: np.dtype[Any], camera: Camera) -> Exposures:
-    """Make room for frames, of the stored numbers where these are small and one gain is theirs."""
+    """Allocate the frames, as stored integers where these are small and share one gain."""
     gain, offset = camera.gain_e_per_adu, camera.offset_adu
     if np.can_cast(stored, np.uint16) and isinstance(gain, float) and isinstance(offset, float):
         return Exposures(np.empty(shape, dtype=np.uint16), gain, offset)
@@ -183,7 +183,7 @@ def search_frames(
     enough: int = 0,
     cautious: bool = False,
 ) -> FrameCandidates:
-    """Find candidates in what the rows leave over."""
+    """Find candidates in the residual of the rows so far."""
     side = context.roi_px
     if context.mode == "joint":
         side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)

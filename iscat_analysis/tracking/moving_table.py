@@ -1,4 +1,4 @@
-"""From the fits of particles that move to the table, one row for each particle and frame."""
+"""The table of moving particles: one row for each particle and frame."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def table_of_tracks(
     *,
     parted: bool,
 ) -> pd.DataFrame:
-    """Judge the lines of a movie, number them, and keep those of tracks seen long enough.
+    """Give the tracks of a movie numbers, drop short ones, and add verdicts to their rows.
 
     Shapes: `track` (n,), `inside` (n,).
     """
@@ -106,7 +106,7 @@ def table_of_tracks(
 
 
 def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
-    """Judge the remarks on a row, one of which may be that its mass is shared."""
+    """Derive status and flags of rows; one flag may be that the mass is shared."""
     own = [Status(flag) for flag in flags.split(";") if flag]
     return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
@@ -179,7 +179,7 @@ def _p_values(
 
 
 def _off_line(context: AnalysisContext, moving: TrackedRows, sigma_kda: FloatArray) -> BoolArray:
-    """Tell whose masses a calibration does not tell: by that of the track where it is known."""
+    """Tell which masses the calibration cannot determine, by the mass of the track where known."""
     track, common, scale = moving.rows.track, moving.common, context.model.scale
     own, shared = moving.rows.theta[:, 3], common.amplitude[track]
     known = np.isfinite(shared)
@@ -195,7 +195,7 @@ def _flags(
     p_value: FloatArray,
     losses: FloatArray,
 ) -> NDArray[np.object_]:
-    """Join what is to be remarked on each row with semicolons."""
+    """Join the flags of each row with semicolons."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)

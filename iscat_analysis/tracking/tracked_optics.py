@@ -57,7 +57,7 @@ _LOOKED_AT = 24  # pictures in which the cause is looked for
 
 @dataclass(frozen=True)
 class Misfit:
-    """What the model leaves over of all pictures of tracks together."""
+    """What the model does not explain in all pictures of tracks together."""
 
     share: float
     clear: bool
@@ -70,7 +70,7 @@ class Misfit:
 
     @property
     def verdict(self) -> str:
-        """Say so."""
+        """Say so in one line."""
         if not self.rejected:
             return "the optics cannot be learned from this movie"
         return (
@@ -81,7 +81,7 @@ class Misfit:
 
 @dataclass(frozen=True)
 class TrialTracks:
-    """The first frames of a movie, followed with some optics."""
+    """The first frames of a movie, tracked with some optics."""
 
     config: Config
     context: AnalysisContext
@@ -89,7 +89,7 @@ class TrialTracks:
 
     @cached_property
     def left(self) -> Misfit | None:
-        """What the model leaves over of all pictures; None where there is none."""
+        """The misfit of all pictures; None where there is none."""
         return _misfit(self.block, self.context)
 
     @property
@@ -99,10 +99,10 @@ class TrialTracks:
 
 
 class TrackFirstFrames(Protocol):
-    """Follows the first frames of a movie."""
+    """Tracks the first frames of a movie with given optics."""
 
     def __call__(self, config: Config, *, cautious: bool = False) -> TrialTracks:
-        """Follow them with some optics; `cautious` as in `find_rows_and_background`."""
+        """Track them; `cautious` as in `find_rows_and_background`."""
         ...
 
 
@@ -115,10 +115,11 @@ def learn_from_tracks(
     warn: Callable[[str], None],
     notify: Callable[[str], None] = notify_nobody,
 ) -> tuple[TrialTracks, dict[str, Any]]:
-    """Follow the first frames, test the optics on them, and learn better ones where they fail.
+    """Track the first frames, test the optics on them, and learn better ones where they fail.
 
-    Through optics that are very wrong a particle leaves rings which are taken for others, until
-    nothing can be linked or learned.  Then only what stands alone is followed, and learned from.
+    Through very wrong optics the rings of a particle are taken for other particles, until nothing
+    can be linked or learned.  Then only isolated particles are tracked, and the optics learned from
+    them.
     """
     optics = config.optics
     suited = optics.convention == "exact" and optics.psf == "model"
@@ -177,7 +178,7 @@ def learn_from_tracks(
 
 
 def _first(config: Config, begin: TrackFirstFrames) -> tuple[TrialTracks, DataError | None]:
-    """Follow the first frames, cautiously where there is trouble, which is given then."""
+    """Track the first frames, cautiously where that fails; the error is returned as well."""
     try:
         return begin(config), None
     except DataError as error:
@@ -196,9 +197,9 @@ def _described(
     name: str,
     pool: ThreadPoolExecutor,
 ) -> tuple[OpticsCalibration | None, TrialTracks | None, str]:
-    """Measure optics from tracks that were followed with optics that describe them.
+    """Measure optics from tracks that these very optics describe.
 
-    Where none are good enough: what was followed last, if it is described, and why.
+    Where none describe them: the last trial, if its tracks are described, and why.
     """
     reason = "what was learned does not describe them either"
     near = trial if trial.described else None
@@ -231,7 +232,7 @@ def _described(
 
 
 def mass_error(summary: Mapping[str, Any]) -> float:
-    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks."""
+    """Relative error of masses with optics that do not describe the tracks."""
     if "left_over_then" in summary:
         return MASS_SHARE * float(summary["left_over_then"])
     share = float(summary.get("left_over", 0.0))
@@ -240,7 +241,7 @@ def mass_error(summary: Mapping[str, Any]) -> float:
 
 
 def _misfit(block: Block, context: AnalysisContext) -> Misfit | None:
-    """Add up what the model leaves over of all pictures; None where there is none."""
+    """Sum the misfit over all pictures; None where there are none."""
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
@@ -265,7 +266,7 @@ def _misfit(block: Block, context: AnalysisContext) -> Misfit | None:
 def _misfit_of_single_pictures(
     aligned: Aligned, context: AnalysisContext, tracks: int
 ) -> Misfit | None:
-    """Say the same of pictures that no two have in common, as of particles at other heights."""
+    """Sum the misfit where each picture is a single frame, as of particles at many heights."""
     excess, power, p_values = 0.0, 0.0, []
     for number, theta in enumerate(aligned.theta):
         likelihood = aligned.likelihood(context, number)
@@ -278,24 +279,24 @@ def _misfit_of_single_pictures(
 
 
 def _share(excess: float, power: float) -> float:
-    """Root of the share of a signal's power."""
+    """Root of the ratio of two powers."""
     return math.sqrt(max(excess, 0.0) / power) if power > 0 else 0.0
 
 
 def _free(context: AnalysisContext) -> BoolArray:
-    """Tell what is fitted of a picture, as `Likelihood` has it."""
+    """Tell which parameters of a picture are fitted, as `Likelihood` has it."""
     return np.array([True, True, context.mode == "joint", True, False])
 
 
 def _brightest(aligned: Aligned, most: int) -> list[int]:
-    """Numbers of the pictures that say most, the brightest first."""
+    """Numbers of the pictures with the most information, the brightest first."""
     energy = aligned.frames * aligned.theta[:, 3] ** 2 * aligned.light_e.mean(axis=(1, 2))
     order: list[int] = np.argsort(-energy, kind="stable")[:most].tolist()
     return order
 
 
 def _cause(begun: TrialTracks) -> Cause | None:
-    """Name the part of the microscope that what is left over looks most like."""
+    """Name the part of the microscope whose change resembles the misfit most."""
     aligned, context = begun.block.aligned, begun.context
     if aligned is None:
         return None
@@ -305,7 +306,7 @@ def _cause(begun: TrialTracks) -> Cause | None:
 
 
 def _message(left: Misfit, cause: Cause | None, *, learns: bool) -> str:
-    """Say what is wrong, and what to do."""
+    """Say what is wrong, and what to do about it."""
     if cause is None:
         return (
             f"the model does not describe the particles: of the pictures of "
@@ -321,7 +322,7 @@ def _message(left: Misfit, cause: Cause | None, *, learns: bool) -> str:
 
 
 def _start(config: Config, cause: Cause | None) -> Config:
-    """Where the search begins: the aperture is not found across the critical angle."""
+    """Choose where the search starts: it does not find the aperture across the critical angle."""
     if cause is None or cause.name != "numerical aperture" or cause.step is None:
         return config
     most = min(config.optics.n_immersion, config.optics.n_glass)

@@ -30,7 +30,7 @@ _DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
 def ascend(
     field: MovingField, ground: BackgroundEstimate, rows: Localizations, *, follow_power: bool
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
-    """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""
+    """Maximise the likelihood of rows and background by steps that never lower it."""
     counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
     damping, best, kept = _DAMPING, -np.inf, (rows, ground)
     for _ in range(_MOST_STEPS):
@@ -54,7 +54,7 @@ def ascend(
 def _damped_step(
     field: MovingField, move: FloatArray, counts: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
-    """Give Newton's step, damped until it climbs, and by how much it should."""
+    """Damp a Newton step until the likelihood is expected to rise; give the expected gain."""
     while True:
         step = field.where_turns_end(move, damping)
         gain = 0.5 * float(np.sum(counts * move * step))
@@ -64,7 +64,7 @@ def _damped_step(
 
 
 def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> float:
-    """Give the log-likelihood of rows over the background that is most likely under them."""
+    """Profile log-likelihood of rows: the background maximises it under these rows."""
     total, power = field.draw(ground, rows, coarse=False), ground.power
 
     def block(first: int) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Rows and background together, to the maximum of the likelihood of `MovingField`."""
+"""Joint fit of rows and background: the maximum of the likelihood of `MovingField`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def fit_jointly(
     turns: int = MOST_TURNS,
     coarse: bool = False,
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
-    """Fit rows and background in turn, to the maximum of their likelihood."""
+    """Fit rows and background in turn until neither changes."""
     sigma = 1 / np.sqrt(np.maximum(field.total_e, 1.0))
     settled, foreseen, roughly = _SETTLED, _FORESEEN, _ROUGHLY
     if field.frames < _SHORT:

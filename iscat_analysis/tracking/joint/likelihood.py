@@ -70,7 +70,7 @@ _BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is s
 
 
 class MovingField:
-    """A movie in memory, and the pictures of what moves in it."""
+    """A movie in memory, and the pictures of the particles that move in it."""
 
     def __init__(
         self,
@@ -167,7 +167,7 @@ class MovingField:
         return len(self.exposures.counts)
 
     def renew(self, block: Callable[[int, int], NDArray[Any]]) -> None:
-        """Put other frames in the place of these."""
+        """Replace the frames."""
 
         def put(first: int) -> None:
             last = min(first + BLOCK, self.frames)
@@ -179,7 +179,7 @@ class MovingField:
         self.draw_anew()
 
     def set_blurs(self, variances_nm2: FloatArray) -> None:
-        """Make the pictures that `Localizations.group` numbers.
+        """Make the pictures of blurs, which `Localizations.group` numbers.
 
         Shapes: `variances_nm2` (groups,).
         """
@@ -194,10 +194,10 @@ class MovingField:
         sweeps: int = 1,
         coarse: bool = False,
     ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
-        """Fit every row over a background, and give the background under the rows.
+        """Fit every row over a background, and estimate the background under the rows.
 
-        Rows that overlap follow one another in the end, but those of smaller squares, some of which
-        are only tried.  How all of them follow their background is kept for `where_turns_end`.
+        In the last fit, rows that overlap are corrected for each other's changes.  The response of
+        all rows to a change of the background is kept for `where_turns_end`.
 
         Shapes: `converged` (n,).
         """
@@ -245,14 +245,14 @@ class MovingField:
         )
 
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
-        """Give the step of the background whose first turn, with the last fit, is `move`.
+        """Extrapolate all further turns from the first one, whose step of the background is `move`.
 
         Shapes: `move` (y, x), result (y, x).
         """
         return self._response.step(move, self.total_e, self.used, damping)
 
     def followed(self, rows: Localizations, step: FloatArray) -> Localizations:
-        """Let the rows of the last fit follow a step of the background, to first order.
+        """Move the rows of the last fit with a step of the background, to first order.
 
         Shapes: `step` (y, x).
         """
@@ -262,13 +262,13 @@ class MovingField:
         return replace(rows, theta=theta)
 
     def draw_anew(self) -> None:
-        """Draw all rings where their particles are, at the next pass."""
+        """Mark all pictures to be drawn again in the next pass."""
         self._canvas = None
 
     def draw(
         self, ground: BackgroundEstimate, rows: Localizations, *, coarse: bool = True
     ) -> NDArray[np.float32]:
-        """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
+        """Draw the rows of all frames, so that `residual` only has to subtract them.
 
         Shapes: result (t, y, x).
         """
@@ -279,7 +279,7 @@ class MovingField:
     def residual(
         self, ground: BackgroundEstimate, rows: Localizations, first: int, last: int
     ) -> NDArray[np.float32]:
-        """Give the counts of some frames minus what is expected.
+        """Give the counts of some frames minus their expectation.
 
         Shapes: result (last - first, y, x).
         """
@@ -296,7 +296,7 @@ class MovingField:
         which: IntArray, corner: IntArray, owner: IntArray,
         out: FloatArray,
     ) -> None:  # fmt: skip
-        """Put squares around rows on top of each other, with all rows taken off.
+        """Superpose the squares around rows, after all rows are subtracted.
 
         Shapes: `which` (n,), `corner` (n, 2), `owner` (n,), `out` (m, 3, side, side).
         """
@@ -320,7 +320,7 @@ class MovingField:
         return canvas.total
 
     def judge(self, ground: BackgroundEstimate, rows: Localizations) -> Judged:
-        """Say what the likelihood knows of every row."""
+        """Compute the information on every row."""
         n = len(rows.frame)
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
@@ -344,7 +344,7 @@ class MovingField:
         return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
 
     def sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
-        """Run blocks of frames and add what they give, in their order."""
+        """Run a function on blocks of frames and sum the results in order."""
         parts = list(self._pool.map(block, range(0, self.frames, BLOCK)))
         total = parts[0].astype(np.float64)
         for part in parts[1:]:
@@ -352,11 +352,11 @@ class MovingField:
         return total
 
     def share(self, task: Callable[[int], None], count: int) -> None:
-        """Run a numbered task for every number below `count`, several at a time."""
+        """Run numbered tasks in threads."""
         list(self._pool.map(task, range(count)))
 
     def holds(self, theta: FloatArray) -> BoolArray:
-        """Tell which particles are in the field.
+        """Tell which positions are in the field.
 
         Shapes: `theta` (..., 5), result (...).
         """
@@ -368,7 +368,7 @@ class MovingField:
     def refit(
         self, ground: BackgroundEstimate, rows: Localizations, *, sweeps: int
     ) -> tuple[Localizations, BoolArray]:
-        """Fit all particles of a few frames, the smaller square of each.
+        """Fit all particles of a few frames in the smaller square.
 
         Shapes: `converged` (n,).
         """
@@ -396,7 +396,7 @@ class MovingField:
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
     def on_wall(self, rows: Localizations) -> BoolArray:
-        """Tell which rows ended on a wall of the search.
+        """Tell which rows ended at a limit of the search.
 
         Shapes: result (n,).
         """
@@ -406,7 +406,7 @@ class MovingField:
         return np.asarray((near & self.free).any(axis=1))
 
     def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
-        """Give the pictures to fit and to draw, which are the same where little is drawn."""
+        """Give the pictures to fit and to draw; they are the same where little is drawn."""
         near, far = self._pictures
         return near, near if coarse and not self.free[2] else far
 
@@ -426,7 +426,7 @@ class MovingField:
         return canvas
 
     def _slopes_of(self, rows: int, side: int) -> Slopes:
-        """Room for slopes, in the place of those before."""
+        """Allocate slopes, reusing the memory of the previous ones."""
         free = int(self.free[:4].sum())
         size = rows * free * side**2
         if self._room_of_slopes.size < size:
