@@ -1,7 +1,8 @@
-"""Parts of a camera that are read out by amplifiers of their own, whose gains change by themselves.
+"""Boundaries between parts of a camera that are read out by different amplifiers.
 
-Halves, quadrants and stripes of the field then change from frame to frame, each as a whole: the sum
-over rows or columns has a step at the seam, which no smooth light has.
+The gain of each amplifier changes by itself.  Halves, quadrants or stripes of the field then change
+from frame to frame as a whole: the sum over rows or columns has a step at the boundary, which
+smooth light does not have.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ _NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 def find_amplifier_boundaries(
     changes: Changes, window: int, known: AmplifierBoundaries = ((), ())
 ) -> AmplifierBoundaries:
-    """Look for rows and columns at which the changes of the light have a step."""
+    """Find rows and columns at which the change of the light has a step."""
     least = changes.least(window) / changes.error
     return _along(changes, 2, least, known[0]), _along(changes, 1, least, known[1])
 
@@ -37,7 +38,7 @@ def find_amplifier_boundaries(
 def parts_of(
     shape: tuple[int, int], boundaries: AmplifierBoundaries
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Tell which rows and columns belong together.
+    """Give indicator functions of the parts between boundaries.
 
     Shapes: `rows, columns` (y, k) and (x, m), `products` (k, m).
     """
@@ -52,7 +53,7 @@ def parts_of(
 
 
 def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) -> tuple[int, ...]:
-    """Find the seams between lines whose pixels lie along an axis of (pairs, y, x)."""
+    """Find the boundaries along an axis of (pairs, y, x)."""
     light = changes.light_e.sum(axis=axis - 1)
     lit = light > 0
     before, after = np.moveaxis(changes.sums_e.sum(axis=axis + 1)[..., lit], 1, 0)

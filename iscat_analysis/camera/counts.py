@@ -172,7 +172,7 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
 
 
 def _first(bad: BoolArray) -> str:
-    """Say how many pixels are bad and where the first one is."""
+    """Say how many pixels are bad, and where the first one is."""
     y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
     count = int(np.count_nonzero(bad))
     return f"in {count} {'pixel' if count == 1 else 'pixels'}, the first at y = {y}, x = {x}"
@@ -235,7 +235,7 @@ def _refuse_negative(frame: NDArray[Any], floor: float | FloatArray, where: str)
 
 
 def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatArray:
-    """Lowest believable count: offset less six standard deviations of read noise and rounding."""
+    """Lowest plausible count: offset less six standard deviations of read noise and rounding."""
     rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
     floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
@@ -243,7 +243,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
 
 
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
-    """Refuse a frame that was divided by another: floats around 1, or around 0 as contrasts.
+    """Refuse a frame that was divided by another: values near 1, or near 0 as contrasts.
 
     Shapes: `frame` (y, x).
     """
@@ -305,7 +305,7 @@ def converter_ceiling(counts: NDArray[Any]) -> float:
 
 
 def _ceiling_adu(camera: Camera) -> float | FloatArray:
-    """Count from which a pixel is saturated."""
+    """Count from which on a pixel is saturated."""
     ceiling: float | FloatArray = math.inf
     if camera.well_depth_e is not None:
         ceiling = camera.offset_adu + np.divide(camera.well_depth_e, camera.gain_e_per_adu)

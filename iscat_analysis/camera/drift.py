@@ -45,7 +45,7 @@ _PEAK = 8.0  # least peak of a phase correlation over the noise of one of random
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the fixed pattern was."""
+    """Shift of the fixed pattern with time."""
 
     frames: FloatArray
     shift_px: FloatArray
@@ -57,7 +57,7 @@ class Trajectory:
         return float(np.median(self.error_px.max(axis=1)))
 
     def at(self, frames: FloatArray | float) -> FloatArray:
-        """Shift in some frames, shape (…, 2); a straight line between blocks and beyond them."""
+        """Shift in some frames, shape (…, 2); linear between blocks and beyond them."""
         at, known = np.asarray(frames, dtype=float), self.frames
         if known.size < 2:
             return np.broadcast_to(self.shift_px[0], (*at.shape, 2)).copy()
@@ -76,7 +76,7 @@ def follow_pattern(
     *,
     mapper: Mapper = map,
 ) -> Trajectory | None:
-    """Follow the fixed pattern from block to block.
+    """Measure the shift of the fixed pattern from block to block.
 
     Shapes: `blocks_e` (k, y, x), `power` (k,), `frames` (k,), `usable` (y, x), `read_variance_e2`
     (y, x).
@@ -167,7 +167,7 @@ class Mover:
 
     @property
     def waves(self) -> tuple[ComplexArray, ComplexArray]:
-        """What multiplies a spectrum where the image is differentiated by y or by x."""
+        """Factors that differentiate a spectrum by y and by x."""
         return 2j * np.pi * self._fy[:, None], 2j * np.pi * self._fx[None]
 
     def spectrum(self, image: FloatArray) -> ComplexArray:
@@ -184,7 +184,7 @@ class Mover:
         return image
 
     def transfer(self, shift_px: FloatArray, weights: FloatArray) -> ComplexArray:
-        """Give what multiplies a spectrum where the image is a weighted sum of moved ones.
+        """Factors that make a spectrum that of a weighted sum of shifted images.
 
         Shapes: `shift_px` (n, 2), `weights` (n,), result (v, u).
         """
@@ -218,7 +218,7 @@ def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
 
 
 def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
-    """Index that puts the nearest usable pixel's value in place of an unusable one's.
+    """Index that gives unusable pixels the value of the nearest usable one.
 
     Shapes: `usable` (y, x).
     """
@@ -227,7 +227,7 @@ def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
 
 
 def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
-    """Give the light that stays where it is while the pattern moves.
+    """Estimate the light that does not move with the pattern.
 
     Shapes: `blocks_e` (k, y, x), `usable` (y, x), result (y, x).
     """
@@ -277,7 +277,7 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
 
 
 def _without_spikes(image: FloatArray) -> FloatArray:
-    """Put the median of those around in the place of pixels that stand out of them."""
+    """Replace outlying pixels by the median of their neighbours."""
     around = median_filter(image, size=3)
     out = np.abs(image - around)
     return np.where(out > _SPIKE * 1.4826 * np.median(out), around, image)

@@ -41,7 +41,7 @@ _LEAST_SQUARES = 24  # along an axis
 
 @dataclass(frozen=True, eq=False)
 class Fringes:
-    """Plane waves whose heights and phases change."""
+    """Plane waves whose amplitudes and phases change."""
 
     waves: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     degree: int = 0
@@ -75,7 +75,7 @@ NO_FRINGES = Fringes()
 
 
 def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
-    """Look for plane waves among changes of the light."""
+    """Find plane waves among changes of the light."""
     side = max(1, -(-max(changes.light_e.shape) // _SIDE))
     change, light = changes.binned(side)
     if min(light.shape) < _LEAST_SQUARES:
@@ -110,9 +110,9 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
 def _refined(
     change: FloatArray, light: FloatArray, waves: FloatArray, smooth_degree: int
 ) -> FloatArray:
-    """Give waves the vectors with which they leave least, beside a polynomial.
+    """Refine wave vectors by Gauss–Newton steps, over a smooth polynomial.
 
-    A wave whose vector is off by d leaves i d·r of itself (Gauss-Newton).
+    A wave whose vector is wrong by d leaves the residual i d·r times itself.
     """
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     flat, root = change.reshape(len(change), -1), np.sqrt(light)
@@ -132,9 +132,9 @@ def _refined(
 def _explained(
     change: FloatArray, light: FloatArray, fringes: Fringes, smooth_degree: int
 ) -> tuple[float, FloatArray]:
-    """Fit fringes beside a polynomial, which is no part of the changes any more.
+    """Fit fringes over a smooth polynomial, which `change` has no part of.
 
-    Gives their mean square beyond that of noise, in its variances, and what they leave.
+    Returns their mean square beyond noise, in variances of it, and the residual.
     """
     rows, columns, products = fringes.axes(light.shape)
     down, along = np.nonzero(products)
@@ -146,7 +146,7 @@ def _explained(
 
 
 def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
-    """Take the polynomial of a degree off changes (pairs, y, x)."""
+    """Subtract the polynomial of a degree from changes (pairs, y, x)."""
     rows, columns = (
         np.linalg.qr(legvander(np.linspace(-1, 1, n), degree))[0] for n in change.shape[1:]
     )
@@ -156,7 +156,7 @@ def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
 
 
 def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
-    """Give the wave vector of the point that stands out of the mean spectrum; None without one."""
+    """Find the wave vector of the highest peak of the mean spectrum; None without one."""
     pairs, high, wide = change.shape
     windows = np.hanning(high)[:, None] * np.hanning(wide)
     seen = change * (windows / math.sqrt(float(np.square(windows).mean())))

@@ -77,7 +77,7 @@ class LearnedCamera:
 
     @property
     def description(self) -> str:
-        """Give the numbers and where they come from, in one line."""
+        """Describe the numbers and their sources in one line."""
         parts = []
         for key, words in (
             ("gain_e_per_adu", "{} e per count"),
@@ -115,7 +115,7 @@ class LearnedCamera:
 def with_camera(
     movie: Stack, config: Config, span: tuple[int, int]
 ) -> tuple[Stack, Config, LearnedCamera]:
-    """Give a movie through its response curve, and a configuration with numbers of the camera."""
+    """Apply the response curve to a movie, and set the numbers of its camera."""
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
     resolved = pixel_nm < _RESOLVED * optics.wavelength_nm / optics.na
@@ -169,7 +169,7 @@ def learn_camera(
 def _sample(
     movie: CountSource, span: tuple[int, int], pixels: int
 ) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Read the first frames with light that do not repeat each other, and those in the dark.
+    """Read the first frames with light, without repeats, and those in the dark.
 
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
@@ -195,7 +195,7 @@ def _sample(
 
 
 def _finite(frames: NDArray[Any]) -> NDArray[Any]:
-    """Leave out frames that have a pixel without a number; they are refused, or left out, later.
+    """Drop frames with pixels that are not numbers; these are handled later.
 
     Shapes: `frames` and result (t, y, x).
     """
@@ -204,7 +204,7 @@ def _finite(frames: NDArray[Any]) -> NDArray[Any]:
 
 
 def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
-    """Tell whether frames have not the pattern of light, nor its noise where that is even.
+    """Tell whether frames have neither the pattern of light nor its noise.
 
     Shapes: `dark` (k, y, x), `lit` (t, y, x).
     """
@@ -221,7 +221,7 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
 
 
 class _Learning:
-    """What is known of a camera while it is being learned."""
+    """The numbers of a camera while they are being measured."""
 
     def __init__(
         self,
@@ -242,12 +242,12 @@ class _Learning:
         self._dark_variance: float | None = None
 
     def number(self, key: str) -> Number:
-        """Give one of the numbers, of a map the mean."""
+        """Value of a number; of a map, its mean."""
         value = float(np.mean(getattr(self.camera, key)))
         return Number(value, self._se[key], self._source[key])
 
     def response(self) -> Response | None:
-        """Give the curve that makes light of counts, where these bend in a way that is known."""
+        """Make the response curve where the counts follow a known law that is not linear."""
         law, found = self.law, self.transfer
         if law is None or found is None or not law.bent or not law.certain:
             return None
@@ -255,7 +255,7 @@ class _Learning:
         return response_of(law, found, self.camera, max(top, float(self.counts.max())))
 
     def take_metadata(self, metadata: StackMetadata) -> None:
-        """Begin with what the camera's driver wrote into the file."""
+        """Take the numbers that the driver of the camera wrote into the file."""
         for key in ("gain_e_per_adu", "offset_adu"):
             value = getattr(metadata, key)
             if value is not None and key in self.free:
@@ -276,7 +276,7 @@ class _Learning:
             self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
     def learn(self) -> None:
-        """Learn what is free from the frames with light."""
+        """Measure what is not configured, on frames with light."""
         if len(self.counts) < 2:
             self._cannot("it has no two frames with light")
             return
@@ -294,7 +294,7 @@ class _Learning:
         self.changed.add(key)
 
     def _cannot(self, why: str) -> None:
-        """Say once that the gain keeps its assumption."""
+        """Say once that the gain keeps its default."""
         if self._source["gain_e_per_adu"] == ASSUMPTION:
             self.messages.append(
                 f"the camera's gain cannot be learned from this movie, because {why}: "
@@ -349,7 +349,7 @@ class _Learning:
         return found.gain_e_per_adu, found.gain_se, MEASURED
 
     def _learn_slope(self) -> None:
-        """Measure the gain where the offset is most of the dark: by pixels of different light."""
+        """Measure gain against light, where most of the counts are offset."""
         if "gain_e_per_adu" not in self.free:
             return
         found = measure_transfer(self.counts, self.camera)
@@ -363,7 +363,7 @@ class _Learning:
             self._set("gain_e_per_adu", gain, gain * found.noise.se / found.level, MEASURED)
 
     def _learn_law(self) -> None:
-        """Find the law of the counts, and with it an offset or a read noise that are free."""
+        """Find the law of the counts, with offset and read noise where these are free."""
         self.transfer = found = measure_transfer(self.counts, self.camera)
         if found is None:
             return
@@ -391,7 +391,7 @@ class _Learning:
             self.law = None
 
     def _take_offset(self, law: Law, level_adu: float, error: float) -> None:
-        """Take the offset where the light ends, and look at the rest once more."""
+        """Take the offset from the zero of the light, and measure the rest again."""
         offset = float(np.mean(self.camera.offset_adu)) + law.value * level_adu
         self._set("offset_adu", offset, error, MEASURED)
         self.free.discard("offset_adu")
@@ -405,7 +405,7 @@ class _Learning:
         self._learn_law()
 
     def _mind_rounding(self) -> None:
-        """Count rounding as read noise, where it is not far below the light's noise."""
+        """Count rounding as read noise, unless it is far below the noise of the light."""
         gain = float(np.mean(self.camera.gain_e_per_adu))
         rounding = rounding_variance_adu2(self.counts) * gain**2 - 1 / 12
         light = float(np.median(self.camera.to_electrons(self.counts.mean(axis=0))))

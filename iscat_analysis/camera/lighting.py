@@ -55,7 +55,7 @@ _LEAST_SHARE = 1e-10  # of what is told of the best known combination of terms
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Measures what of frames changes over their mean one; `find_surface` makes it."""
+    """Measures how the light of frames differs from the mean light; made by `find_surface`."""
 
     light_e: FloatArray
     degree: int
@@ -76,7 +76,7 @@ class Surface:
 
     @property
     def messages(self) -> list[str]:
-        """What the user should know, one line each."""
+        """Messages for the user, one line each."""
         lines = []
         if self.degree:
             lines.append(
@@ -141,7 +141,7 @@ class Surface:
 
     @cached_property
     def _inverse(self) -> FloatArray:
-        """Turns overlaps with the products into coefficients, the least where several would do."""
+        """Pseudoinverse that turns overlaps with the products into coefficients."""
         rows, columns = self._axes
         down, along = np.divmod(self._kept, columns.shape[1])
         gram = np.empty((self._kept.size, self._kept.size))
@@ -158,7 +158,7 @@ class Surface:
         return np.asarray(np.linalg.pinv(gram, rcond=_LEAST_SHARE, hermitian=True))
 
     def factors(self, electrons: FloatArray) -> FloatArray:
-        """Measure the change of frames.
+        """Give the light of frames over the mean light.
 
         Shapes: `electrons` (…, y, x), result (…, y, x).
         """
@@ -189,7 +189,7 @@ class Surface:
 def find_surface(
     pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]], camera: Camera, window: int
 ) -> Surface | None:
-    """Look for changes of the distribution of the light between frames.
+    """Find changes of the distribution of the light between frames.
 
     Shapes: `pairs` (t, y, x).
     """
@@ -209,7 +209,7 @@ def find_surface(
 
 
 def _patterns(changes: Changes, window: int, highest: int) -> Surface:
-    """Look for seams and fringes, which hide each other."""
+    """Find amplifier boundaries and fringes, in turns, because each hides the other."""
     found = Surface(changes.light_e, 0, 0.0)
     for _ in range(_ROUNDS):
         seams = find_amplifier_boundaries(_even(changes, found), window, found.amplifier_boundaries)
@@ -224,7 +224,7 @@ def _patterns(changes: Changes, window: int, highest: int) -> Surface:
 
 
 def _even(changes: Changes, found: Surface) -> Changes:
-    """Divide sums by what was found in them."""
+    """Divide sums by the changes found in them."""
     if not found.measures:
         return changes
     return changes.divided(found.factors(changes.sums_e))
@@ -250,7 +250,7 @@ def _smooth(changes: Changes, window: int, highest: int, fringes: Fringes) -> tu
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Frames summed in cells, and what they are made of there."""
+    """Sums of frames in cells, and the basis functions in the same cells."""
 
     changes: FloatArray  # (pairs, cells) in standard deviations of shot noise
     basis: FloatArray  # (cells, terms) orthonormal: waves, then polynomials
@@ -292,9 +292,9 @@ class _Grid:
         return cls(out, basis, degrees)
 
     def squares(self) -> tuple[FloatArray, float]:
-        """Squared coefficients (pairs, terms) in their variances, and what they leave of a cell's.
+        """Squared coefficients (pairs, terms) and residual, in variances of a cell.
 
-        Where nothing but noise is left, the mean of that over cells and pairs is 0.
+        Where there is only noise, the mean of the residual over cells and pairs is 0.
         """
         out: list[FloatArray] = []
         whole = np.eye(self.basis.shape[1])

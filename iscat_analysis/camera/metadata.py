@@ -1,8 +1,4 @@
-"""What a movie says of its camera, and whether its noise agrees.
-
-`resolve_metadata` fills the configuration from the file; `diagnose_gain` measures the gain from the
-noise itself.
-"""
+"""Metadata of a movie, and whether its noise agrees with them."""
 
 from __future__ import annotations
 
@@ -34,7 +30,7 @@ _OUTLIER_FRAMES = 16  # fewer, and the variance of one pixel is too uncertain to
 
 
 def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
-    """Fill what the configuration leaves out from what the movie says of itself."""
+    """Set what the configuration leaves open from the metadata of the movie."""
     notes = []
     found: dict[str, float] = {}
     for key, unit, words in (
@@ -77,7 +73,7 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
 
 
 def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
-    """Put what the movie says of its optics in the place of what is as by default."""
+    """Replace defaults of the optics by the metadata of the movie."""
     found: dict[str, float] = {}
     notes = []
     for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
@@ -110,7 +106,7 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
 
 
 def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
-    """Say that pixels are larger than a particle's spot is wide; refuse twice that."""
+    """Warn that pixels are larger than the spot of a particle; refuse twice that size."""
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
     spot_nm = optics.wavelength_nm / (2 * optics.na)
     if pixel_nm is None or pixel_nm <= spot_nm:
@@ -136,7 +132,7 @@ def _refuse_unlikely(pixel_nm: float, source: str) -> None:
 
 @dataclass(frozen=True)
 class GainDiagnosis:
-    """Measured noise beside what the configured gain predicts."""
+    """Measured noise over that of the configured gain."""
 
     noise_ratio: float
     noise_ratio_se: float
@@ -281,7 +277,7 @@ def diagnose_gain(
 def with_pattern_jitter(
     found: GainDiagnosis, counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None
 ) -> GainDiagnosis:
-    """Measure what motion of the fixed pattern explains of an excess, where there is one.
+    """Measure how much of an excess of noise the motion of the fixed pattern explains.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
@@ -291,7 +287,7 @@ def with_pattern_jitter(
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:
-    """Leave out pixels that blink, whose variance would outweigh all the others'."""
+    """Leave out blinking pixels, whose variance would outweigh that of all others."""
     if n_frames < _OUTLIER_FRAMES:
         return np.ones(ratios.shape, dtype=np.bool_)
     # Relative spread of half the mean squared successive difference of normal numbers

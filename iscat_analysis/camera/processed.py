@@ -50,7 +50,7 @@ class Processing:
 
     @property
     def message(self) -> str:
-        """What the user should know."""
+        """Message for the user."""
         what = {
             "interpolated": "the frames were interpolated, as where a movie is aligned by parts of "
             f"a pixel: the noise of the finest patterns changes by {100 * self.uneven:.0f} % "

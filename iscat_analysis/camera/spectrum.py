@@ -55,17 +55,17 @@ class NoiseSpectrum:
 
     @property
     def alike(self) -> float:
-        """How many times fewer pixels would tell as much of the variance, were they independent."""
+        """Factor by which correlation reduces the number of independent pixels."""
         covariance = fft.irfft2(self.power, s=self.shape)
         return float(np.sum(np.square(covariance / covariance[0, 0])))
 
     @property
     def correlated(self) -> bool:
-        """Whether neighbouring pixels are."""
+        """Whether neighbouring pixels are correlated."""
         return max(map(abs, self.neighbours)) > _NEGLIGIBLE
 
     def whitened(self, weighted: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
-        """Turn a signal, times its information, into what a template's overlap is taken with.
+        """Divide a signal, times its information, by the spectrum of the noise.
 
         Shapes: `weighted` (y, x), `weight` (y, x).
         """
@@ -105,7 +105,7 @@ class NoiseSpectrum:
 
     @property
     def message(self) -> str:
-        """One line about what is not as expected; empty where nothing but the variance is."""
+        """One line about what differs from white noise; empty where only the variance differs."""
         parts = []
         x, y = self.neighbours
         if self.correlated:

@@ -1,8 +1,9 @@
-"""Light, or counts of the dark camera, that are added to all pixels alike and change.
+"""Light, or dark counts, that are added to all pixels equally and change with time.
 
-Where a room's light or the camera's offset drifts, dim pixels change by more of themselves than
-bright ones: by one over their light.  In every part of the field that is the same number, whatever
-smooth light does there; what a pattern that moves makes of it differs from part to part.
+Where light of the room or the offset of the camera drifts, pixels change relative to their own
+light by one over it, dim ones most.  The size of that change is the same in all parts of the field.
+Smooth changes of the light do not affect it; a pattern that moves makes it differ from part to
+part.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _LEAST_PATTERN_POWER = 1e-3  # by a part, of what others tell
 
 
 def lift(light_e: FloatArray) -> FloatArray:
-    """Give the relative change of pixels to which the same is added.
+    """Relative change of pixels to which the same number is added.
 
     Shapes: `light_e` (y, x), result (y, x).
     """
@@ -34,7 +35,7 @@ def lift(light_e: FloatArray) -> FloatArray:
 
 
 def find_stray_light(changes: Changes, window: int) -> float:
-    """Look for something that is added to all pixels alike, and changes."""
+    """Measure a change that is added to all pixels equally, over the mean light; 0 if none."""
     light, more = changes.light_e, lift(changes.light_e)
     rows, columns = (
         np.equal.outer(np.arange(_PARTS), np.arange(n) * _PARTS // n).astype(np.float64)

@@ -1,8 +1,8 @@
-"""Frames that hold light of those before them: averaged, interpolated or filtered in time.
+"""Frames that contain light of earlier frames: averaged, interpolated or filtered in time.
 
-Of independent frames any two differ alike, but for what changes slowly.  Where each was averaged
-with the one before, neighbours differ less than frames farther apart, and these all alike; where
-light or the stage drift, or the laser flickers, differences go on growing.
+Of independent frames any two differ by the same noise, apart from slow changes.  If each was
+averaged with the one before, neighbours differ less than frames farther apart, and those all differ
+equally.  Where light or stage drift, or the laser flickers, differences go on growing.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _GROWS = 0.15  # of that, by which it may still grow farther on
 def shared_light(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> float | None:
-    """Tell whether successive frames have light in common.
+    """Test whether successive frames have light in common.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """

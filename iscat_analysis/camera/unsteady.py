@@ -58,7 +58,7 @@ def unsteady_message(pixels: BoolArray) -> str:
 def find_unsteady(
     blocks: Sequence[NDArray[Any]], camera: Camera, least_beside: float
 ) -> BoolArray | None:
-    """Find pixels that flicker, switch or repeat themselves.
+    """Find pixels that flicker, switch, or repeat their values.
 
     Shapes: `blocks` (t, y, x), result (y, x).
     """
@@ -110,7 +110,7 @@ def find_unsteady(
 
 
 def _largest_neighbour(values: FloatArray) -> FloatArray:
-    """Give the larger of the two values beside each, along the axis where that is less."""
+    """Larger one of the two neighbours, along the axis where it is smaller."""
     padded = np.pad(values, 1, mode="reflect")
     along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
     along_x = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
@@ -118,7 +118,7 @@ def _largest_neighbour(values: FloatArray) -> FloatArray:
 
 
 class _Scatter:
-    """Squares of what pixels have beyond their mean, and how far those beside them follow."""
+    """Mean square deviations of pixels, and their products with neighbouring pixels."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.squares = np.zeros(shape)
@@ -130,13 +130,13 @@ class _Scatter:
 
     @property
     def neighbour_products(self) -> FloatArray:
-        """Products with the pixels beside along y or x, whichever follow more."""
+        """Products with the neighbours along y or x, whichever are larger."""
         largest: FloatArray = self.products.max(axis=0)
         return largest
 
 
 def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:
-    """Find rows and columns most of whose pixels scatter more than those of the lines beside."""
+    """Find rows and columns in which most pixels scatter more than in the neighbouring lines."""
     noisy = np.zeros(ratio.shape, dtype=np.bool_)
     for axis in (0, 1):
         lines = np.flatnonzero(lit.mean(axis=axis) > _WHOLE)

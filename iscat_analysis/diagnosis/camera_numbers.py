@@ -1,4 +1,4 @@
-"""Which number of the camera is wrong: what the noise and the zero of the light say of it."""
+"""Which number of the camera is wrong, as noise and zero of the light show it."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ _SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its of
 
 
 def zero_by_law(law: Law, level_e: float) -> LightZero | None:
-    """Give where the light ends by the law that the movie's counts follow."""
+    """Give the zero of the light that follows from the law of the counts."""
     if law.kind == "offset":
         return LightZero(law.value, law.se, law.value * level_e, law.flickers)
     return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
 
 
 def law_messages(known: LearnedCamera) -> tuple[str, ...]:
-    """Say that counts are not in proportion to light, by which law, and what to do."""
+    """Say that counts are not proportional to light, which law they follow, and what to do."""
     law = known.camera.law
     if law is None:
         return ()
@@ -91,10 +91,10 @@ def law_messages(known: LearnedCamera) -> tuple[str, ...]:
 
 
 def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
-    """Tell whether it is the offset that is wrong, where the noise is not the only one to say so.
+    """Tell whether the offset is wrong, where an excess of noise could be the cause as well.
 
-    Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
-    meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
+    Noise of the light itself, or motion, bends the line of variance against mean, which then has
+    another zero.  But then there is more noise than the light has, whatever the offset is.
     """
     if not zero.off or gain.shakes:
         return False
@@ -112,13 +112,13 @@ def _offset_of(camera: Camera) -> str:
 
 
 def _effect(share: float) -> str:
-    """Say what a part of the light that is none does to masses."""
+    """Describe how the mass changes where a part of the counts is no light."""
     percent = float(f"{100 * abs(share):.2g}")  # in full where it is hundreds
     return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
 
 
 def offset_message(zero: LightZero, camera: Camera) -> str:
-    """Say where the light is zero, and what a wrong offset does."""
+    """Say where the light is zero, and what a wrong offset does to masses."""
     per_count = float(np.mean(camera.gain_e_per_adu))
     counts = zero.electrons / per_count
     se = zero.se * counts / zero.share
@@ -142,9 +142,9 @@ def offset_message(zero: LightZero, camera: Camera) -> str:
 
 
 def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
-    """Say that an offset may be as wrong as a gain, where the noise fits both.
+    """Say that either the offset or the gain may be wrong, where the noise fits both.
 
-    An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
+    An offset that is wrong by a share s of the light leaves 1 − s of the expected noise.
     """
     share = 1 - gain.noise_ratio
     if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
@@ -162,7 +162,7 @@ def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: 
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
-    """Judge the gain by the noise that neighbouring pixels have together.
+    """Correct the gain for noise that neighbouring pixels share.
 
     Notes
     -----

@@ -1,4 +1,4 @@
-"""What a movie reveals of lines, pixels, stage and model, in words."""
+"""Warnings about pixels, axes, stage, mass scale and model of a movie."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _MANY_SLOW = 0.1  # and their share of all events
 
 
 def axes_warning(name: str, counts: NDArray[Any]) -> str:
-    """Say that time seems to run along the rows or columns of the frames.
+    """Warn that time seems to run along the rows or columns of the frames.
 
-    What changes least from one to the next, in proportion to their means, are frames: light on a
-    pixel repeats but for its noise, and neighbouring pixels have different light.
+    Images along the time axis change least, relative to their means: a pixel's light repeats but
+    for noise, while neighbouring pixels have different light.
 
     Shapes: `counts` (t, y, x).
     """
@@ -95,7 +95,7 @@ def _verb_be(number: int) -> str:
 
 
 def repeats_warning(movie: Stack, windows: Windows) -> str:
-    """Say which frames repeat the one before them, which the sums count as frames of their own."""
+    """Warn of frames that repeat the one before, which sums count as frames of their own."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
     same &= well_lit(windows.power, DARK)[1:]  # of dark ones something else is said
@@ -118,7 +118,7 @@ def _repeats(movie: Stack, number: int) -> bool:
 def uneven_warning(
     config: Config, name: str, windows: Windows, explained: FloatArray | None = None
 ) -> str:
-    """Say that the light is uneven where one level is taken for the background of all pixels.
+    """Warn that the light is uneven where one level is the background of all pixels.
 
     Shapes: `explained` (y, x).
     """
@@ -155,7 +155,7 @@ def uneven_warning(
 
 
 def misfit_warning(config: Config, events: Sequence[Event]) -> str:
-    """Say what is probably wrong with the model, where it misses the brightest particles."""
+    """Say what is probably wrong with the model, where it fails for the brightest particles."""
     if config.optics.psf == "measured":
         return ""
     alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
@@ -168,7 +168,7 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
 
 
 def line_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say which contrasts the line of the calibration turns into no single mass."""
+    """Warn of contrasts that the calibration line cannot convert into a single mass."""
     line = config.calibration
     if line is None or not line.offset:
         return ""
@@ -194,7 +194,7 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def scale_warning(scale: MassScale) -> str:
-    """Say how far the scale of masses was carried from the optics of its standards, or refused."""
+    """Say how the mass scale was transferred from the optics of its standards, or why not."""
     line = scale.calibration
     if line is None or (not scale.refusal and abs(scale.carried - 1) < _LEAST_SCALE_CHANGE):
         return ""
@@ -220,7 +220,7 @@ def scale_warning(scale: MassScale) -> str:
 
 
 def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
-    """Say which particles are too heavy for a line that faint standards gave."""
+    """Warn of particles that are too heavy for a line through faint standards."""
     bent = is_bent(scale, table)
     if not bent.any():
         return ""
@@ -238,7 +238,7 @@ def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
 
 
 def sign_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that nearly all particles change the light the other way than the model has it."""
+    """Warn that nearly all particles have the opposite sign of the model."""
     mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
     turned = int((mass < 0).sum())
     if turned < _FEWEST_TURNED or turned < _NEARLY_ALL * len(mass):
@@ -254,10 +254,9 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def landing_rate_warning(table: pd.DataFrame) -> str:
-    """Say that the light of many steps does not change from one frame to the next.
+    """Warn that the light of many steps changes slowly, not from one frame to the next.
 
-    Their pictures may agree with the model; `Status.CHANGING` is of the course of the light before
-    and after.
+    Their pictures may agree with the model; `Status.CHANGING` is about the light before and after.
     """
     flags = table["flags"].fillna("").astype(str).str.split(";")
     slow = int(flags.map(lambda listed: Status.CHANGING.value in listed).sum())
@@ -273,7 +272,7 @@ def landing_rate_warning(table: pd.DataFrame) -> str:
 
 
 def fixed_height_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that particles whose height was fitted in every frame do not move along z."""
+    """Warn that particles whose heights were fitted in every frame do not move along z."""
     if config.track.free != "joint":
         return ""
     good = table[table["status"] == Status.OK.value].sort_values(["track", "frame"])
@@ -296,10 +295,10 @@ def fixed_height_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> str:
-    """Say that particles go too far within an exposure for their heights to be fitted.
+    """Warn that particles move too far within an exposure for their heights to be fitted.
 
-    A picture is that of a normal distribution about the mean of the path, along z in phase too; of
-    a long path no two are alike.
+    A picture is modelled with a normal distribution of positions about the mean, along z in phase
+    too.  Of a long path no two pictures are alike.
 
     Shapes: `smear_nm` (n,).
     """
@@ -324,9 +323,9 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
 
 
 def pattern_jitter_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
-    """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
+    """Warn that the fixed pattern shakes, where that is most of the noise beyond the light's.
 
-    Particles that move add noise too, but not along the gradient of the mean of all frames.
+    Moving particles add noise too, but not along the gradient of the mean frame.
     """
     counts = movie.read(frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES))
     try:

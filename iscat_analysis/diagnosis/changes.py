@@ -47,7 +47,7 @@ _ASKED = 500_000  # values, whose median has an error of a few thousandths
 
 @dataclass(frozen=True)
 class Changes:
-    """Clear changes in a movie."""
+    """Statistics of clear changes in a movie."""
 
     number: int
     staying: float
@@ -59,7 +59,7 @@ NO_CHANGES = Changes(0, float("nan"), float("nan"))
 
 
 def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
-    """Look for changes from block to block, and at what becomes of them.
+    """Find changes from block to block, and test whether they stay.
 
     Shapes: `blocks` (k, y, x).
     """
@@ -91,7 +91,7 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
 def _pictures(
     smooth: NDArray[np.float32], peaks: NDArray[np.int64], reach_px: float, noise: float
 ) -> NDArray[np.int64]:
-    """Count the pictures around each change; `noise` is that of the difference of two blocks."""
+    """Count the pictures around each change; `noise` is that of a difference of two blocks."""
     row, column = np.ogrid[: smooth.shape[1], : smooth.shape[2]]
     count = np.empty(len(peaks), dtype=np.int64)
     for number, (t, y, x) in enumerate(peaks.tolist()):
@@ -108,7 +108,7 @@ def _pictures(
 def _of_spots(
     blocks: NDArray[np.floating], peaks: NDArray[np.int64], spot_px: float
 ) -> NDArray[np.bool_]:
-    """Tell changes whose neighbouring pixels change as well from pixels that blink."""
+    """Tell changes in which neighbouring pixels take part from single pixels that blink."""
     least = least_beside(spot_px)
     real = np.ones(len(peaks), dtype=np.bool_)
     _, rows, columns = blocks.shape
@@ -130,7 +130,7 @@ def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) ->
 
 
 def least_beside(spot_px: float) -> float:
-    """Give the part of a particle's change that the pixels beside its centre have at least."""
+    """Give the smallest share of a change that the pixels next to its centre have."""
     return _SHARED * math.exp(-0.5 / spot_px**2)
 
 

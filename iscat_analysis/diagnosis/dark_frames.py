@@ -22,7 +22,7 @@ _NAMED = 4
 
 @dataclass(frozen=True, eq=False)
 class _DarkFramesReplaced:
-    """A movie some of whose frames are dark; attributes as those of a `Stack`."""
+    """A movie in which dark frames are replaced; attributes as those of a `Stack`."""
 
     source: Stack
     frames: NDArray[np.int64]
@@ -60,7 +60,7 @@ class _DarkFramesReplaced:
 
 
 def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, str]:
-    """Leave frames out of sums in which a part of the light is missing, and name the dark ones."""
+    """Leave frames with missing light out of sums, and list the dark ones."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     power = windows.power
     usual = float(np.median(power))

@@ -26,7 +26,7 @@ _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
-    """Measure noise against averaging, and how far the fixed pattern moved."""
+    """Measure the noise against averaging, and how far the fixed pattern moved."""
     curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
     limit = drift = error = None
     if windows.n_before >= 2 and is_lit(windows):
@@ -49,10 +49,10 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
 
 
 def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
-    """Give how far the pattern moved along y and x, and the errors; None where there is none.
+    """Measure the shift of the pattern along y and x, and its errors; None without a pattern.
 
-    A particle changes the light at its place as an edge that moved does, but in every part of the
-    field another way: the errors are at least what the parts differ by.
+    A particle changes the light like an edge that moved, but differently in every part of the
+    field.  The errors are therefore at least the differences between parts.
     """
     rows, columns = windows.before_e.shape
     whole = _part_moved(windows, np.s_[:rows, :columns])
@@ -91,7 +91,7 @@ def _part_moved(
 
 
 def drift_warning(name: str, background: dict[str, Any]) -> str | None:
-    """Say that the fixed pattern moved, where that can be taken for particles."""
+    """Warn that the fixed pattern moved, where that can be taken for particles."""
     if background["drift_px"] is None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]

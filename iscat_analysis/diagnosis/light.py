@@ -1,4 +1,4 @@
-"""The light before anything is searched: pixels, lines and a smooth part that are unsteady."""
+"""Unsteady pixels and unsteady light, found before anything is searched."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
 class Pair(NamedTuple):
-    """Frames next to each other, and others a window later."""
+    """Two sets of successive frames, the second a window later than the first."""
 
     first: int
     before: NDArray[Any]
@@ -45,7 +45,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class JudgedLight:
-    """A movie whose light and pixels were looked at."""
+    """A movie without its unsteady pixels, and with its unsteady light divided out."""
 
     movie: Stack
     lines: Lines | None
@@ -54,7 +54,7 @@ class JudgedLight:
 
 
 def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
-    """Look for pixels and for parts of the light that are unsteady."""
+    """Find pixels and parts of the light that are unsteady."""
     if config.optics.scheme == "darkfield":
         return JudgedLight(movie, None, (), movie)
     pairs, window = _pairs(movie, config, camera)
@@ -78,7 +78,7 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
 def judge_lines(
     movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
 ) -> Lines | None:
-    """Look for rows, columns and a smooth part of the light that may be divided out."""
+    """Find rows, columns and smooth light that change and may be divided out."""
     background = config.background
     mode = background_mode(config)
     if (
@@ -99,7 +99,7 @@ def judge_lines(
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
-    """Give the frames of pairs that have none in common."""
+    """Select frames of pairs that have no frame in common."""
     parts = sorted(
         (part for p in pairs for part in ((p.first, p.before), (p.later, p.after))),
         key=lambda part: part[0],

@@ -1,4 +1,4 @@
-"""The noise before anything is searched: camera, correlation of pixels, length of the windows."""
+"""The noise before anything is searched: camera, correlation of pixels, window length."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _LESS = 0.75  # of the noise, which small pictures leave over by chance at least
 
 @dataclass(frozen=True)
 class Noise:
-    """What some frames without particles, or nearly so, say of the noise."""
+    """The noise of frames without particles, compared with the camera's numbers."""
 
     messages: tuple[str, ...] = ()
     differs: bool = False
@@ -66,16 +66,16 @@ class Noise:
     shakes: bool = False
 
     def messages_of(self, name: str) -> Iterator[str]:
-        """Give what the user should know."""
+        """List the messages for the user."""
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
         yield from self.messages
 
     def compared_with_fits(self, chi2: FloatArray) -> Noise:
-        """Hold what noise around particles is said to be against what fits of them leave over.
+        """Withdraw an excess of noise that the fits of particles do not show.
 
-        Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
-        what a wrong model leaves over of rings, or the blur of motion.
+        Too much noise is in all fits alike.  Where some fits leave less, the excess is the residual
+        of a wrong model, or blur of moving particles.
 
         Shapes: `chi2` (n,).
         """
@@ -151,7 +151,7 @@ def judge_counts(
 
 
 def _filtered(shared: float) -> str:
-    """Say that frames are no independent measurements."""
+    """Say that successive frames are not independent measurements."""
     return (
         f"frames next to each other differ by {shared:.2g} times the variance of those farther "
         "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
@@ -162,7 +162,7 @@ def _filtered(shared: float) -> str:
 def judge_background(
     movie: Stack, camera: Camera, windows: Windows, *, still: bool, additive: bool
 ) -> Noise:
-    """Judge the noise of the background frames; where it is known, of those with the particles."""
+    """Judge the noise of the background, or of the fitted frames where the background is known."""
     frames = windows.n_before or (windows.n_after if still else 0)
     if frames < 2 or not is_lit(windows):
         return Noise()
@@ -211,7 +211,7 @@ def judge_beside(
 
 @dataclass(frozen=True)
 class NoiseSurvey:
-    """What the first frames of a landing movie say, and the frames themselves."""
+    """The noise of the first frames of a landing movie, and a reader of all frames."""
 
     reader: Reader
     noise: Noise
@@ -220,7 +220,7 @@ class NoiseSurvey:
 
 
 def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
-    """Judge the noise of a landing movie, and choose how many frames around a step are summed."""
+    """Judge the noise of a landing movie, and choose the window."""
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
         mapper = over_frames(pool, reader.shape)
@@ -278,7 +278,7 @@ def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
 
 
 def is_lit(windows: Windows) -> bool:
-    """Tell whether there is light in the background, beyond the read noise."""
+    """Tell whether the background has more light than read noise."""
     used = ~windows.masked
     light, read = windows.before_e[used], windows.read_variance_before_e2[used]
     return bool(light.sum() > read.sum())

@@ -1,4 +1,4 @@
-"""Whether the stage moves, before anything is searched: what the fixed pattern tells of it."""
+"""Motion of the stage, as the fixed pattern shows it before anything is searched."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _LEAST_VARIANCE_SHARE = 0.03
 
 
 def with_drift_correction(config: Config, *, moves: bool) -> Config:
-    """Settle whether the motion of the fixed pattern is divided out."""
+    """Set in the configuration whether the motion of the fixed pattern is divided out."""
     background = config.background.model_copy(update={"drift_correction": moves})
     return config.model_copy(update={"background": background})
 
 
 def motion_message(movie: FrameSource, opening: NoiseSurvey) -> str:
-    """Say that the fixed pattern of a landing movie moves."""
+    """Say that the fixed pattern of a landing movie moves; empty where it does not."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"
     reader, length = opening.reader, opening.curve.frames[-1]

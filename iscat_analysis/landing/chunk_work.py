@@ -1,4 +1,4 @@
-"""One chunk of a landing movie: its models, its steps and their fits, in whatever process."""
+"""One chunk of a landing movie: its models, its steps and their fits, in any process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from iscat_analysis.threads import threads
 
 @dataclass(frozen=True)
 class ChunkSetting:
-    """What the chunks of a movie have in common, for a process that can read its file."""
+    """What all chunks of a movie share, so that any process can read and analyse one."""
 
     frames: CountSource
     camera: Camera
@@ -70,7 +70,7 @@ def chunk_job(
     *,
     progress: Progress = silent,
 ) -> FinishedChunk:
-    """Analyse one chunk from the movie's file."""
+    """Open the movie and analyse one chunk."""
     with threads(setting.config.compute.workers) as pool:
         chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)

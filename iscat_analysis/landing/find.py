@@ -76,10 +76,10 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
 
 
 def with_learned_heights(ready: Prepared, run: Run) -> Config:
-    """Learn mean and spread of the heights, where that is left open, from the first frames.
+    """Learn mean and spread of the heights from the first frames, where these are left open.
 
-    There they are searched with a prior so wide that the light decides; what it does not tell
-    stays with that prior.
+    These frames are analysed with a prior so wide that the light determines the heights.  A number
+    that the light does not determine keeps its prior.
     """
     config = ready.config
     particle = config.particle
@@ -257,7 +257,10 @@ def _finished(
     merged: MergedChunks,
     posterior: bool,
 ) -> Generator[tuple[int, bool]]:
-    """Finish chunks and merge them in their order, whichever comes first.
+    """Finish chunks and merge them in order, in whatever order they come.
+
+    Yields the number of finished frames, and whether a chunk was interrupted.  With posteriors,
+    chunks run one after another, because each may sample as many as those before it left over.
 
     Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
     has the posteriors that those before it left to sample: with posteriors, one follows another.
@@ -284,7 +287,7 @@ def _finished(
 
 
 def _median_snr(table: pd.DataFrame) -> float:
-    """Give the signal-to-noise ratio of the particle in the middle; 0 where there is none."""
+    """Median signal-to-noise ratio of the particles; 0 where there is none."""
     good = table["snr"][table["status"] == Status.OK] if len(table) else []
     return float(np.median(good)) if len(good) else 0.0
 
@@ -296,7 +299,7 @@ def _counted(table: pd.DataFrame) -> dict[str, int]:
 
 
 def _trajectory_summary(trajectory: Trajectory | None) -> dict[str, Any]:
-    """Give what the summary says of a trajectory."""
+    """Summarise a trajectory of the fixed pattern."""
     if trajectory is None:
         return {
             "drift_corrected": False,

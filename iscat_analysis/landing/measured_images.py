@@ -75,9 +75,10 @@ def with_measured_images(
 
 
 def _hides_others(step: Step, threshold: float) -> bool:
-    """Whether what is left over hides others: a little of much, or nearly all of a picture.
+    """Whether the misfit of a step could hide others.
 
-    What is between these may be two particles that land at once.
+    It does if the model misses a little of a very bright picture, or nearly all of a picture.  In
+    between it may be two particles that land at once.
     """
     described = step.excess < _LITTLE * step.snr**2
     if described and RINGS * step.start.snr > threshold:
@@ -86,7 +87,7 @@ def _hides_others(step: Step, threshold: float) -> bool:
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
-    """Whether a step lies in the middle of the picture of a brighter one, and at its time."""
+    """Whether a step is in the middle of the picture of a brighter step, at the same time."""
     near = distance_px(step, brighter) < 2 * _LARGEST_SHIFT_SHARE * roi_px
     return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
 
@@ -99,7 +100,7 @@ def _measured(
     window: int,
     roi_px: int,
 ) -> Step:
-    """Replace a step's picture by the measured one; it stays where there are no frames for it."""
+    """Replace the picture of a step by the measured one, if there are frames for that."""
     rows, columns = ((part.start, part.stop) for part in neighbours.box(step))
     frame, gap = step.at.frame, min(step.at.gap, window // 5)
     begin, end = max(frame - window, chunk.first), min(frame + window, chunk.stop)

@@ -1,4 +1,4 @@
-"""Finished chunks of a landing movie, joined again: each event once, in order of frame."""
+"""Finished chunks of a landing movie, merged: each event once, in order of frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
 @dataclass(frozen=True)
 class FinishedChunk:
-    """What is kept of a finished chunk."""
+    """The results of a chunk that are kept."""
 
     core: tuple[int, int]
     lines: pd.DataFrame  # of fits.csv, which have no numbers yet
@@ -62,17 +62,17 @@ class MergedChunks:
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
 
     def note(self, number: int, done: FinishedChunk) -> None:
-        """Note when the events of a finished chunk happen, whose turn may not have come yet."""
+        """Register the events of a finished chunk, which may not be the next one in order."""
         frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
         self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
 
     def earlier(self, number: int, frame: int) -> int:
-        """Count the events before a frame, of the finished chunks before one."""
+        """Count the events before a frame in finished chunks before a given one."""
         known = list(self._dated.items())  # other threads note theirs
         return sum(int((dated < frame).sum()) for n, dated in known if n < number)
 
     def add(self, done: FinishedChunk) -> None:
-        """Take one more."""
+        """Append the next chunk."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
         self.sampled += done.sampled
@@ -129,7 +129,7 @@ class MergedChunks:
         return Searched.joined([d.searched for d in self._done if d.searched is not None])
 
     def light(self) -> FloatArray:
-        """Light of the frames that are done; NaN where one was left out."""
+        """Light of the finished frames; NaN where one was left out."""
         return np.concatenate([np.empty(0), *(done.light for done in self._done)])
 
     def left_out(self) -> int:
@@ -142,7 +142,7 @@ class MergedChunks:
         return np.flatnonzero(~good.astype(np.bool_))
 
     def trajectory(self) -> Trajectory | None:
-        """Way of the fixed pattern through all chunks that followed it; None where none did."""
+        """Trajectory of the fixed pattern through all chunks; None where none was followed."""
         parts: list[Trajectory] = []
         way: Trajectory | None = None  # the chunk before, halo included
         for done in self._done:
@@ -166,7 +166,7 @@ class MergedChunks:
         )
 
     def unfollowed(self) -> list[tuple[int, int]]:
-        """Frames of chunks in which no motion was looked for, or there was no pattern to follow."""
+        """Frames of chunks in which the motion was not followed, or that had no pattern."""
         return [done.core for done in self._done if done.trajectory is None]
 
     def drift(self) -> list[float] | None:

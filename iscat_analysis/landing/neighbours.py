@@ -52,7 +52,7 @@ class Step:
 
 
 class Neighbours:
-    """Which steps see each other, and how."""
+    """Which steps overlap, and the light of a step in the frames of another."""
 
     def __init__(
         self,
@@ -194,7 +194,7 @@ class Neighbours:
         add_image(total, step.corner, image, share)
 
     def _present(self, step: Step, frames: slice) -> slice:
-        """Give those of the frames in which the particle is there; all if it is there in none."""
+        """Select the frames in which the particle is there; all frames if it is in none."""
         turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
         part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
         return part if part.start < part.stop else frames
@@ -215,7 +215,7 @@ class Neighbours:
         return seen
 
     def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
-        """For each step, others that its fit should know of, and those that it depends on."""
+        """List for each step the others that its fit must include, and those that it depends on."""
         x, y, frame = (
             np.array(values, dtype=float)
             for values in zip(

@@ -1,4 +1,4 @@
-"""What is odd about the frames of a landing movie, in words."""
+"""Warnings about dark, repeated and shifted frames of a landing movie."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def frame_warnings(
     *,
     corrected: bool = False,
 ) -> Iterator[str]:
-    """Say what is odd about the frames.
+    """Warn of frames that were left out and of motion of the pattern.
 
     Shapes: `light` (t,).
     """
@@ -63,7 +63,7 @@ def frame_warnings(
 def _drift_warnings(
     name: str, merged: MergedChunks, drift: list[float] | None, windows: float, corrected: bool
 ) -> Iterator[str]:
-    """Say how the fixed pattern moved, and what was done about it."""
+    """Say how the fixed pattern moved, and whether its motion was divided out."""
     way = merged.trajectory()
     if way is not None and drift is not None:
         yield (

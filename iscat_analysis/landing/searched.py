@@ -1,8 +1,8 @@
-"""Which part of field and time was searched, and for particles of what signal-to-noise ratio.
+"""The part of field and time that was searched, for each signal-to-noise ratio.
 
-Beside a bright step a particle must be higher than what the fits left over there, and it waits as
-long as something much higher in the same frames was neither fitted nor subtracted.  What is asked
-of a peak at each place and boundary is the largest of these and the threshold of the search.
+A particle near a bright step must exceed the residual of the fit there.  It also waits as long as a
+much higher peak of the same frames is neither fitted nor subtracted.  The level that a peak needs
+at a place and boundary is the larger of these and the threshold of the search.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def searched_shares(
 
 
 def _raise_near_unsubtracted(asked: FloatArray, peak: Peak, roi_px: int) -> None:
-    """Ask of others what they must exceed not to wait for a peak that was not subtracted."""
+    """Raise the needed level around a peak that was not subtracted."""
     for half, share in ((LARGEST_IMAGE * roi_px, FAR_LOBE), (roi_px, SIDELOBE)):
         box = tuple(
             slice(max(math.ceil(c - half), 0), max(math.floor(c + half) + 1, 0))
@@ -123,7 +123,7 @@ def _raise_near_unsubtracted(asked: FloatArray, peak: Peak, roi_px: int) -> None
 def _raise_near_fitted(
     asked: FloatArray, step: Step, snr: NDArray[Any], inside: float, roi_px: int
 ) -> None:
-    """Ask what the fit of a bright step left over, along rings around it and in its region."""
+    """Raise the needed level around a bright step, by the residual of its fit."""
     centre = step.start.x_px, step.start.y_px
     y, x = (np.arange(n) - c for n, c in zip(asked.shape, centre[::-1], strict=True))
     away = np.hypot(y[:, None], x[None, :])

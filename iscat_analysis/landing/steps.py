@@ -59,7 +59,7 @@ _MUCH = 5.0  # times the mass of a step that another has, of whose light it may 
 
 @dataclass(frozen=True)
 class StepEvent:
-    """A step that was fitted for good, and what its frames say beside it."""
+    """A step after its last fit, with the estimates from parts of its frames."""
 
     event: Event
     step: Step
@@ -228,7 +228,7 @@ class ChunkFitter:
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
-        """Fit the chosen steps at the heights that they have, each with the others as they were."""
+        """Fit the chosen steps at their present heights, with the others fixed."""
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
@@ -248,7 +248,7 @@ class ChunkFitter:
     def _lifted(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
-        """Fit the chosen steps at all heights, so that their rings are those of their own."""
+        """Fit the chosen steps at all heights, so that the rings fit too."""
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
@@ -277,13 +277,13 @@ class ChunkFitter:
         return refitted
 
     def _seated(self, step: Step) -> Candidate:
-        """Put a step where a particle of its mass is expected, unless its height is free."""
+        """Set the height of a step to the expected one, unless its height is free."""
         if "z_nm" in FREE_PARAMETERS[self._context.mode]:
             return step.start
         return replace(step.start, z_nm=self._context.height_nm(step.start.mass_kda))
 
     def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
-        """Put a step where a fit found it."""
+        """Set a step to its fitted position."""
         likelihood, (y_px, x_px) = task.likelihood, task.offset_px
         pixel = self._context.pixel_nm
         start = replace(
@@ -303,7 +303,7 @@ class ChunkFitter:
 
     @property
     def _quick_mode(self) -> str:
-        """Where z is free it is found after place and mass, from all heights at once."""
+        """Mode of the first fits: a free z is held, and found later from all heights at once."""
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
 
     def _finish(
@@ -344,7 +344,7 @@ class ChunkFitter:
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
-        """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
+        """Judge all steps, including side lobes and steps that explain less than they leave."""
         steps = [own.fitted.step for own in finished]
         described = [own.fitted.event.described for own in finished]
         frame = np.array([step.at.frame for step in steps])
@@ -368,7 +368,7 @@ class ChunkFitter:
         return judged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
-        """Leave out what the others explain, and the weaker of two steps that describe one."""
+        """Drop steps that others explain, and the weaker of two that describe one particle."""
         steps = sorted(steps, key=lambda s: -s.start.snr)
         sign = np.array([s.sign for s in steps])
         frame = np.array([s.at.frame for s in steps])

@@ -1,4 +1,4 @@
-"""Particles that stand against a background recorded before them, or against a known level."""
+"""Particles on top of a background that was recorded before they bound, or whose level is known."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of 
 
 
 def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
-    """Find particles in the frames after a background, together or, in mode track, one by one."""
+    """Find particles in the frames after a background; mode track fits each frame by itself."""
     ready, windows = _sum_frames(ready, run)
     context, noise, summary, doubt = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera
@@ -102,9 +102,9 @@ def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
 def _background(
     ready: Prepared, run: Run, windows: Windows
 ) -> tuple[AnalysisContext, Noise, dict[str, Any], str]:
-    """Make the models, and judge the noise, pixels and drift of the background.
+    """Make the models, and judge noise, pixels and drift of the background.
 
-    The last is why it may not be the background of these frames; empty where it is.
+    Also returned is why it may not be the background of these frames; empty where it is.
     """
     movie, config, camera = ready.steady, ready.config, ready.camera
     after = windows.frames_after
@@ -139,7 +139,7 @@ def _background(
 def _judge_beside_particles(
     ready: Prepared, context: AnalysisContext, windows: Windows, table: pd.DataFrame
 ) -> Noise:
-    """Judge the camera where the background is known and all frames hold particles that move."""
+    """Judge the camera in pixels that no moving particle comes near; the background is known."""
     movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
     frame = table["frame"].to_numpy(np.int64)
     particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)
@@ -170,7 +170,7 @@ def _fit_together(
     summary: dict[str, Any],
     pool: ThreadPoolExecutor,
 ) -> DetectionResult:
-    """Find, fit and sample the particles that are there in all frames after the background."""
+    """Find and fit the particles that are there in all frames, and sample their posteriors."""
     events, windows = fit_field(
         context, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
     )
@@ -216,7 +216,7 @@ def _fit_together(
 def _uneven_message(
     context: AnalysisContext, name: str, windows: Windows, events: Sequence[Event]
 ) -> str:
-    """Say that a known background is uneven, away from the particles that were fitted over it."""
+    """Say that a known background is uneven, where no particle was fitted."""
     if windows.n_before:
         return ""
     rows, columns = windows.after_e.shape

@@ -1,4 +1,4 @@
-"""From what was found to what is reported: errors, tracks, summary; the same for all movies."""
+"""From the results to the report: errors, tracks and summary, in the same way for all movies."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def make_analysis(
     started: str,
     interrupted: bool,
 ) -> Analysis:
-    """Gather everything that is reported of a movie."""
+    """Put everything that is reported of a movie into an `Analysis`."""
     progress = run.progress
     if interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)
@@ -184,9 +184,9 @@ def make_analysis(
 
 
 def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Give the frames of both ranges in their order, and where the light of each stands.
+    """Sort the frames of both ranges, each once, and give the index of each in the power.
 
-    Where particles move, both ranges are the whole movie, and each frame stands there twice.
+    Where particles move, both ranges are the whole movie, so that every frame is in it twice.
     """
     ranges = compared.frames_before, compared.frames_after
     both = np.concatenate([np.arange(*span, dtype=np.int64) for span in ranges])

@@ -107,7 +107,7 @@ class InjectedMovie:
         return counts
 
     def _mover(self, particle: Injected) -> Callable[[int], FloatArray]:
-        """Give what makes a particle's contrast in a frame."""
+        """Make the function that gives the contrast of a particle in a frame."""
         way = self._trajectory
         if way is None:
             return lambda _: particle.contrast
@@ -138,7 +138,7 @@ def _with_particle(
 
 
 def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[str, Any], bool]:
-    """Tell how many known particles are found, and how well they are measured."""
+    """Summarise how many injected particles are found, and how well they are measured."""
     if not run.inject or found.interrupted:
         return {}, False
     try:
@@ -204,7 +204,7 @@ def draw_particles(
     table: pd.DataFrame,
     seed: int,
 ) -> list[Injected]:
-    """Choose what to add: anywhere, at any time, of masses as they were found."""
+    """Draw random places, times and masses, the masses from those that were found."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
     good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
     if not good.size:

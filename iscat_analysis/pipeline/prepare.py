@@ -142,7 +142,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
 
 
 def _with_standards(config: Config, run: Run) -> Config:
-    """Say once that a gradient came without the optics of its standards, and where it is taken."""
+    """Say where the gradient is taken whose standards have no recorded optics."""
     found = with_standards(config)
     if found is not config:
         optics = found.optics
@@ -158,10 +158,10 @@ def _with_standards(config: Config, run: Run) -> Config:
 def _landing_light(
     movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
 ) -> tuple[JudgedLight, NoiseSurvey, str]:
-    """Judge the light of a landing movie and, in steady light, noise and motion of some frames.
+    """Judge the light of a landing movie, and its noise and motion once the light is steady.
 
-    Motion is looked for where that is left open, and told in words.  The first chunk, which is
-    wanted next, is summed while the light is still being judged.
+    The message about motion is empty where drift correction was configured or nothing moves.  The
+    first chunk, which is needed next, is summed while the light is still being judged.
     """
 
     def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
@@ -181,13 +181,13 @@ def _landing_light(
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:
-    """Refuse frames that are all the same: they have no noise, by which everything is judged."""
+    """Refuse identical frames: without noise no error can be estimated."""
     if len(counts) > 1 and all(np.array_equal(frame, counts[0]) for frame in counts[1:]):
         raise DataError(f"{name} are all the same; export the movie again")
 
 
 def _refuse_what_only_slides(run: Run, name: str) -> None:
-    """Say that workers are left idle, and refuse to inject particles."""
+    """Refuse to inject particles, and say that workers are idle, where windows do not slide."""
     if run.executor.distant:
         run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
     if run.inject:

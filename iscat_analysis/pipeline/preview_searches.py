@@ -1,4 +1,4 @@
-"""Three ways to look at some frames: as a landing movie, over a background, and one by one."""
+"""The searches of a preview, one for each background mode, and what they find."""
 
 from __future__ import annotations
 
@@ -110,21 +110,21 @@ class Look:
 
 
 class Search(Protocol):
-    """One way to search; each belongs to a kind of movie."""
+    """A search for one background mode."""
 
     window: int
     longest: int
     frames: tuple[int, int]
 
     def context(self, window: int) -> AnalysisContext:
-        """Give models and threshold for windows of a length."""
+        """Give models and threshold for windows of `window` frames."""
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the frames around one."""
+        """Search the frames around one."""
 
 
 class LandingSearch:
-    """What lands or leaves between two windows of a landing movie."""
+    """Searches for particles that land or leave between two windows."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self.frames = first, last = fitted_frames(movie, config)
@@ -145,7 +145,7 @@ class LandingSearch:
         self.context = context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the windows before and after the boundary at which a frame begins."""
+        """Compare the windows before and after the boundary at which a frame begins."""
         first, last = self.frames
         stride = stride_of(window)
         frame = min(max(frame, first + stride), last - stride)
@@ -198,7 +198,7 @@ class LandingSearch:
 
 
 class BeforeAfterSearch:
-    """What is there in some frames and was not in the background."""
+    """Searches for particles that were not in the background."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -229,7 +229,7 @@ class BeforeAfterSearch:
         return self._context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the frames from one on, over the background."""
+        """Compare the frames from one on with the background."""
         context, known = self._context, self._windows
         frame = min(max(frame, self.frames[0]), self.frames[1] - window)
         part = measure_windows(
@@ -266,7 +266,7 @@ class BeforeAfterSearch:
 
 
 class MovingSearch:
-    """What is in one frame and not in the median of the frames around it."""
+    """Searches single frames for particles that are not in the median of the frames around."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -293,7 +293,7 @@ class MovingSearch:
         return self._context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at one frame over the median of those around it."""
+        """Compare one frame with the median of those around it."""
         first, last = self.frames
         window = max(window, min(LEAST_FRAMES, last - first))
         frame = min(max(frame, first), last - 1)
@@ -330,14 +330,14 @@ def _with_threshold(context: AnalysisContext, threshold: float) -> AnalysisConte
 
 
 def _candidate_table(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
-    """Make a table, strongest first."""
+    """Make a table of candidates, the strongest first."""
     values = np.array([tuple(map(float, row)) for row in rows]).reshape(-1, len(FOUND_COLUMNS))
     order = np.argsort(-np.abs(values[:, FOUND_COLUMNS.index("snr")]), kind="stable")
     return pd.DataFrame(values[order], columns=list(FOUND_COLUMNS))
 
 
 def positive_threshold(threshold: float) -> float:
-    """Refuse a threshold that is none."""
+    """Refuse a threshold that is no positive number."""
     if not (math.isfinite(threshold) and threshold > 0):
         raise ConfigError(f"threshold = {threshold:g} must be a positive signal-to-noise ratio")
     return threshold

@@ -1,8 +1,8 @@
-"""Images of events that were fitted before: the frames of the fit, summed and fitted again.
+"""Images of events of a stored result, made again from the movie.
 
-A result keeps numbers.  With its movie, the counts that a fit saw are summed again, the other
-events of the table are in their places, and the fit, begun where it ended, gives the images that
-the report has.
+A result keeps numbers only.  With its movie, the counts of an event are summed again, the other
+events of the table are put in their places, and a fit that starts at the stored estimate gives the
+images of the report.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def redraw(
     tracks: pd.DataFrame | None,
     summary: Mapping[str, Any],
 ) -> Redraw:
-    """Prepare to draw the rows of a result."""
+    """Make the function that draws the rows of a result."""
     movie = linear(movie, config.camera)
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     judged = judge_light(movie, config, camera)
@@ -88,7 +88,7 @@ def _landings(
     table: pd.DataFrame,
     window: int,
 ) -> Redraw:
-    """Draw what landed or left: windows before and after, in a chunk of their own."""
+    """Draw rows of a landing movie: the windows before and after each step."""
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = reader_of(frames, config, camera, (first, last))
@@ -124,7 +124,7 @@ def _landings(
 
 
 def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
-    """Make a step of a row of the table."""
+    """Make a `Step` of a row of the table."""
     frames = row["n_before"] * row["n_after"] / (row["n_before"] + row["n_after"])
     at = StepFrame(
         frame=int(row["frame"]), half_width=int(row["frame_ci95"]), height=1.0,
@@ -140,7 +140,7 @@ def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
 def _before_after(
     movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
 ) -> Redraw:
-    """Draw what is there after the background, or in mode ``track`` in a frame after it."""
+    """Draw rows over a recorded background; in mode ``track`` each in its frame."""
     before, after = frame_ranges(movie, config)
     tracked = config.fit.mode == "track"
     shape = (movie.shape[1], movie.shape[2])
@@ -199,7 +199,7 @@ def _moving(
     tracks: pd.DataFrame | None,
     blocks: int,
 ) -> Redraw:
-    """Draw particles in single frames, over the background of their block under all of them."""
+    """Draw particles in single frames, over the background of their block."""
     first, last = fitted_frames(movie, config)
     shape = movie.shape[1], movie.shape[2]
     context = tracking_context(config, shape, max(last - first, 1), lines)

@@ -1,9 +1,8 @@
-"""The rows of ``fits.csv``: fits get their errors from all that is known of them together, at once.
+"""The rows of ``fits.csv``, made when all events are known.
 
-A fit knows the error of its own likelihood.  What calibrations may be wrong by, what its frames
-show elsewhere, and how the spread of all fits compares with the bound is known when all are there;
-only then a row is made, and with ``fit.sigma = "measured"`` its σ is the measured one from the
-beginning.
+A fit knows the error of its own likelihood.  Calibration errors, the spread of an event's own
+frames and the ratio of the measured spread to the bound follow from all events together.  With
+``fit.sigma = "measured"`` the σ in a row is already the measured one.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 @dataclass(frozen=True)
 class ReportedRows:
-    """The rows of all events of a movie, and what they say together."""
+    """The rows of all events of a movie, and what all events together say."""
 
     table: pd.DataFrame
     achieved: Mapping[str, EmpiricalSpread]
@@ -88,7 +87,7 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
 
 
 def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
-    """Flag steps whose light may go on changing, and say what there is of that."""
+    """Flag steps whose light may still be changing, and describe that in a message."""
     fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
     if evidence is None:
         return fits, ""

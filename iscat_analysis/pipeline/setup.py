@@ -42,7 +42,7 @@ _MAD = 1.4826  # of normal numbers: standard deviation over median absolute devi
 
 @dataclass(frozen=True)
 class Question:
-    """What nobody but the user may know, and what is taken otherwise; None: it must be known."""
+    """A key that only the user may know, and its default; None where there is none."""
 
     key: str
     words: str
@@ -65,9 +65,9 @@ _CAMERA = ("camera.gain_e_per_adu", "camera.offset_adu", "camera.read_noise_e")
 
 @dataclass(frozen=True)
 class Value:
-    """A key of the configuration, its value, and where that comes from.
+    """A key of the configuration, its value, and its origin.
 
-    What is not `written` is shown in the file as a comment, and every movie tells it anew.
+    Where it is not `written`, the file has it as a comment, because it is read from each movie.
     """
 
     key: str
@@ -78,7 +78,7 @@ class Value:
 
     @property
     def shown(self) -> str:
-        """The value in words, with its standard error where there is one."""
+        """The value as text, with its standard error where there is one."""
         if isinstance(self.value, str):
             return self.value
         return f"{self.value:.4g}" + (f" ± {self.se:.2g}" if self.se else "")
@@ -160,7 +160,7 @@ def write_setup(
 
 
 def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
-    """Collect what answers and metadata say of what would be asked; answers win."""
+    """Collect values from answers and metadata; answers win."""
     known = []
     for question in _QUESTIONS:
         value = getattr(metadata, question.key.partition(".")[2], None)
@@ -174,7 +174,7 @@ def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -
 def _ask_the_rest(
     known: list[Value], ask: Callable[[Question], str] | None, warn: Callable[[str], None]
 ) -> tuple[list[Value], Config]:
-    """Put one question at a time, and once more where the answer cannot be."""
+    """Ask for each open key, again where an answer is invalid."""
     config = configure(None, settings={each.key: each.value for each in known})
     values = list(known)
     open_questions = [q for q in _QUESTIONS if q.key not in {each.key for each in known}]
@@ -198,7 +198,7 @@ def _ask_the_rest(
 
 
 def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Preview]:
-    """Take particles to move where the frames show it clearly, and to land otherwise."""
+    """Choose mode track where the frames clearly show moving particles, else keep the mode."""
     changes = look_at_changes(preview.steady, preview.config, preview.camera.camera, preview.frames)
     if not as_moving(changes, stack.name):
         return Value("fit.mode", config.fit.mode, DEFAULT), preview
@@ -207,7 +207,7 @@ def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Pre
 
 
 def _each_movie(metadata: StackMetadata) -> list[Value]:
-    """Show what the metadata of every movie say, and its configuration should not."""
+    """List values that each movie has in its own metadata, so that the file need not hold them."""
     stated = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
     return [
         Value(key, value, _origin_in_file(metadata), written=False)
@@ -217,7 +217,7 @@ def _each_movie(metadata: StackMetadata) -> list[Value]:
 
 
 def _camera_values(camera: LearnedCamera) -> list[Value]:
-    """Give the camera's numbers, which every movie tells anew."""
+    """List the numbers of the camera, which are measured anew in each movie."""
     values = []
     for key in _CAMERA:
         number = camera.numbers[key.partition(".")[2]]
@@ -227,7 +227,7 @@ def _camera_values(camera: LearnedCamera) -> list[Value]:
 
 
 def _search_preview(preview: Preview) -> dict[str, Any]:
-    """Search at places all over the movie that have no frame in common."""
+    """Search some frames all over the movie."""
     (first, last), window = preview.frames, preview.window
     apart = 1 if preview.config.fit.mode == "track" else window
     places = max(1, min(_PREVIEW_PLACES, (last - first) // (2 * apart)))
@@ -248,7 +248,7 @@ def _search_preview(preview: Preview) -> dict[str, Any]:
 
 
 def _spread(image: np.ndarray[Any, Any]) -> float:
-    """Give the standard deviation of the pixels, which a few particles do not change.
+    """Give the standard deviation of the pixels, robust against a few particles.
 
     Shapes: `image` (y, x).
     """
@@ -257,7 +257,7 @@ def _spread(image: np.ndarray[Any, Any]) -> float:
 
 
 def _toml_text(setup: Setup) -> str:
-    """Write the file: each value with what it is and where it comes from."""
+    """Write the file: each value, its meaning and its origin."""
     lines = [
         f"# Configuration for {in_toml(setup.movie)}, written by `iscat init`; iscat-fit finds it",
         "# where it lies beside a movie.  Behind each value stands where it comes from.  A line",
@@ -279,7 +279,7 @@ def _toml_text(setup: Setup) -> str:
 
 
 def _metadata_line(stack: Stack) -> str:
-    """Give in one line what the file says of itself."""
+    """Describe the metadata of the file in one line."""
     metadata = stack.metadata
     parts = [
         words.format(value)
@@ -310,7 +310,7 @@ def _config_value(config: Config, key: str) -> Any:
 
 
 def preview_lines(setup: Setup) -> list[str]:
-    """Say in a few lines what the search saw."""
+    """Describe in a few lines what the search found."""
     seen = setup.preview
     total, places = sum(seen["candidates"]), len(seen["frames"])
     moving = setup.config.fit.mode == "track"

@@ -1,4 +1,4 @@
-"""A result in its folder, and what its events looked like in the movie."""
+"""A stored result, and the images of its events, made again from the movie."""
 
 from __future__ import annotations
 

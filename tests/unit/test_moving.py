@@ -289,7 +289,7 @@ def test_rows_that_plain_steps_do_not_fit_are_fitted(
         asked.append(given)
         return search(*given)
 
-    monkeypatch.setattr(frame_fits, "_climb", climbed)
+    monkeypatch.setattr(frame_fits, "_fit_with_search", climbed)
     near, _, done = field.fit(ground, truth, sweeps=4)
     assert done.all()
     assert not asked

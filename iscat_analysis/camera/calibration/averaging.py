@@ -1,4 +1,4 @@
-"""Noise against averaging: how far longer averages go on following shot noise."""
+"""Noise of averages, and up to which length it follows shot noise."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _MEDIAN_VARIANCE = 2.333  # relative standard error of a variance from a median,
 def noise_curve(
     stack: FrameSource, found: Moments, used: BoolArray, result: Solution, progress: Progress
 ) -> pd.DataFrame:
-    """Set contrast noise between successive averages of 1, 2, 4 … frames against shot noise.
+    """Compare the noise between successive averages of 1, 2, 4 … frames with shot noise.
 
     Notes
     -----

@@ -66,10 +66,10 @@ _MOST_FILLED = 0.98  # of full scale, up to which the light follows from the cou
 
 @dataclass(frozen=True)
 class Law:
-    """A law and its number.
+    """A law of the counts and its number.
 
-    `value` is γ, N/F at the mean light, or the share s of the mean light; `offset` is the share
-    that an offset is wrong by besides; `contrast` is that measured over the true one, of a faint
+    `value` is γ, N/F at the mean light, or the share s of the mean light; `offset` is the share by
+    which the offset is wrong besides; `contrast` is the measured over the true contrast of a faint
     particle in the mean light.
     """
 
@@ -85,25 +85,25 @@ class Law:
 
     @property
     def bent(self) -> bool:
-        """Whether counts are no line in light, so that no offset makes masses right."""
+        """Whether counts are not linear in light, so that no offset makes masses right."""
         # that it is no chance is known already: a line describes the pixels clearly worse
         return self.kind in BENT and abs(1 - self.contrast) > TOLERANCE
 
     @property
     def dilutes(self) -> bool:
-        """Whether masses are wrong by an offset, or by light that no particle changes."""
+        """Whether an offset, or light that no particle changes, makes masses wrong."""
         wrong = abs(1 - self.contrast) > TOLERANCE + SIGMAS * self.contrast_se
         return self.kind in ("offset", "other light") and wrong
 
     @property
     def certain(self) -> bool:
-        """Whether it is known by how much masses are wrong: no other kind of law is as good."""
+        """Whether the error of masses is known, because no other kind of law fits as well."""
         return self.flickers or not self.alike
 
 
 @dataclass(frozen=True)
 class _Family:
-    """Laws of one kind: curves of light over its mean for a number, where it starts and ends."""
+    """Laws of one kind: their curve, and start and limits of their number."""
 
     kind: Kind
     curves: Callable[[FloatArray, float], Curves]
@@ -170,7 +170,7 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
 
 
 def _among(best: Law, alike: list[Law]) -> Law:
-    """Widen the error of a law by what others that are as good say of the contrast."""
+    """Widen the error of a law by the contrasts of other laws that fit as well."""
     kinds = tuple(law.kind for law in alike if law.kind != best.kind)
     if best.kind in BENT:
         alike = [law for law in alike if law.kind in BENT]
@@ -182,7 +182,7 @@ def _among(best: Law, alike: list[Law]) -> Law:
 
 
 def _residuals(found: Transfer, curves: Curves) -> FloatArray:
-    """Give what the best multiples of two curves leave over, in standard errors."""
+    """Residuals of the best multiples of two curves, in standard errors."""
     rest = []
     for seen, se, curve in (
         (found.variance, found.variance_se, curves[0]),
@@ -194,7 +194,7 @@ def _residuals(found: Transfer, curves: Curves) -> FloatArray:
 
 
 def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray) -> Law:
-    """Fit a law's number, and with an `offset` of one entry the share that is no light besides."""
+    """Fit the number of a law and, if `offset` has an entry, the share that is no light."""
 
     def residuals(theta: FloatArray) -> FloatArray:
         shift = float(theta[1]) if offset.size else 0.0

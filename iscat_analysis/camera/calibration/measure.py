@@ -1,4 +1,4 @@
-"""From recordings to a camera: what is read, left out, fitted and said."""
+"""From recordings to a calibration of the camera."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseS
 
 
 def _with_neighbours(result: Solution, spectrum: NoiseSpectrum, notes: list[str]) -> Solution:
-    """Judge the gain by the noise that neighbouring pixels have together."""
+    """Correct the gain for noise that neighbouring pixels share."""
     summed, error = (value / spectrum.variance for value in spectrum.summed)
     gain, scatter = result.gain.value / summed, math.sqrt(spectrum.alike) * result.gain.se
     x, y = spectrum.neighbours
@@ -219,7 +219,7 @@ def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool)
 
 
 def _glance(stack: FrameSource) -> NDArray[Any]:
-    """Return a few frames from all over the stack."""
+    """Read a few frames from all over the stack."""
     frames = stack.shape[0]
     places = np.unique(np.linspace(0, frames - 1, 16).astype(int))
     return np.concatenate([stack.read(int(k), int(k) + 1) for k in places])
@@ -228,7 +228,7 @@ def _glance(stack: FrameSource) -> NDArray[Any]:
 def _curve(
     found: Sequence[Moments], used: BoolArray, result: Solution, notes: list[str]
 ) -> pd.DataFrame:
-    """Variance against mean in bins of equally many pixels, each stack by itself."""
+    """Average variance against mean in bins of equally many pixels, for each stack."""
     rows = []
     for item in found:
         mean, variance = item.mean[used], item.variance[used]
@@ -261,7 +261,7 @@ def _maps(
     result: Solution,
     notes: list[str],
 ) -> dict[str, FloatArray]:
-    """One number per pixel; what is masked keeps the number of the whole sensor."""
+    """Make one number per pixel; masked pixels keep that of the whole sensor."""
     gain = result.gain.value
     offset = dark.mean if dark is not None else np.full(used.shape, result.offset.value)
     read = dark.variance if dark is not None else np.full(
@@ -299,7 +299,7 @@ def _maps(
 
 
 def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> CameraCalibration:
-    """Without light there is an offset and a read noise in counts, and no gain."""
+    """Calibrate without light: offset and read noise in counts, but no gain."""
     used = ~(masked["hot"] | masked["dead"])
     offset, read = dark_numbers(dark, used)
     note = "a dark alone gives no gain, so the read noise is in counts; add a flat or the movie"

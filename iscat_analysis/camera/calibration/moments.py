@@ -1,4 +1,4 @@
-"""One stack read once: mean and variance of every pixel, and how it follows the laser."""
+"""Mean and variance of every pixel of a stack, and its response to the laser."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def robust_sigma(deviations: FloatArray) -> float:
 
 
 def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
-    """Group pixels of like brightness, equally many in each group.
+    """Group pixels by brightness, equally many in each group.
 
     Shapes: `mean` (n,).
     """

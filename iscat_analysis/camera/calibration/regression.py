@@ -1,4 +1,4 @@
-"""From moments to a camera: variance against mean, and where the light is zero."""
+"""From moments to numbers of the camera: variance against mean, and the zero of the light."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ def _read_variance(line: tuple[float, float, FloatArray], offset: Estimate) -> _
 
 
 def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Estimate | None:
-    """Give the variance of the read noise of every other tile of the sensor [counts²]."""
+    """Read noise of every other tile of the sensor [counts²]."""
     y, x = np.indices(used.shape) // _TILE_PX
     part = used & ((y + x) % 2 == 0)
     if np.count_nonzero(part) < _LEAST_HALF:
@@ -175,7 +175,7 @@ def _unselected(whole: _ReadVariance, half: Estimate, threshold: float) -> Estim
 
 
 def _root(variance: Estimate) -> Estimate:
-    """Take the root of a variance, and off it that the mean of a root is below its own."""
+    """Root of a variance, corrected for the bias of a root."""
     root = math.sqrt(max(variance.value, variance.se / 4))
     relative = variance.se / root**2
     return Estimate(root * (1 + min(relative, 1.0) ** 2 / 8), root * relative / 2)
@@ -198,7 +198,7 @@ def _with_dark(
     used: BoolArray,
     n: int,
 ) -> Solution:
-    """Fit the slope alone: the dark gives every pixel's own offset and read noise."""
+    """Fit only the slope; the dark gives offset and read noise of every pixel."""
     light = mean - np.tile(dark.mean[used], n)
     shot = variance - np.tile(dark.variance[used], n)
     if light.mean() <= 0:
@@ -331,7 +331,7 @@ def _offset(
 
 
 def _together(score: FloatArray, tiles: NDArray[np.int64] | None) -> FloatArray:
-    """Add up the scores (n, k) of pixels that may differ from a line together."""
+    """Sum the scores (n, k) of pixels whose deviations may be correlated."""
     if tiles is None:
         return score
     return np.stack([np.bincount(tiles, weights=column) for column in score.T], axis=1)
