@@ -285,7 +285,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
 
 
 def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Landing:
-    """Read the sign of landing off the masses that the table has; dark where it has none."""
+    """Find the sign of landing from the masses of a table; dark where there are none."""
     product = contrast * mass
     product = product[np.isfinite(product)]
     return "bright" if product.size and float(np.median(product)) > 0 else "dark"

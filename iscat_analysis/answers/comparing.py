@@ -1,4 +1,4 @@
-"""Samples beside each other: which differ, in which masses and fractions."""
+"""Comparison of many samples: which ones differ, in masses or fractions."""
 
 from __future__ import annotations
 
@@ -278,7 +278,7 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
 
 
 def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[str]:
-    """Say what the tests do not hold."""
+    """List what the tests assume."""
     notes = list(dict.fromkeys(note for table in tables for note in table.remarks))
     if any(table.scale_error is not None for table in tables):
         notes.append(

@@ -267,7 +267,7 @@ def _gathered(
     ran: tuple[str, ...],
     failed: tuple[tuple[str, str], ...],
 ) -> Batch:
-    """Make tables and page of everything, unless they are there already."""
+    """Make tables and page of all results, unless they are up to date."""
     out = runner.out
     by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
     ordered = [by_path[row.path] for row in plan.table.rows]

@@ -1,6 +1,7 @@
-"""The calibrations of a day: camera from flats, optics and mass from calibrants.
+"""Calibrations of a batch: camera from flats, optics and masses from calibrants.
 
-What cannot be calibrated stays as configured, and is told: the movies go on.
+Where a calibration fails, the configuration is used, and the user is told; the movies are analysed
+all the same.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _OPTICS = (
 
 @dataclass(frozen=True)
 class Day:
-    """What the calibrations of a day found."""
+    """The calibrations of a batch."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     outcomes: Mapping[str, Outcome] = field(default_factory=dict)
@@ -44,7 +45,7 @@ class Day:
 
 
 def calibrate_day(plan: Plan, runner: Runner) -> Day:
-    """Make the calibrations of a day, as far as they are not made yet."""
+    """Make the calibrations of a batch that are not made yet."""
     settings: dict[str, Any] = {}
     outcomes: dict[str, Outcome] = {}
     failed: list[tuple[str, str]] = []
@@ -123,7 +124,7 @@ def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outco
 
 
 def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
-    """Read what a calibrant's analysis says of the optics; None where it could not tell."""
+    """Read the optics from the analysis of a calibrant; None where it could not test them."""
     if config.optics.file is not None:
         return None
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
@@ -138,7 +139,7 @@ def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
 
 
 def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outcome, dict[str, Any]]:
-    """Put the events of all calibrants together and fit the line through the standards."""
+    """Fit the line through the standards to the events of all calibrants."""
     if not tables:
         return Outcome("failed", "no calibrant could be analysed"), {}
     folder = runner.out / "calibration"
@@ -177,7 +178,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
 
 
 def _together(tables: Mapping[str, Path]) -> tuple[list[pd.DataFrame], Config]:
-    """Read the events of all calibrants, their contrasts as with the optics of the first."""
+    """Read the events of all calibrants, with contrasts converted to the optics of the first."""
     configs = {name: load_config(path.with_name("config.toml")) for name, path in tables.items()}
     first = next(iter(configs.values()))
     frames = []

@@ -1,4 +1,4 @@
-"""From the table to a plan: what each movie is called, and its configuration."""
+"""Names of results and configurations of movies, made from the table of a batch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Movie:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done."""
+    """The movies of a batch, their configurations and the names of their results."""
 
     table: Table
     config: Config
@@ -37,7 +37,7 @@ class Plan:
 def make_plan(
     table: Table, config: Config, standards: tuple[tuple[float, float], ...] = ()
 ) -> Plan:
-    """Lay out the work of a day."""
+    """Plan a batch."""
     for row in table.rows:
         try:
             configured(config, {}, row)

@@ -1,4 +1,4 @@
-"""How far a movie can be trusted, from what its result says: numbers, and cautions in words."""
+"""Quality of each movie of a batch: numbers, and warnings in words."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def judge(
     p_values: FloatArray,
     day: Day,
 ) -> dict[str, Any]:
-    """Judge one movie.
+    """Describe the quality of one movie.
 
     Shapes: `masses_kda` (n,), `p_values` (n,).
     """

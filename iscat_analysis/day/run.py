@@ -1,4 +1,4 @@
-"""One job at a time: what is finished is left alone, what fails costs only itself."""
+"""Jobs of a batch: finished ones are skipped, and a failure affects only its own job."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ State = Literal["done", "failed", "missing"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job."""
+    """Result of a job."""
 
     state: State
     why: str = ""

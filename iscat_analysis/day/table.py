@@ -230,7 +230,7 @@ def _names(source: Path, cells: list[str]) -> list[str]:
 
 
 def _check_names(source: Path, names: Sequence[str], where: str) -> None:
-    """Refuse a table without paths, and a column that is nearly one with a meaning."""
+    """Refuse a table without paths, and a column whose name is a misspelled key."""
     for name in names:
         near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_CLOSE)
         if near and name not in COLUMNS and near[0] not in names:

@@ -160,7 +160,7 @@ def _of_one_movie(progress: Progress) -> Progress:
 
 @dataclass
 class _MovieFiles:
-    """What was seen of a movie: its files, in how many looks since, and whether it can be read."""
+    """Files of a movie when last checked, the number of equal checks, and if it is readable."""
 
     state: State | None
     checks: int = 0
@@ -168,12 +168,12 @@ class _MovieFiles:
 
     @property
     def settled(self) -> bool:
-        """Whether it is to be waited for no longer."""
+        """Whether the movie is complete, or no longer waited for."""
         return self.checks >= MOST_CHECKS or (self.checks > 0 and self.readable)
 
 
 class _Folder:
-    """Looks at a folder."""
+    """A folder that is checked for new movies."""
 
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
         self._folder, self._out = folder, out
@@ -184,7 +184,7 @@ class _Folder:
         self._begun = False
 
     def check(self) -> Ready | None:
-        """Give the movies that are whole, and what tells them from later ones.
+        """Give the movies that are complete, and their states.
 
         None where there is none, or where one that was given before is being changed.
         """
@@ -229,14 +229,14 @@ class _Folder:
         return before
 
     def warn(self, text: str) -> None:
-        """Say something once."""
+        """Warn once of the same thing."""
         if text not in self._reported:
             self._reported.add(text)
             self._notify(text)
 
 
 def _state(address: Path) -> State | None:
-    """Give size and time of the files of a movie; None where it is not there."""
+    """Size and time of the files of a movie; None where there are none."""
     try:
         found = [(file, file.stat()) for file in files_of(address)]
     except OSError:
@@ -253,7 +253,7 @@ def _opens(address: Path) -> bool:
 
 
 class _Run:
-    """Brings a batch up to date, one movie after another, with a page in between now and then."""
+    """Keeps a batch up to date, movie by movie, and makes its page from time to time."""
 
     def __init__(
         self, analyse: Callable[..., Batch], standards: str | Sequence[float] | None, notify: Notify
@@ -264,7 +264,7 @@ class _Run:
         self._analysed: list[str] = []
 
     def bring_up_to_date(self, table: Table, stop: threading.Event) -> None:
-        """Analyse what is new or has changed."""
+        """Analyse movies that are new or have changed."""
         self._table = table
         number = sum(row.role != "flat" for row in table.rows)
         self._batch(table, only=(number + 1, number + 1))  # without a movie: the calibrations
@@ -287,7 +287,7 @@ class _Run:
             self._notify(f"{summary}; the page is {page.page}")
 
     def last_page(self, progress: Progress) -> Batch | None:
-        """Put everything that is finished on the page."""
+        """Make the page of everything that is finished."""
         if self._table is None:
             return None
         progress("report", 0, 1)

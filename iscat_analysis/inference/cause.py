@@ -90,7 +90,7 @@ _Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
 
 @dataclass(frozen=True)
 class Cause:
-    """What the residuals of several fits look like."""
+    """The change of the microscope that the residuals of several fits resemble."""
 
     name: str
     share: float
@@ -103,7 +103,7 @@ class Cause:
 
     @property
     def likeness(self) -> str:
-        """What the residuals look most like."""
+        """What the residuals resemble, in words."""
         by = ""
         if self.step is not None:
             steps = [_rounded(step) for step in (self.step, *self.other_steps)]
@@ -134,7 +134,7 @@ class Cause:
 def likely_cause(
     config: Config, fits: Sequence[tuple[Likelihood, FloatArray, BoolArray]]
 ) -> Cause | None:
-    """Name the part of the microscope whose change looks most like what fits left over."""
+    """Name the part of the microscope whose change resembles the residuals most."""
     if not fits or config.optics.convention != "exact":
         return None
     left = [_Left.of(*fit) for fit in fits]
@@ -168,9 +168,10 @@ def likely_cause(
 def _explained_by(
     config: Config, name: str, left: Sequence[_Left], excess: float
 ) -> list[tuple[float, float]]:
-    """Share of χ² in excess that a part of the microscope explains, and by what step.
+    """Share of the excess χ² that each step of a parameter explains, and that step.
 
-    The best first; others are as far away from it as pictures on the other side of focus are.
+    The best one comes first.  The others are local maxima, such as pictures on the other side of
+    focus.
     """
     reach = left[0].reach_nm
     changes = _neighbours(config, name, reach)
@@ -208,9 +209,9 @@ def _explained_by(
 def _peaks(
     best: tuple[float, float], whole: list[tuple[float, float]]
 ) -> list[tuple[float, float]]:
-    """Give the steps that explain more than those tried beside them, the best first.
+    """Find the steps that explain more than the neighbouring ones, the best first.
 
-    A step of first order takes the place of the one that is tried next to it, if it is better.
+    A step from a first-order fit replaces the neighbouring grid step if it explains more.
     """
     tops = [
         each
@@ -225,7 +226,7 @@ def _peaks(
 
 @dataclass(frozen=True)
 class _Left:
-    """What one fit left over, in standard deviations, without the directions of the fit."""
+    """Residual of one fit, in standard deviations, with the directions of the fit projected out."""
 
     grid: PixelGrid
     place: tuple[float, float, float, float]
@@ -264,21 +265,21 @@ class _Left:
         )  # fmt: skip
 
     def change(self, step: float, picture: _Picture) -> FloatArray:
-        """Give the change of the picture per unit of a step."""
+        """Change of the picture per unit of a step."""
         change = (picture(self.grid, *self.place) - self.signal)[self.used] * self.root / step
         return np.asarray(change - self.fitted @ (self.fitted.T @ change))
 
 
 def _rounded(step: float) -> str:
-    """Two digits, with the sign."""
+    """Write a number with two digits and its sign."""
     return f"{float(f'{step:.2g}'):+g}"
 
 
 def _angle(step: FloatArray) -> FloatArray:
-    """Give the angle by which a phase is off, of what it seems to be to first order [degrees].
+    """Convert a phase error from its first-order value to an angle [degrees].
 
-    A turned picture is cos Δ of the picture and sin Δ of what a small turn adds to it.  The fitted
-    mass has taken up the cosine, and per mass tan Δ is left over.
+    A picture turned by Δ is cos Δ of the picture plus sin Δ of its derivative.  The fitted mass
+    takes up the cosine, so that the residual per mass is tan Δ.
     """
     return np.degrees(np.arctan(np.radians(step)))
 
@@ -290,9 +291,9 @@ def _explained(
     *,
     whole: bool = False,
 ) -> tuple[float, FloatArray]:
-    """Share of χ² in excess that changes of the microscope explain, and how much of each.
+    """Share of the excess χ² that changes of the microscope explain, and their sizes.
 
-    `whole` changes are there or not: just one of them is taken.
+    Of changes that are `whole`, present or not, only one is taken.
     """
     slope, curvature = np.zeros(len(changes)), np.zeros((len(changes), len(changes)))
     for each in left:
@@ -308,10 +309,10 @@ def _explained(
 def _neighbours(
     config: Config, name: str, reach_nm: float, far: float | None = None
 ) -> list[tuple[float, _Picture]]:
-    """Give the microscopes that differ in one respect, and by how much; none where there are none.
+    """Give configurations that differ in one parameter of the microscope.
 
-    They are `far` away where that is given, else as in `_STEPS`.  There are none beyond what optics
-    can be, nor where particles that the configuration's line has dark would be bright.
+    They differ by `far` where it is given, else by `_STEPS`.  There are none where no optics have
+    such a value, or where particles would change their sign against the calibration line.
     """
     optics = config.optics
     if name == PIXEL:

@@ -61,11 +61,10 @@ def expected_maxima(
 
 
 def companions(u: float, ring: FloatArray, cell: float) -> float:
-    """Count the maxima of the other sign that a maximum brings with it.
+    """Give the expected number of maxima of the other sign that accompany a maximum.
 
     Where the field is correlated by r < 0 with that at a maximum of height v = u + 1/u, its mean is
-    −|r| v, and it passes −u more often there.  Once the maximum is fitted and taken off, it does
-    no more.
+    −|r| v, and it passes −u more often there.  That ends when the maximum is fitted and subtracted.
     """
     near = ring[ring < 0]
     spread = np.sqrt(1 - near**2)

@@ -85,7 +85,7 @@ def fit_stack(
     inject : int
         Known particles to add to a landing movie in a second run, which tells how many are found
         and how well they are measured; ``summary["injection"]``.
-    place : Place, optional
+    executor : Executor, optional
         Where the chunks of a landing movie are analysed; default in this process.
 
     Returns
@@ -109,8 +109,8 @@ def fit_stack(
     inject = int(number_in("`inject`", inject, least=0, whole=True))
     folder = path_beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
-    way = background_mode(config)
-    figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
+    mode = background_mode(config)
+    figures = FEW_FIGURES if mode == "sliding" else EVENT_FIGURES
     check_output(folder, overwrite)
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
@@ -126,7 +126,7 @@ def fit_stack(
                 inject=inject,
                 executor=executor,
             )
-        with parts_kept(None if way == "fixed" else partial):
+        with parts_kept(None if mode == "fixed" else partial):
             write_report(
                 analysis, folder, overwrite=overwrite, event_figures=figures, executor=executor
             )

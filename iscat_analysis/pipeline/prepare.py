@@ -49,7 +49,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         run.warn(note)
-    way = background_mode(config)
+    mode = background_mode(config)
     run.notify(describe_background_mode(config))
     span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
@@ -76,7 +76,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.warn(f"{movie.name}: {processing.message}")
     stop = min(stop, start + _OPENING, movie.shape[0])
     seen = movie.read(start, max(start, stop))
-    if way != "sliding":  # windows that slide pass over frames that repeat
+    if mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
     refuse_overflow(stored.read(start, max(start, stop)), movie.name)
     swapped = axes_warning(movie.name, seen)
@@ -89,7 +89,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     noise_survey: NoiseSurvey | None = None
 
     with one_thread_algebra():  # in all threads until the light is judged
-        if way == "sliding":
+        if mode == "sliding":
             judged, noise_survey, motion = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
                 config = with_drift_correction(config, moves=bool(motion))
@@ -106,7 +106,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     movie, lines, steady = judged.movie, judged.lines, judged.steady
     if lines is not None:
         summary["lines"] = lines.summary
-    if way == "sliding" or (tracked and unsteady):
+    if mode == "sliding" or (tracked and unsteady):
         changes_future = start_in_thread(look_at_changes, steady, config, camera, span)
     digest = movie.hashed()
     configured = config
@@ -133,10 +133,10 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
         if other_kind:
             run.warn(other_kind)
-    if way != "sliding":
+    if mode != "sliding":
         _refuse_what_only_slides(run, movie.name)
     return Prepared(
-        movie, steady, config, camera, way, lines, noise_survey, other_kind, digest, summary,
+        movie, steady, config, camera, mode, lines, noise_survey, other_kind, digest, summary,
         known.response, processing,
     )  # fmt: skip
 

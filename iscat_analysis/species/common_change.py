@@ -26,7 +26,7 @@ _SUSPECTS = 12  # that change most by themselves; two of these are left out in t
 def common_change(
     tracks: Sequence[tuple[FloatArray, FloatArray, FloatArray]], frames: tuple[int, int]
 ) -> float:
-    """Say by how much the masses of all tracks change together.
+    """Range of the relative change of all masses with time; 0 where none is significant.
 
     Shapes: `tracks` (n,).
     """

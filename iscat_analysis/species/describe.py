@@ -300,7 +300,7 @@ def _ladder(
     repeats: Sequence[Repeat],
     scale_error: Callable[[FloatArray], FloatArray] | None,
 ) -> LadderFit:
-    """Say what the monomer weighs."""
+    """Describe the mass of the monomer."""
     monomer, offset = choice.values(found)
     drawn = np.array([choice.values(found, r.mixture) for r in repeats]).reshape(-1, 2)
     error, low, high = (np.full(2, math.nan) for _ in range(3))
@@ -319,7 +319,7 @@ def _ladder(
 
 
 def _doubts(ladder: LadderFit | None) -> list[str]:
-    """Say where a ladder is none."""
+    """List reasons why the masses may be no ladder."""
     if ladder is None or not ladder.p_value < _NO_LADDER:
         return []
     return [
@@ -330,7 +330,7 @@ def _doubts(ladder: LadderFit | None) -> list[str]:
 
 
 def _residence(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
-    """Frames that a particle of each species must stay to be found every other time."""
+    """Frames that a particle of each species must stay for a detection probability of one half."""
     if window_frames is None or events.efficiency is None:
         return np.full(best.mean.shape, math.nan)
     with np.errstate(divide="ignore"):  # one of no mass is never found
@@ -339,13 +339,13 @@ def _residence(events: Events, best: Mixture, window_frames: int | None) -> Floa
 
 
 def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
-    """By how much an end of a 95 % interval moves when the error of the scale is added."""
+    """Distance by which the error of the scale moves an end of a 95 % interval."""
     reach = np.maximum(reach, 0.0)
     return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
 def _remarks(species: pd.DataFrame) -> list[str]:
-    """Say of which species not to believe everything."""
+    """List reasons to doubt single species."""
     if "background" in species:
         species = species[~species["background"]]
     undetectable = species["efficiency"] < LEAST_EFFICIENCY
@@ -378,7 +378,7 @@ def _remarks(species: pd.DataFrame) -> list[str]:
 
 
 def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
-    """Say for how long a particle must stay for its efficiency to be what the table says."""
+    """Say how long a particle must stay for its efficiency to be that of the table."""
     known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
     if window_frames is None or known.empty:
         return []
@@ -396,7 +396,7 @@ def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
 def _undescribed(
     events: Events, branch: Branch, draws: int, seed: int, notes: Sequence[str]
 ) -> Distribution:
-    """Events, but too few to say what they are."""
+    """Describe events that are too few for a mixture."""
     some = events.x.size > 0
     return Distribution(
         species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),

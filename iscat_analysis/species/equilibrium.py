@@ -177,7 +177,7 @@ class _Equilibrium(Series):
         )
 
     def logits(self, theta: FloatArray) -> FloatArray:
-        """Give the logits of the species, as the constants want them."""
+        """Logits of the species that follow from the constants."""
         values = dict(zip(self.names[self.own :], theta[self.own :], strict=True))
         return landing_logits(
             self.model, self.totals, math.exp(values["ln_kd"]), values.get("inactive", 0.0),

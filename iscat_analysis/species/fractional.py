@@ -49,14 +49,14 @@ class _There(NamedTuple):
 
 
 class Lags(NamedTuple):
-    """Every distance in time between two frames, in frames, and which pair has which."""
+    """All time differences between frames, in frames, and the index of the one of each pair."""
 
     distinct: FloatArray
     which: NDArray[np.int64]
 
     @classmethod
     def of(cls, track: Displacements) -> Lags:
-        """Find those of a track."""
+        """Collect those of a track."""
         pairs = np.abs(np.subtract.outer(track.frames, track.frames))
         longest = int(pairs[0, -1])
         if longest < pairs.size:  # few gaps or none: all lags up to the longest
@@ -95,7 +95,7 @@ def _powers(at: FloatArray) -> tuple[float, float]:
 
 
 def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArray, float]:
-    """Step to the vertex of the parabola within a range, and what the likelihood gains there."""
+    """Newton step inside a range, and the expected gain of the likelihood."""
     curvature = here.curvature
     if not (curvature[1, 1] > 0 and np.linalg.det(curvature) > 0):
         curvature = here.information
@@ -149,10 +149,10 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
 
 
 def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
-    """Invert a covariance by halves, and give the logarithm of its determinant.
+    """Invert a covariance by halves, and compute the logarithm of its determinant.
 
-    That is products almost alone, during which, unlike in LAPACK's own inverse as SciPy calls it,
-    other threads go on.
+    This needs little but matrix products.  These release other threads, which LAPACK's inverse, as
+    SciPy calls it, does not.
     """
     n = len(sigma)
     if n <= _SMALL:

@@ -59,7 +59,7 @@ _INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The events of one table within the window, and how its detector sees it.
+    """The events of one table inside the mass window, and its detector.
 
     Shapes: `x, noise` (n,), `size, kind_noise` (c,), `nodes, steps` (g,), `seen` (c, g).
     """
@@ -78,7 +78,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What all tables have in common, of parameters; `Series.shared` makes it."""
+    """Parameters that all tables share; `Series.shared` makes it."""
 
     mean: FloatArray
     variance: FloatArray
@@ -170,7 +170,7 @@ class Series(ABC):
         return np.array([self.ends[0], *gaps, self.ends[1]])
 
     def _hats(self, x: FloatArray) -> FloatArray:
-        """Densities of area 1 that are each linear from one middle to the next."""
+        """Triangular basis functions of area 1 on the middles."""
         found = np.array([np.interp(x, self.knots, row) for row in np.eye(self.knots.size)])
         step = np.diff(self.knots)
         area = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))
@@ -202,7 +202,7 @@ class Series(ABC):
         )  # fmt: skip
 
     def _priors(self) -> None:
-        """Middles and widths of what is known of combinations of parameters beforehand."""
+        """Mean and width of the prior of combinations of parameters."""
         lightest = float(self.masses.min())
         rows: list[tuple[dict[int, float], float, float]] = []
         place = self.parts
@@ -225,7 +225,7 @@ class Series(ABC):
         self.prior_middle = np.array([middle / width for _, middle, width in rows])
 
     def shared(self, theta: FloatArray) -> Shared:
-        """Give what parameters stand for."""
+        """Convert parameters to masses, widths and the shape of the background."""
         place = self.parts
         mean = self.composition @ theta[:place] + theta[place]
         light, heavy, tail = theta[place + 1 : place + 4]
@@ -249,7 +249,7 @@ class Series(ABC):
         return np.asarray(np.hstack([species, odds]) / (1 + odds))
 
     def value(self, theta: FloatArray, logits: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood with its priors, its slope, and that in the logits of the species.
+        """Log-likelihood with its priors, its gradient, and that in the logits of the species.
 
         Shapes: `theta` (at least `own`,), `logits` (tables, k), slopes (own,) and (tables, k).
         """
@@ -315,7 +315,7 @@ class Series(ABC):
 
 
 class Free(Series):
-    """A series whose weights are free in every table: their logits follow the other parameters."""
+    """A series whose weights are free in every table."""
 
     def __init__(
         self, tables: Sequence[Events], composition: FloatArray, masses: FloatArray

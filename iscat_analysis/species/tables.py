@@ -90,7 +90,10 @@ class EventTable:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the user should know where the edge is taken for the limit of detection."""
+        """Notes for the user, also where the lightest event stands for the limit of detection.
+
+        Notes for the user, with one where the lightest event stands for the limit of detection.
+        """
         if self.edge_kda is None:
             return self.notes
         return (
@@ -108,7 +111,7 @@ def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
 
 
 def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
-    """Refuse masses of species that no event is near, as those in another unit."""
+    """Refuse masses of species without an event near them, such as masses in another unit."""
     seen = np.abs(np.concatenate([table.mass_kda for table in tables]))
     low, high = _NEAREST * min(masses_kda), max(masses_kda) / _NEAREST
     if not seen.size or ((seen >= low) & (seen <= high)).any():
@@ -175,7 +178,7 @@ def event_table(
 def filter_efficiency(
     good: pd.DataFrame, threshold_snr: float, searched: float = 1.0
 ) -> Efficiency | None:
-    """Read the matched filter's efficiency, in the share that was searched, off its events."""
+    """Estimate the detection efficiency of the matched filter from its events."""
     mass, snr = (good[name].to_numpy(dtype=float) for name in ("mass_kda", "snr"))
     known = np.isfinite(mass) & (mass != 0) & (snr > 0) & np.isfinite(snr)
     mass, snr = np.abs(mass[known]), snr[known]
@@ -299,7 +302,7 @@ def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
-    """Take the rows that have a mass and are fit to be used."""
+    """Select rows with a mass and without a disqualifying flag."""
     if "mass_kda" not in table:
         raise DataError(
             f"{name}: has no column mass_kda; give fits.csv, a table of Refeyn's, or name the "
@@ -379,18 +382,18 @@ def _cut(found: EventTable, above_kda: float) -> EventTable:
 
 
 def _edge(values: FloatArray) -> float:
-    """Say where a distribution begins: the least value, less the mean distance of those near it."""
+    """Lower end of a distribution: the smallest value, less the mean distance of values near it."""
     few = np.sort(values)[:_NEAR_EDGE]
     return float(few[0] - (few[-1] - few[0]) / max(few.size - 1, 1))
 
 
 def _sharp(edge_kda: float) -> Efficiency:
-    """Everything above a mass is seen, and nothing below."""
+    """Efficiency that is 1 above a mass and 0 below."""
     return Efficiency(1 / _SHARP, edge_kda * _SHARP)
 
 
 def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
-    """Read threshold and noise of the filter off a table of ours."""
+    """Estimate threshold and noise of the filter from a table of this program."""
     good = table[table["status"] == Status.OK.value] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
     snr = snr[np.isfinite(snr) & (snr > 0)]

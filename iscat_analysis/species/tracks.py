@@ -79,7 +79,7 @@ _UM2 = 1e6  # nm²
 
 @dataclass(frozen=True)
 class TrackSetup:
-    """What a movie and its configuration say of all tracks."""
+    """What all tracks of a movie share: times, optics, and the errors of the background."""
 
     frame_rate_hz: float | None
     exposure_ms: float | None
@@ -140,7 +140,7 @@ def describe_tracks(
 
 
 def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
-    """Say by how much the masses of all tracks change together."""
+    """Relative change of mass that all tracks share."""
     massive = [rows.massive() for rows in rows_by_track(fits).values()]
     return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
 
@@ -156,7 +156,7 @@ def _record(
     correlation: Correlation | None,
     exact: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Describe one track, but for the tests of its motion."""
+    """Make the row of one track, without the tests of its motion."""
     record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
     record |= {
         "track": track,
@@ -214,7 +214,7 @@ def _scale_error(record: Mapping[str, Any], known_share: float) -> float:
 
 
 def _wider(found: Diffusion, end: int, scale: float) -> float:
-    """Give an end of the interval of D, with the error of its scale."""
+    """End of the interval of D, with the error of its scale."""
     value, best = found.interval_um2_s[end], found.d_um2_s
     if value <= 0 or best <= 0:
         return value
@@ -231,7 +231,7 @@ def _mass(good: TrackRows, power: float, correlation: Correlation | None) -> Com
 
 
 def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
-    """Fit D to the displacements that begin so far inside that they cannot have left the field."""
+    """Fit D to displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
     if setup.frame_rate_hz is None or len(placed.frame) < least:
         return None
@@ -292,7 +292,7 @@ def _motions(
     workers: int,
     progress: Progress,
 ) -> dict[int, tuple[Diffusion | None, dict[str, float]]]:
-    """Give D of tracks and the tests of their motion, of some where that is interrupted."""
+    """D of all tracks and the tests of their motion; an interrupt leaves tests out."""
 
     def motion(track: int) -> tuple[Diffusion | None, dict[str, float]]:
         found = _diffusion(places[track], setup)
@@ -312,7 +312,7 @@ def _motions(
 
 
 def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
-    """Ask whether the motion is free, two tests of the first positions of a long track."""
+    """Test whether the motion is free; two of the tests use the first positions of long tracks."""
     whole = placed.positions()
     track = tuple(part[:TESTED_POSITIONS] for part in whole)
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
@@ -331,7 +331,7 @@ def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> di
 
 
 def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
-    """Everything that makes a number of the track less than it seems, worst first."""
+    """List the flags of a track, the worst first."""
     seen = {
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
@@ -347,7 +347,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
 
 
 def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
-    """Whether a particle that stays where it is all the movie is seen in a part of it."""
+    """Whether a particle that hardly moves is detected in only a part of the movie."""
     frames = setup.frames[1] - setup.frames[0]
     if setup.frame_rate_hz is None or record["n_frames"] > _SEEN * frames:
         return False

@@ -1,4 +1,4 @@
-"""The budget of a movie: what the error of a mass is made of, source by source."""
+"""The error budget of the masses of a movie, source by source."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def _median(values: FloatArray) -> float | None:
 
 
 def explained_kda(budget: Sequence[Mapping[str, Any]]) -> float:
-    """Give the width that the budget gives a species beyond σ: what differs from row to row."""
+    """Width of a species that the budget explains beyond σ: errors that differ between rows."""
     own = [one for one in budget if not one["common"] and one["name"] != "photon noise"]
     return math.sqrt(sum((one["sigma_mass_kda"] or 0.0) ** 2 for one in own))
 

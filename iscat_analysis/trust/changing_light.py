@@ -1,11 +1,12 @@
-"""Light that goes on changing: at the place of a particle that is there, or as it comes.
+"""Steps whose light goes on changing, because the particle is there already or lands slowly.
 
-The light of a particle that settles, bleaches or breathes changes again and again at its place, and
-each change is found as a step of its own.  A second particle at the very place of a first one is
-rare, and cannot be told from that.
+The light of a particle that settles, bleaches or breathes changes repeatedly at its place, and each
+change is found as a step.  A second particle at exactly the same place is rare, and cannot be told
+from that.
 
-Where particles take their time to settle, the rise of a faint one drowns in the noise of its
-frames: it is fitted as a step, and its mass is too small.  That is known from the bright ones.
+If particles take several frames to land, the rise of a faint one drowns in the noise of single
+frames.  It is then fitted as a step, and its mass is too small.  Bright ones show that this
+happens.
 """
 
 from __future__ import annotations
@@ -35,10 +36,10 @@ _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
 def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
-    """Tell which steps of a landing movie may be changes of a particle that is there.
+    """Flag steps that may be changes of the light of a particle that is there already.
 
-    These are the much smaller ones while it is there, and of two alike in sign, mass and place that
-    follow each other within one window, both.
+    These are steps much smaller than that particle.  Of two steps of the same sign, mass and place
+    within one window, both are flagged.
 
     Shapes: result (rows,).
     """
@@ -67,12 +68,11 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
 
 
 def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]:
-    """Tell which steps may rise as others do, unseen; and over how many frames those rise.
+    """Flag steps that may rise slowly without showing it, and give the duration of rises.
 
-    Where many of those that rise go on rising after their lines, all may.
-
-    A line over r frames and the step nearest to it differ by r/12 times the squared signal-to-noise
-    ratio of one frame, of which the log-likelihood is half.
+    If many of the visible rises go on rising after the end of their lines, all steps may.  A line
+    over r frames and the nearest step differ by r/12 times the squared signal-to-noise ratio of one
+    frame, half of which is the gain in log-likelihood.
 
     Shapes: result (rows,).
     """
@@ -95,7 +95,7 @@ def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]
 
 
 def rise_message(frames: float, unseen: int, rising: int, rows: int) -> str:
-    """Say that particles take their time; empty where none does."""
+    """Say that particles take several frames to land; empty where they do not."""
     if not frames:
         return ""
     also = f"; {unseen} that may rise on unseen are flagged changing" if unseen else ""

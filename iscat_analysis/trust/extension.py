@@ -62,7 +62,7 @@ class Extension:
         in_time: Mapping[str, EmpiricalSpread],
         wiggle_nm: float = 0.0,
     ) -> Extension | None:
-        """Judge the evidence of rows, beyond a wiggle that is known; None where none has any."""
+        """Estimate the extension from all rows, beyond a known wiggle; None where there is none."""
         marks = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
@@ -92,12 +92,12 @@ class Extension:
 
     @property
     def is_common(self) -> bool:
-        """Whether all particles have it."""
+        """Whether all particles are extended."""
         return bool(self.variance_nm2 > _SIGNIFICANT * self.variance_se_nm2)
 
     @property
     def message(self) -> str:
-        """What the user should know; empty where pictures are as wide as the model's."""
+        """Message for the user; empty where pictures are as wide as the model's."""
         if not self.is_common:
             return ""
         wide = math.sqrt(self.variance_nm2)
@@ -134,9 +134,10 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
 
 
 def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Least mean variance that pictures which are long, each its own way, tell of; and its error.
+    """Least mean variance that elongated pictures show, and its error.
 
-    What all have in common is of the optics.
+    Each particle has its own direction of elongation; what all have in common belongs to the
+    optics.
 
     Shapes: `across, along, sigma` (n,).
     """
@@ -156,9 +157,9 @@ def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[f
 def _wiggle(
     table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread], known_nm: float
 ) -> tuple[float, float]:
-    """Variance by which positions scatter from frame to frame beyond the noise, and its error.
+    """Variance of positions from frame to frame beyond the noise, and its error.
 
-    Half of the frames that are compared have no particle, whose wiggle then is twice the mean.
+    Half of the frames that are compared hold no particle; its wiggle is twice the mean.
     """
     before, after = table["n_before"].to_numpy(float), table["n_after"].to_numpy(float)
     frames = before * after / np.maximum(before + after, 1.0)

@@ -108,7 +108,7 @@ class Fluctuation:
 
     @property
     def message(self) -> str:
-        """What the user should know."""
+        """Message for the user."""
         return (
             f"contrasts fluctuate by {100 * self.relative:.2g} ± {100 * self.relative_se:.1g} % "
             f"while particles are there, over some {self.frames:.2g} frames: sigma_mass_kda has "

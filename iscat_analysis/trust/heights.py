@@ -1,4 +1,4 @@
-"""What a movie says of the heights of its particles, and what holding them does to masses."""
+"""Spread of the heights of particles, and the mass error of holding them at one height."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
 @dataclass(frozen=True)
 class Heights:
-    """What all events say of their heights, and what follows from it."""
+    """Heights that the light of all events shows, and the mass shifts that follow."""
 
     spread: HeightSpread
     held: bool
@@ -33,7 +33,7 @@ class Heights:
     def of(
         cls, config: Config, table: pd.DataFrame, evidence: Evidence, *, learned_optics: bool
     ) -> Heights | None:
-        """Judge the evidence of every row; None where there is too little."""
+        """Estimate the heights from all rows; None where there are too few."""
         held = not has_prior(config)
         kinds = _DESCRIBED if held else {Status.OK.value}
         marks = zip(table["status"], table["flags"].fillna(""), strict=True)
@@ -49,12 +49,12 @@ class Heights:
 
     @property
     def are_wrong(self) -> bool:
-        """Whether one height is held for particles that are not equally high."""
+        """Whether one height is held although the particles have different heights."""
         return self.held and self.spread.is_spread
 
     @property
     def message(self) -> str:
-        """What the user should know; empty where heights and errors agree."""
+        """Message for the user; empty where heights and errors agree."""
         if not self.are_wrong:
             return ""
         return (

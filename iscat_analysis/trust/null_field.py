@@ -1,7 +1,7 @@
-"""Where a field is empty: the estimator at the places that no particle reaches.
+"""Estimates at places without a particle, which show the noise.
 
-Windows of frames are compared there by `landing.split_frame_estimates`, and single frames with
-their background by `FrameNoise`, for tracks.
+`landing.split_frame_estimates` compares windows of frames there; `FrameNoise` compares single
+frames with their background, for tracks.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _WHOLE = CONTRASTS.index("whole")
 def taken_places(
     context: AnalysisContext, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
 ) -> BoolArray:
-    """Give the pixels so near to a particle that its fit, and not the noise, is seen.
+    """Mark pixels near a particle, in which the estimate would show its fit and not the noise.
 
     Shapes: result (y, x).
     """
@@ -60,7 +60,7 @@ def taken_places(
 def taken_by(
     context: AnalysisContext, windows: Windows, events: Sequence[Event], signal: FloatArray
 ) -> BoolArray:
-    """Give the pixels that fitted particles take.
+    """Mark pixels near fitted particles.
 
     Shapes: `signal` (y, x), result (y, x).
     """
@@ -86,7 +86,7 @@ def empty_field(
     *,
     level: bool,
 ) -> EmptyField:
-    """Make the estimator of particles such as were fitted.
+    """Make the linear estimator for windows, with the typical height and noise of the fits.
 
     Shapes: `mean_e` (y, x), `read` (y, x), `used` (y, x).
     """
@@ -114,7 +114,7 @@ def background_field(
     read: FloatArray,
     fits: Sequence[FitResult],
 ) -> EmptyField:
-    """Make the estimator for frames against a background.
+    """Make the linear estimator for single frames against a background.
 
     Shapes: `read` (y, x).
     """
@@ -125,7 +125,7 @@ def background_field(
 
 
 class FrameNoise:
-    """What single frames make of nothing, each against the background, as tracks are fitted."""
+    """Estimates in single frames at places without a particle."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class FrameNoise:
         self._last: tuple[int, float, FloatArray, BoolArray, FloatArray] | None = None
 
     def look(self, here: Windows, events: Sequence[Event]) -> FloatArray:
-        """Look at one frame, where no particle was fitted in it.
+        """Add one frame.
 
         Shapes: result (1 + len(LENGTHS).
         """
@@ -193,7 +193,7 @@ class FrameNoise:
 
     @property
     def spread(self) -> EmptySpread:
-        """What all frames say, each as often as particles were fitted in it."""
+        """Spread over all frames, each weighted with the number of particles fitted in it."""
         seen = self._counts[2:].any(axis=1)
         kept = np.concatenate([[True, True], seen])
         total, frames = self._distances[:, seen]
