@@ -41,7 +41,7 @@ class Unidentifiable:
     direction: tuple[float, ...]
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Describe it in one line."""
         if len(self.names) == 1:
             return f"{self.names[0]}: the image does not change with it"
         moves = (f"{n} {d:+.3g}" for n, d in zip(self.names, self.direction, strict=True))

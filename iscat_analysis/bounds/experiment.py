@@ -260,7 +260,7 @@ def information_fraction(bounds: EventBounds) -> FloatArray:
 
 
 def warnings_of(experiment: Experiment) -> list[str]:
-    """Say what makes the numbers unattainable or wrong, one line each."""
+    """Warn of what makes the bounds unattainable or wrong, one line each."""
     config, lines = experiment.config, []
     well_depth_e = config.camera.well_depth_e
     if well_depth_e is not None and experiment.peak_e >= well_depth_e:

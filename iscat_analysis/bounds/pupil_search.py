@@ -1,4 +1,4 @@
-"""The search for a pupil: what may change, how good a pupil is, and the way down from a start."""
+"""Search for the best pupil: its variables, its figure of merit, and descents from starts."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class Search:
         )
 
     def value(self, optics: Optics) -> tuple[float, Optics]:
-        """Tell ln F and the optics, dimmed where the well asks for it."""
+        """Compute ln F and the optics, dimmed where the well depth requires it."""
         largest_e = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
         for _ in range(4):
             self.evaluations += 1
@@ -140,7 +140,7 @@ class Search:
         return self.value(self.decode(keys, found.x))
 
     def simplified(self, best: Optics) -> tuple[float, Optics]:
-        """Round the settings to what a laboratory can set, and undo those that change nothing."""
+        """Round the settings, and undo those that change nothing."""
         best = self._with(
             best, {key: _rounded(key, setting(best, key)) for key in self.keys if key != "mask_na"
                    or best.mask_na}

@@ -181,7 +181,7 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
 
 
 def _refusal(path: Path, signature: bytes) -> str:
-    """Say what a file is that is not read, and what to do."""
+    """Say what kind of file is not read, and what to do."""
     known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
     found = f"a film, {_LOSSY}; {_EXPORT}" if signature[4:] == _FILM else next(known, "")
     needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr or a NumPy array"

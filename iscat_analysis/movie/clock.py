@@ -1,4 +1,4 @@
-"""The camera's clock: its rate, and which frames it dropped, from the times of all frames."""
+"""The clock of the camera: its rate and dropped frames, from the times of all frames."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class Hdf5Reader:
             raise
 
     def close(self) -> None:
-        """Let h5py go of the file; its mapped bytes stay."""
+        """Close the file in h5py; the mapped bytes stay."""
         with self._believing_nothing():
             self._file.close()
 
@@ -319,7 +319,7 @@ class Hdf5Reader:
 
 
 def _single(dataset: h5py.Dataset) -> bool:
-    """Whether a dataset is one value, in the file itself and not compressed."""
+    """Whether a dataset is one value, stored in the file and not compressed."""
     layout = dataset.id.get_create_plist().get_layout()
     inside = layout in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT) and not dataset.external
     return bool(inside and dataset.size == 1)

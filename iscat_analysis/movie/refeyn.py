@@ -35,7 +35,7 @@ _FRAME_BOMB_RATIO = 100  # of one decoded frame over the file
 
 @dataclass(frozen=True)
 class _Dialect:
-    """Where one generation of files keeps things."""
+    """Names of datasets in one generation of files."""
 
     frames: str
     keyframes: str | None
@@ -104,10 +104,10 @@ class RefeynFrames:
 
 
 class DifferenceFrames(RefeynFrames):
-    """A movie stored as differences, summed as it is read.
+    """A movie stored as differences, which are summed as it is read.
 
-    Decoded frames are remembered here and there, so that no read starts from the first frame; a
-    movie read in order is summed once.
+    Some decoded frames are kept, so that a read need not start at the first frame.  A movie that is
+    read in order is summed once.
     """
 
     def __init__(

@@ -104,7 +104,7 @@ class ArrayFrames:
 
 
 def not_shared(path: Path) -> DataError:
-    """Say that a file is not, or not the same, where it shall be read."""
+    """Say that a file is missing or different where another process reads it."""
     return DataError(
         f"{path}: is not on {platform.node()}, or is another file there; workers read and write by "
         "path, so that their machines must share the file system"
@@ -199,7 +199,7 @@ class Stack:
 
     @property
     def identity(self) -> str:
-        """What tells this movie from others without reading all of it; empty for an array."""
+        """Hash that identifies the movie without reading all of it; empty for an array."""
         try:
             return fingerprint(self._files, self._part) if self._files else ""
         except OSError as error:
@@ -226,7 +226,7 @@ class Stack:
         return self._frames.notes
 
     def seen_as(self, frames: Frames) -> Stack:
-        """Give the same movie with other frames, which were made from its own.
+        """Make the same movie with frames that were derived from its own.
 
         Parameters
         ----------
@@ -243,7 +243,7 @@ class Stack:
         return seen
 
     def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
-        """Give the same movie with some pixels as dark as dead ones, which all stages leave out.
+        """Set some pixels to dark counts, so that all stages leave them out.
 
         Parameters
         ----------

@@ -374,7 +374,7 @@ def _resolution(page: tifffile.TiffPage) -> tuple[float, float, int] | None:
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Keep what tifffile logs from stderr where the program has set up no logging of its own."""
+    """Keep log messages of tifffile off stderr, unless the program has set up logging."""
     logger, handler = logging.getLogger("tifffile"), logging.NullHandler()
     logger.addHandler(handler)
     try:

@@ -143,9 +143,10 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
 
 
 def _lacks_chunks(array: Any, path: Path, place: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Tell whether a shard was written without some of its chunks, which zarr gives as zeros.
+    """Tell whether a shard lacks some of its chunks, which zarr would read as zeros.
 
-    Its index names place and length of each, in two integers of 64 bits, before a checksum of 4.
+    Its index has place and length of each chunk as two integers of 64 bits, before a checksum of 4
+    bytes.
     """
     codec = array.metadata.codecs[0]
     names = [type(each).__name__ for each in codec.index_codecs]

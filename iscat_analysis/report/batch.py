@@ -290,7 +290,7 @@ def _equilibria(
     equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
     drawn: Mapping[str, Markup],
 ) -> dict[str, Any] | None:
-    """Say what K_D is, and whether the movies follow the equilibrium."""
+    """Tabulate K_D of every series, and whether the movies follow the equilibrium."""
     if not equilibria:
         return None
     section = _charts("equilibrium", "Equilibrium", drawn, ("kd",)) or {}
@@ -356,7 +356,7 @@ def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any
 
 
 def _quality(movies: pd.DataFrame) -> dict[str, Any]:
-    """Say of every movie how far it can be trusted."""
+    """Tabulate the quality of every movie."""
     links = dict(_links(movies))
     further = list(movies.attrs.get("further", ()))
     rows = []
@@ -408,11 +408,11 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
 
 
 def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
-    """Give every movie's name, as a link to its report where there is one."""
+    """Make every movie's name a link to its report, where there is one."""
     pages = zip(movies["movie"], movies["report"], strict=True)
     return [(name, link(report, name)) for name, report in pages]
 
 
 def summary_line(movies: pd.DataFrame) -> str:
-    """Say in one line what there is."""
+    """Describe the batch in one line."""
     return f"{count(len(movies), 'movie')} of {count(movies['sample'].nunique(), 'sample')}"

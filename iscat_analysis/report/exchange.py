@@ -242,7 +242,7 @@ def _write_yaml(path: Path, info: dict[str, Any]) -> None:
 
 
 def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
-    """Say of the movie what Picasso must know."""
+    """Metadata of the movie that Picasso needs."""
     shape = _summary(folder).get("input", {}).get("shape")
     if not shape:
         raise DataError(
@@ -267,7 +267,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _calibrated(folder: Path) -> bool:
-    """Whether masses are masses; a table of unknown origin is believed."""
+    """Whether masses are calibrated; true for a table of unknown origin."""
     summary = _summary(folder)
     return summary.get("mode") != "localize" and summary.get("mass_scale") != "absolute model"
 
@@ -301,7 +301,7 @@ def _events(fits: pd.DataFrame) -> pd.DataFrame:
 
 
 def _checked(fits: pd.DataFrame) -> pd.DataFrame:
-    """Refuse what is no table of fits, and give its columns of numbers as such."""
+    """Refuse what is not a table of fits, and convert its columns to numbers."""
     if not isinstance(fits, pd.DataFrame):
         raise DataError(f"`fits`: is {type(fits).__name__}; give `Result.table`")
     missing = [name for name in EVENT_COLUMNS if name not in fits]

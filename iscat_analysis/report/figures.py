@@ -73,7 +73,7 @@ def _points(
     linked: bool = True,
     **style: Any,
 ) -> None:
-    """Draw points that know the rows of the table they stand for, unless it is not on the page."""
+    """Draw points with the table rows they stand for, if the table is on the page."""
     at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
     (line,) = axes.plot(x[at], y[at], mark, ls="none", **style)
     if linked and at.size <= MOST_POINTS:
@@ -164,7 +164,7 @@ def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, F
 
 
 def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw the histogram of what the analysis is about: mass, contrast or height."""
+    """Draw the histogram of the main quantity: mass, contrast or height."""
     table = counted(table)
     values, sigma, label = _main_values(analysis, table)
     finite, good = np.isfinite(values), _is_ok(table)
@@ -183,7 +183,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw what the analysis is about against the frame."""
+    """Draw the main quantity against the frame."""
     values, _, label = _main_values(analysis, table)
     spans = analysis.summary.get("landing", {}).get("partly_searched", ())
     figure = new_figure(6.2, 3.3 if spans else 2.8)
@@ -248,7 +248,7 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
-    """Draw what tells whether model and noise describe the movie."""
+    """Draw the tests of model and noise."""
     columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
     chi2, p_value = (values[np.isfinite(values)] for values in columns)
     noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}

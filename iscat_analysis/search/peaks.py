@@ -1,4 +1,4 @@
-"""Peaks of smooth fields that are known at pixels only."""
+"""Peaks of smooth fields that are sampled at pixels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FINE = np.linspace(-0.625, 0.625, 11)
 
 
 def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Find what stands out of a stack of fields and has nothing higher beside it.
+    """Find local maxima above a threshold in a stack of fields.
 
     Shapes: `fields` (k, y, x), result (n, 3).
     """
@@ -44,7 +44,7 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
 def summits(
     fields: NDArray[Any], at: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Find the tops of smooth fields, or their bottoms, between the pixels.
+    """Find maxima or minima of smooth fields between the pixels.
 
     Shapes: `fields` (k, y, x), `at` (n, 3), `dy, dx` (n,), `above` (n,).
     """
@@ -71,7 +71,7 @@ def summits(
 
 
 def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Fold indices that lie outside back into an axis, at its first and last pixel."""
+    """Reflect indices outside an axis at its first and last pixel."""
     period = max(2 * (size - 1), 1)
     folded = places % period
     return np.minimum(folded, period - folded) if size > 1 else np.zeros_like(places)

@@ -46,14 +46,14 @@ _PATCH_PX = 5.0  # around the candidate, which is its own
 
 @dataclass(frozen=True)
 class Described:
-    """How well a fit describes its region."""
+    """How well a fit describes its region: what it explains, and its misfit."""
 
     snr: float
     excess: float
 
     @classmethod
     def of(cls, snr: float, chi2_reduced: float, n_pixels: int) -> Described:
-        """Take it from a fit."""
+        """Make it of a fit."""
         return cls(snr, _significant((chi2_reduced - 1) * n_pixels, n_pixels))
 
     def is_dwarfed(self, others: Iterable[Described]) -> bool:
@@ -75,13 +75,13 @@ def is_hidden(snr: float, size: float) -> bool:
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:
-    """Measure what a fit left over."""
+    """Measure the misfit of a fit."""
     n = int(np.count_nonzero(np.isfinite(residuals)))
     return _significant(float(np.nansum(residuals**2)) - n, n)
 
 
 def _significant(excess: float, n_pixels: int) -> float:
-    """Give a χ² in excess, 0 where that may be noise."""
+    """Excess of χ², 0 where it may be noise."""
     return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n_pixels) else 0.0
 
 

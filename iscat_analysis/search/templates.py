@@ -54,7 +54,7 @@ _NOISE_SHARE = 0.1  # of these that noise must account for; particles have a tho
 
 @dataclass(frozen=True)
 class ExcessNoise:
-    """Noise beyond the expected."""
+    """Noise beyond that of the camera's numbers."""
 
     ratio: float
     message: str
@@ -62,7 +62,7 @@ class ExcessNoise:
 
 @dataclass(frozen=True)
 class Templates:
-    """The model's images, normalised, at the heights searched."""
+    """Normalised images of the model at the searched heights."""
 
     z_nm: FloatArray
     images: FloatArray
@@ -256,9 +256,9 @@ def _peaks(
 def _strongest_lobe(
     best: FloatArray, peak: _Peak, known: Sequence[tuple[float, float]], roi_px: float
 ) -> float:
-    """Size of what known particles left over, at a candidate's distance from each.
+    """Height of the residuals of known particles at a candidate's distance from each.
 
-    The nearest come first, and the search ends with one that hides the candidate.
+    The nearest particles are tried first; the search ends with one that hides the candidate.
     """
     place = peak.x_px, peak.y_px
     away = {k: math.hypot(k[0] - place[0], k[1] - place[1]) for k in known}
@@ -279,9 +279,9 @@ def refuse_flood(
     images: int = 1,
     frames: str = "",
 ) -> None:
-    """Give up a search in which noise passes the threshold; many particles are no reason to.
+    """Stop a search in which noise passes the threshold, but not one with many particles.
 
-    The rings of many particles look like noise as well, but normal noise of that variance would
+    The rings of many particles look like noise as well; but normal noise of that variance would
     hardly pass the threshold.
     """
     if excess_noise is None or candidates <= MOST_CANDIDATES:
@@ -342,7 +342,7 @@ def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
 
 
 def _weak_amplitude(bare: ForwardModel) -> float:
-    """Return an amplitude whose signal is linear; in dark field any will do."""
+    """Amplitude whose signal is linear; in dark field any will do."""
     nominal = bare.material.mass_kda
     peak = abs(bare.peak_contrast(bare.height_nm, nominal))
     return nominal * min(1.0, 1e-4 / max(peak, 1e-30)) if bare.rho else nominal

@@ -45,7 +45,7 @@ _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is co
 
 
 class Reader:
-    """Frames of one chunk after the other: where they lie in the file, or read into memory once."""
+    """Reads the frames of one chunk after the other, in place or into memory."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Reader:
         return self._movie.name
 
     def forget(self) -> None:
-        """Give the memory of the frames back."""
+        """Release the memory of the frames."""
         if self._placed:
             self._placed.let_go()
         self._buffer = self._buffer[:0].copy()
@@ -138,7 +138,7 @@ class Reader:
         return self._frames(start, stop), good, light
 
     def _append(self, end: int, mapper: Mapper) -> None:
-        """Go on from the last frame that is held."""
+        """Read on from the last frame that is in memory."""
         start, begin = self._held
         if begin >= end:
             return
@@ -190,7 +190,7 @@ class Reader:
         return chunk
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
-        """Good frames among the first, on which the noise is judged."""
+        """Good frames among the first, for judging the noise."""
         stop = min(self.last, self.first + NOISE_FRAMES)
         counts, good, light = self.counts(self.first, stop, mapper)
         if self._dark_e > 0:  # of frames with a background
@@ -217,7 +217,7 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:
-    """Yield stretches of true."""
+    """Yield the ranges in which a mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     for start, stop in edges.reshape(-1, 2):
         yield slice(int(start), int(stop))

@@ -96,7 +96,7 @@ class Patch:
         return self.counts.reshape(len(self.counts), self.mean_e.size)
 
     def frames(self, start: int, stop: int) -> Patch:
-        """Give some of the frames, where they lie."""
+        """Select some of the frames, without a copy."""
         here = slice(max(start - self.first, 0), max(stop - self.first, 0))
         return replace(
             self, first=self.first + here.start, counts=self.counts[here], good=self.good[here],
@@ -184,7 +184,7 @@ def measure_frames(
 
 
 def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Tell which frames lack their first or last row, as where a transfer broke off.
+    """Tell which frames lack their first or last rows, as after an interrupted transfer.
 
     Shapes: `counts` (t, y, x), result (t,).
     """
@@ -201,7 +201,7 @@ def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
 
 
 def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
-    """Tell which frames have the light of most, and not that of a shutter that is closed or opens.
+    """Tell which frames have the usual light, unlike those of a closed or opening shutter.
 
     Shapes: `light_e` (t,), result (t,).
     """
@@ -215,7 +215,7 @@ def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
 
 
 def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Tell which frames have the light of most, and do not repeat the one before.
+    """Tell which frames have the usual light, and do not repeat the one before.
 
     Shapes: `counts` (t, y, x), result (t,).
     """

@@ -1,4 +1,4 @@
-"""Noise against averaging, and the windows it makes worth having."""
+"""Noise of averages, and the window that follows from it."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
 
 
 class _Compared(NamedTuple):
-    """Neighbouring averages of a length: variances over that of shot noise."""
+    """Variances of the difference of neighbouring averages, over that of shot noise."""
 
     noise: float  # of the contrast
     rest: float  # the same without motion
@@ -105,7 +105,7 @@ class _Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class _Strip:
-    """Some rows of frames, and their camera."""
+    """Some rows of all frames, and their camera."""
 
     counts: NDArray[Any]
     gain: FloatArray
@@ -115,7 +115,7 @@ class _Strip:
 
     @classmethod
     def of(cls, counts: NDArray[Any], camera: Camera, *, adjacent: bool) -> _Strip:
-        """Take rows all over the field, or some that lie together."""
+        """Select rows from the whole field, or adjacent ones."""
         height = counts.shape[1]
         rows: Any = np.linspace(0, height - 1, min(_ROWS, height)).astype(int)
         if adjacent:
@@ -128,7 +128,7 @@ class _Strip:
         return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], adjacent)
 
     def compared(self, n: int) -> _Compared:
-        """Compare averages of n frames; of rows that do not lie together nothing tells motion."""
+        """Compare averages of n frames; motion can be measured in adjacent rows only."""
         blocks = 2 * min(len(self.counts) // (2 * n), 8)
         parts = self.counts[: blocks * n].reshape(blocks, n, *self.counts.shape[1:])
         sums = self.gain * (parts.sum(axis=1, dtype=np.float64) - n * self.offset)
@@ -157,7 +157,7 @@ class _Strip:
 
 
 def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
-    """Differences between the pixels on either side of each; beyond the border, of the border."""
+    """Differences between the neighbours of each pixel along an axis."""
     at = np.arange(images.shape[axis])
     after, before = (images.take(np.clip(at + step, 0, at[-1]), axis) for step in (reach, -reach))
     return np.asarray(after - before)

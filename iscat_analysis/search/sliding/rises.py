@@ -43,7 +43,7 @@ class Rise:
 
 
 def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> Rise | None:
-    """Find a rise about the best step, whose log-likelihood over none is given; None at once.
+    """Find a rise around the best step, whose log-likelihood is given; None where it is a step.
 
     Shapes: `heights` (t,), `weight` (t,).
     """
@@ -82,17 +82,17 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
 
 
 def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
-    """Give the share of the light that is there in frames over which it rises evenly."""
+    """Share of the new light in frames during a linear rise."""
     return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
 
 
 def _settling(frames: IntArray, decay: float, begin: FloatArray) -> FloatArray:
-    """Give the share of the light that is there in frames in which it settles exponentially."""
+    """Share of the new light in frames during an exponential rise."""
     return np.asarray(-np.expm1(-np.maximum(frames + 0.5 - begin, 0.0) / decay))
 
 
 def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
-    """Log-likelihood of each course with a height of its own, over that of a constant.
+    """Log-likelihood of each time course with a free height, over that of a constant.
 
     Shapes: `courses` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
     """
@@ -102,7 +102,7 @@ def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> Float
 
 
 def _gain_beyond(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
-    """Give what frames after a gap have beyond those before it.
+    """Difference of the means after and before a gap.
 
     Shapes: `heights` (t,), `weight` (t,).
     """
