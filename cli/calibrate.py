@@ -62,7 +62,10 @@ def camera(
         Path | None, typer.Option(metavar="STACK", help="Frames without light.")
     ] = None,
     offset: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="The offset, known without a dark.")
+        float | None,
+        typer.Option(
+            metavar="COUNTS", help="Offset of the camera in counts, if it is known without a dark."
+        ),
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps", help="Write maps, one number per pixel, as TIFF.")
@@ -126,12 +129,20 @@ def mass(
         str,
         typer.Option(
             metavar="KDA,KDA,...",
-            help="Masses of the standards; 66:0.5 gives one its standard error, otherwise 1 %.",
+            help=(
+                "Masses of the standards [kDa]; 66:0.5 gives a mass its standard error, the "
+                "default is 1 %."
+            ),
         ),
     ],
     landing: Annotated[
         LandingSign | None,
-        typer.Option(help="What landing does; default what the table's masses say, or dark."),
+        typer.Option(
+            help=(
+                "Whether a particle that lands makes its place dark or bright; default from the "
+                "table's masses, or dark."
+            )
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -190,22 +201,30 @@ def optics(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="What may change, some of focus,na,phase,mask,zernike,polarization; default all.",
+            help=(
+                "Parameters to learn, some of focus,na,phase,mask,zernike,polarization; "
+                "default all."
+            ),
         ),
     ] = None,
     focus_step: Annotated[
         float | None,
         typer.Option(
             metavar="NM",
-            help="The movie is a scan of immobile particles: rise of the focus per frame [nm]; "
-            "where focus is free it is measured as well.",
+            help=(
+                "The movie is a scan of the focus over immobile particles: rise of the focus "
+                "per frame [nm]; where focus is free it is measured as well."
+            ),
         ),
     ] = None,
     measured: Annotated[
         bool,
         typer.Option(
             "--measured",
-            help="Measure the picture itself instead, where no optics describe it; mode mass.",
+            help=(
+                "Measure the picture of a particle itself, for a microscope that no optics "
+                "describe; mode mass."
+            ),
         ),
     ] = False,
     out: Annotated[

@@ -71,7 +71,10 @@ def fit(
         str | None,
         typer.Option(
             metavar="SHAPE,TYPE",
-            help="STACK is nothing but numbers, as in 1500x128x128,uint16; also STACK::SHAPE,TYPE.",
+            help=(
+                "Shape and type of a raw file of numbers, as in 1500x128x128,uint16; also "
+                "STACK::SHAPE,TYPE."
+            ),
         ),
     ] = None,
     frames: Annotated[
@@ -79,7 +82,9 @@ def fit(
     ] = None,
     background: Annotated[
         str | None,
-        typer.Option(metavar="A:B", help="Frames before the particles bound, half-open."),
+        typer.Option(
+            metavar="A:B", help="Frames of the background, before the particles bound, half-open."
+        ),
     ] = None,
     settings: SetOption = None,
     posterior: Annotated[
