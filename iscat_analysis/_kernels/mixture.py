@@ -20,10 +20,8 @@ _LOG_2PI = math.log(2.0 * math.pi)
 _CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
 _TINY = 1e-250  # a density below it is added up by logarithms
 _BLOCK = 128  # events whose numbers stay in the cache
-_LN2_HIGH, _LN2_LOW = (
-    0.6931471803691238,
-    1.90821492927058770002e-10,
-)  # ln 2; the first has few digits
+# Ln 2; the first has few digits
+_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.90821492927058770002e-10
 _HALVES = np.exp2(-np.arange(1024.0))
 _LAST_HALF = np.uint32(_HALVES.size - 1)
 

@@ -17,12 +17,13 @@ from iscat_analysis.records import BoolArray, FloatArray
 AmplifierBoundaries = tuple[tuple[int, ...], tuple[int, ...]]
 """Rows and columns at which another part begins."""
 
-_MOST = 3  # along an axis
-_SMOOTH = 6  # degree of the light along an axis over which a step must stand out
-_LEAST = 8  # lines of a part
+_MOST_BOUNDARIES = 3  # along an axis
+_SMOOTH_DEGREE = 6  # degree of the light along an axis over which a step must stand out
+_FEWEST_LINES = 8  # lines of a part
 _BY_CHANCE = 1e-12  # that the gains of pairs are as far above noise
-_SHARP = 10.0  # times what nine in ten lines differ from those before, that they do at a seam
-_UNEXPLAINED = 0.5  # of what smooth light leaves over, more than which seams may not
+# Times what nine in ten lines differ from those before, that they do at a seam
+_LEAST_STEP_RATIO = 10.0
+_MOST_UNEXPLAINED_SHARE = 0.5  # of what smooth light leaves over, more than which seams may not
 _NINE_IN_TEN = 0.9
 _NORMAL_SQUARE = 0.4549364231195724  # median of the square of a normal variable
 
@@ -61,14 +62,14 @@ def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) ->
     change = after / after.sum(axis=1, keepdims=True) - before / before.sum(axis=1, keepdims=True)
     change *= light.sum() / np.sqrt(light * changes.noises[:, None])
     count = light.size
-    if count < 2 * _LEAST + _SMOOTH:
+    if count < 2 * _FEWEST_LINES + _SMOOTH_DEGREE:
         return known
     differences = change[:, 2:-1] + change[:, 3:] - change[:, 1:-2] - change[:, :-3]
     jumps = np.zeros(count)
     jumps[2:-1] = np.median(np.square(differences), axis=0)
-    sharp = jumps > _SHARP * np.quantile(jumps, _NINE_IN_TEN)
+    sharp = jumps > _LEAST_STEP_RATIO * np.quantile(jumps, _NINE_IN_TEN)
     root = np.sqrt(light)[:, None]
-    smooth = root * legvander(np.linspace(-1, 1, count), _SMOOTH)
+    smooth = root * legvander(np.linspace(-1, 1, count), _SMOOTH_DEGREE)
     steps = root * (np.arange(count)[:, None] >= np.arange(count))
     tried = np.searchsorted(lit_positions, known).tolist()
     kept, unexplained = len(tried), np.inf
@@ -77,14 +78,14 @@ def _along(changes: Changes, axis: int, least: float, known: tuple[int, ...]) ->
         basis, _ = np.linalg.qr(np.hstack([smooth, steps[:, tried]]))
         rest = change - (change @ basis) @ basis.T
         left = float(np.median(np.square(rest).sum(axis=1))) - (count - basis.shape[1])
-        if left < _UNEXPLAINED * unexplained:
+        if left < _MOST_UNEXPLAINED_SHARE * unexplained:
             kept, unexplained = len(tried), left
-        if len(tried) == _MOST:
+        if len(tried) == _MOST_BOUNDARIES:
             break
         independent_steps = steps - basis @ (basis.T @ steps)
         far = sharp.copy()
         for cut in (0, *tried, count):
-            far[max(cut - _LEAST + 1, 0) : cut + _LEAST] = False
+            far[max(cut - _FEWEST_LINES + 1, 0) : cut + _FEWEST_LINES] = False
         size = np.where(far, np.linalg.norm(independent_steps, axis=0), np.inf)
         gains = np.square(rest @ (independent_steps / size))
         best = int(gains.sum(axis=0).argmax())

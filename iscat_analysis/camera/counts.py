@@ -30,8 +30,8 @@ CEILING_REPEATS = 4
 
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
-_LEAP = 0.75  # of the largest number, from one frame to the next
-_BRIGHT = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
+_OVERFLOW_JUMP = 0.75  # of the largest number, from one frame to the next
+_BRIGHT_QUANTILE = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
 _LARGEST_OVERFLOW_SHARE = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
@@ -273,11 +273,11 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     if not np.issubdtype(counts.dtype, np.unsignedinteger) or counts.dtype.itemsize > 2:
         return
     largest = int(np.iinfo(counts.dtype).max)
-    if not counts.size or int(counts.max()) - int(counts.min()) < _LEAP * largest:
+    if not counts.size or int(counts.max()) - int(counts.min()) < _OVERFLOW_JUMP * largest:
         return
     for before, after in pairwise(counts):
         high = np.maximum(before, after)
-        leap = (high - np.minimum(before, after) > _LEAP * largest) & (high < largest)
+        leap = (high - np.minimum(before, after) > _OVERFLOW_JUMP * largest) & (high < largest)
         if _LARGEST_OVERFLOW_SHARE < leap.mean() < 1 / 2 and not _is_shutter(before, after):
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
@@ -290,7 +290,7 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
 
 def _is_shutter(before: NDArray[Any], after: NDArray[Any]) -> bool:
     """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
-    low, high = sorted(float(np.quantile(frame, _BRIGHT)) for frame in (before, after))
+    low, high = sorted(float(np.quantile(frame, _BRIGHT_QUANTILE)) for frame in (before, after))
     return low < high / 2
 
 

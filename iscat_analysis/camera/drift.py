@@ -35,12 +35,12 @@ REACH_PX = 4
 
 _STILL_PX = 16.0  # standard deviation of what is smoothed away of the pattern; speckle is finer
 _PASSES = 4
-_CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
+_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
-_POOR = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
-_PATTERN = 1.0  # least squared gradient of the pattern over that of its noise
-_SPIKE = 6.0  # robust standard deviations of a pixel from the median of those around it
-_PEAK = 8.0  # least peak of a phase correlation over the noise of one of random phases
+_POOR_MISMATCH = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
+_LEAST_PATTERN_POWER = 1.0  # least squared gradient of the pattern over that of its noise
+_SPIKE_SIGMAS = 6.0  # robust standard deviations of a pixel from the median of those around it
+_LEAST_PEAK_RATIO = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def follow_pattern(
         )  # fmt: skip
 
     found = list(mapper(one, range(1, lit.size)))
-    if not found or not np.median([clear for _, _, clear in found]) > _PATTERN:
+    if not found or not np.median([clear for _, _, clear in found]) > _LEAST_PATTERN_POWER:
         return None
     steps = np.array([step for step, _, _ in found])
     errors = np.array([error for _, error, _ in found])
@@ -133,7 +133,14 @@ def _register(
                 return nowhere
             scale = max(1.4826 * float(np.nanmedian(some)), 1.0)
             spurious = shift_equations(
-                moved, pattern_read, image_read, ratio, deviation, _CLIP * scale, normal, right
+                moved,
+                pattern_read,
+                image_read,
+                ratio,
+                deviation,
+                _CLIP_SIGMAS * scale,
+                normal,
+                right,
             )
             clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
             if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
@@ -146,7 +153,7 @@ def _register(
         return scale, shift, scale * np.sqrt(np.diag(inverse)[:2]), clear
 
     found = refined(np.zeros(2))
-    if found[0] > _POOR:
+    if found[0] > _POOR_MISMATCH:
         far = np.array(measure_drift(pattern, np.where(usable, image, ratio * pattern)))
         if np.isfinite(far).all():
             found = min(found, refined(far), key=lambda result: result[0])
@@ -263,7 +270,7 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
         return math.nan, math.nan
     surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=taper.shape)
     at = np.unravel_index(int(np.argmax(surface)), surface.shape)
-    if surface[at] * math.sqrt(surface.size) < _PEAK:
+    if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
         return math.nan, math.nan
     y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, taper.shape, strict=True))
     fy, fx = np.meshgrid(fft.fftfreq(rows), fft.rfftfreq(columns), indexing="ij")
@@ -280,4 +287,4 @@ def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
     around = median_filter(image, size=3)
     out = np.abs(image - around)
-    return np.where(out > _SPIKE * 1.4826 * np.median(out), around, image)
+    return np.where(out > _SPIKE_SIGMAS * 1.4826 * np.median(out), around, image)

@@ -22,19 +22,21 @@ from scipy.special import chdtri
 from iscat_analysis.camera.light_changes import Changes
 from iscat_analysis.records import BoolArray, FloatArray
 
-_MOST = 6  # waves: a source with two interfering reflections has one, with three three
-_SIDE = 160  # squares along an axis, at most, of which a spectrum is made
-_ABOVE = 100.0  # times what is around it, beyond noise, that a wave has in the spectrum: of a
+_MOST_WAVES = 6  # waves: a source with two interfering reflections has one, with three three
+_MOST_SQUARES = 160  # squares along an axis, at most, of which a spectrum is made
+# Times what is around it, beyond noise, that a wave has in the spectrum: of a
+_LEAST_POWER_RATIO = 100.0
 # pattern that moves, the largest of 1e4 points has half of that
 _BY_CHANCE = 1e-10  # that a point is as far above noise: a field has some 1e4
-_CLIP = 5.0  # robust standard deviations of the changes of a pixel
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_CLIP_SIGMAS = 5.0  # robust standard deviations of the changes of a pixel
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _ZOOMS = 4  # each to half the step, from half a wave over the field
 _TURNS = 4  # of the fit of wave vectors that follows
 _DEGREES_PER_WAVE = 4  # of a polynomial that follows waves of the field
-_SLOWEST = 2.5  # waves over the field that are left to polynomials
-_BESIDE = 8  # degree of the polynomial beside which waves are looked for: it follows fewer of them
-_STEEPEST = 4  # degree of the heights of waves
+_FEWEST_PERIODS = 2.5  # waves over the field that are left to polynomials
+# Degree of the polynomial beside which waves are looked for: it follows fewer of them
+_SMOOTH_DEGREE = 8
+_MOST_AMPLITUDE_DEGREE = 4  # degree of the heights of waves
 _PIXELS_PER_TERM = 150  # as of the polynomial
 _LEAST_SQUARES = 24  # along an axis
 
@@ -76,17 +78,19 @@ NO_FRINGES = Fringes()
 
 def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
     """Find plane waves among changes of the light."""
-    side = max(1, -(-max(changes.light_e.shape) // _SIDE))
+    side = max(1, -(-max(changes.light_e.shape) // _MOST_SQUARES))
     change, light = changes.binned(side)
     if min(light.shape) < _LEAST_SQUARES:
         return NO_FRINGES
-    smooth_degree = min(highest, _BESIDE)
-    spread = _NORMAL * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
-    change = _without_smooth(np.clip(change, -_CLIP * spread, _CLIP * spread), smooth_degree)
-    slowest = min(highest / _DEGREES_PER_WAVE, _SLOWEST)
+    smooth_degree = min(highest, _SMOOTH_DEGREE)
+    spread = _SIGMA_PER_MAD * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
+    change = _without_smooth(
+        np.clip(change, -_CLIP_SIGMAS * spread, _CLIP_SIGMAS * spread), smooth_degree
+    )
+    slowest = min(highest / _DEGREES_PER_WAVE, _FEWEST_PERIODS)
     least = changes.least(window) / changes.error
     waves, square, rest = np.empty((0, 2)), 0.0, change
-    while len(waves) < _MOST:
+    while len(waves) < _MOST_WAVES:
         peak = _peak(rest, slowest)
         if peak is None:
             break
@@ -99,7 +103,11 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
     if not len(waves):  # the others are the foot of what the polynomial follows
         return NO_FRINGES
     room = changes.used.sum() / _PIXELS_PER_TERM
-    most = max(k for k in range(_STEEPEST + 1) if not k or len(waves) * (k + 1) * (k + 2) <= room)
+    most = max(
+        k
+        for k in range(_MOST_AMPLITUDE_DEGREE + 1)
+        if not k or len(waves) * (k + 1) * (k + 2) <= room
+    )
     squares = np.array([
         _explained(change, light, Fringes(waves, k), smooth_degree)[0] for k in range(most + 1)
     ])  # fmt: skip
@@ -164,7 +172,7 @@ def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
     around = np.maximum(_around(power, wide), 1.0)
     waves = np.hypot(np.fft.fftfreq(high)[:, None] * high, np.fft.rfftfreq(wide) * wide)
     noise = float(chdtri(2 * pairs, _BY_CHANCE)) / (2 * pairs)
-    most = np.maximum(noise, around + _ABOVE * (around - 1))
+    most = np.maximum(noise, around + _LEAST_POWER_RATIO * (around - 1))
     above = np.where(waves > slowest, power / most, 0.0)
     at = np.unravel_index(int(above.argmax()), above.shape)
     if above[at] <= 1:

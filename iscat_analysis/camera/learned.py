@@ -38,9 +38,9 @@ _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at, a second
 _LEAST_FRAMES = 8
 _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
 _LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
-_FIRST = 64  # frames among which some may be dark
-_DARK = 0.5  # of the usual counts, below which a frame may be without light
-_LEAST = 0.01  # of the usual counts, by which dark frames may differ
+_FIRST_FRAMES = 64  # frames among which some may be dark
+_DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
+_DARK_SPREAD_SHARE = 0.01  # of the usual counts, by which dark frames may differ
 # of what the counts of dark frames would show, if they were light: its error, and itself
 _LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
 _LARGEST_NOISE_RATIO = 4.0  # times the median, of the noise of a pixel in the dark that is left out
@@ -49,9 +49,9 @@ _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without an
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
 _FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
-_SHAKEN = 0.03  # of the noise, from where motion of the pattern is taken off before
+_LEAST_JITTER_SHARE = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
-_RESOLVED = 0.4  # of λ/NA, below which pixels are finer than any detail of light
+_RESOLVED_PIXEL = 0.4  # of λ/NA, below which pixels are finer than any detail of light
 _FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
 
@@ -118,7 +118,7 @@ def with_camera(
     """Apply the response curve to a movie, and set the numbers of its camera."""
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
-    resolved = pixel_nm < _RESOLVED * optics.wavelength_nm / optics.na
+    resolved = pixel_nm < _RESOLVED_PIXEL * optics.wavelength_nm / optics.na
     learned = learn_camera(
         movie, config.camera, span,
         additive=optics.scheme == "darkfield",
@@ -176,16 +176,16 @@ def _sample(
     total = movie.shape[0]
     looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
-    opening = _finite(movie.read(0, min(_FIRST, total)))
+    opening = _finite(movie.read(0, min(_FIRST_FRAMES, total)))
     if not levels or not len(opening):
         return opening, None
     usual = float(np.quantile(levels, 0.75))
     means = opening.mean(axis=(1, 2))
-    dim = (means < _DARK * usual) & (means > 0)
-    dim &= means - means.min() < _LEAST * usual  # and no shutter that is opening
+    dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
+    dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
     counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
-    lit = counts.mean(axis=(1, 2)) > _DARK * usual
+    lit = counts.mean(axis=(1, 2)) > _DARK_LIGHT_SHARE * usual
     repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
     counts = counts[lit & ~repeats]
     if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
@@ -335,11 +335,13 @@ class _Learning:
         longer = averaged_noise(counts, seen)
         if longer is not None:
             return found.gain_e_per_adu / longer, found.gain_se / longer, EFFECTIVE
-        still = without_pattern_jitter(counts[:_FIRST], seen)
-        calm, rough = (_short(part, seen) for part in (still, counts[:_FIRST].astype(np.float64)))
+        still = without_pattern_jitter(counts[:_FIRST_FRAMES], seen)
+        calm, rough = (
+            _short(part, seen) for part in (still, counts[:_FIRST_FRAMES].astype(np.float64))
+        )
         if calm is not None and rough is not None:
             ratio = calm.noise_ratio / rough.noise_ratio
-            if ratio < 1 - _SHAKEN - 3 * calm.noise_ratio_se:
+            if ratio < 1 - _LEAST_JITTER_SHARE - 3 * calm.noise_ratio_se:
                 return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
         if spectrum is not None and spectrum.correlated:
@@ -416,7 +418,7 @@ class _Learning:
 
 def _noise_adu2(counts: NDArray[Any]) -> float:
     """Half the mean square of what successive frames differ by, without the laser's flicker."""
-    steps = np.diff(counts[:_FIRST].astype(np.float64), axis=0)
+    steps = np.diff(counts[:_FIRST_FRAMES].astype(np.float64), axis=0)
     steps -= steps.mean(axis=(1, 2), keepdims=True)
     return float(np.mean(steps**2)) / 2
 

@@ -44,12 +44,13 @@ _PIXELS_PER_TERM = 150  # fewer would take more of a particle's light than its n
 _CELLS = 20  # along each axis of the grid on which changes are looked for
 _PASSES = 4
 _ROUNDS = 2  # in which seams and fringes are looked for, each beside the other
-_CLIP = 4.0  # robust standard deviations beyond which a cell shows something else
-_SIGNIFICANT = 8.0  # standard errors beyond which a change is one: it repeats in time and place
-_SPREAD = 0.1  # of the cells, over which a change of the light is spread at least
-_SMOOTH = 3.0  # times what a smooth change leaves over in a cell, that it must make there
+_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a cell shows something else
+_LEAST_SIGMAS = 8.0  # standard errors beyond which a change is one: it repeats in time and place
+_LEAST_CELL_SHARE = 0.1  # of the cells, over which a change of the light is spread at least
+# Times what a smooth change leaves over in a cell, that it must make there
+_LEAST_SMOOTH_RATIO = 3.0
 _LOWEST_HIGHEST = 3  # degree without which smooth is not told from fine
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _LEAST_SHARE = 1e-10  # of what is told of the best known combination of terms
 
 
@@ -242,8 +243,8 @@ def _smooth(changes: Changes, window: int, highest: int, fringes: Fringes) -> tu
     beyond = np.cumsum(excess[::-1])[::-1]  # what polynomials of lower degree leave
     terms = np.cumsum([s.shape[1] for s in of_degree[::-1]])[::-1]
     least = changes.least(window) / changes.error
-    seen = (beyond > least) & (beyond > _SIGNIFICANT * np.sqrt(2 * terms / count))
-    if not seen[0] or beyond[0] < _SMOOTH * left * grid.basis.shape[0]:
+    seen = (beyond > least) & (beyond > _LEAST_SIGMAS * np.sqrt(2 * terms / count))
+    if not seen[0] or beyond[0] < _LEAST_SMOOTH_RATIO * left * grid.basis.shape[0]:
         return 0, 0.0
     return int(np.flatnonzero(seen).max()) + 1, math.sqrt(float(beyond[0]) * changes.error)
 
@@ -302,7 +303,7 @@ class _Grid:
         for change in self.changes:
             # what landed and is large would bend the first fit so that nothing stands out of it
             away = np.abs(change - np.median(change))
-            kept = away <= _CLIP * max(1.0, _NORMAL * float(np.median(away)))
+            kept = away <= _CLIP_SIGMAS * max(1.0, _SIGMA_PER_MAD * float(np.median(away)))
             if kept.sum() <= self.basis.shape[1]:
                 kept[:] = True
             for _ in range(_PASSES):
@@ -312,12 +313,12 @@ class _Grid:
                 found = part.T @ change[kept]
                 fitted = self.basis @ np.linalg.solve(turned, found)
                 rest = np.abs(change - fitted)
-                inside = rest <= _CLIP * max(1.0, _NORMAL * float(np.median(rest)))
+                inside = rest <= _CLIP_SIGMAS * max(1.0, _SIGMA_PER_MAD * float(np.median(rest)))
                 if np.array_equal(inside, kept) or inside.sum() <= found.size:
                     break
                 kept = inside
             squares = np.square(fitted - np.median(fitted))
-            if squares.sum() ** 2 < _SPREAD * squares.size * np.square(squares).sum():
+            if squares.sum() ** 2 < _LEAST_CELL_SHARE * squares.size * np.square(squares).sum():
                 continue  # dust that landed, which is nowhere else
             out.append(np.square(found))
             left += float(np.square(rest[kept]).sum())

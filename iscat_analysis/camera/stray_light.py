@@ -17,10 +17,10 @@ from iscat_analysis.records import FloatArray
 
 _PARTS = 8  # along each axis
 _SIGNIFICANT = 30.0  # squared standard errors, which follow from the differences of the parts
-_DOUBT = 4.0  # standard errors of what is left over in a part
-_PATTERN = 10.0  # times what the noise of the mean frame tells, that its pattern must
-_ALIKE = 4.0  # times what the median part tells, more than which none should
-_MOST = 0.25  # of the mean light, more than which is not added between windows
+_RESIDUAL_SIGMAS = 4.0  # standard errors of what is left over in a part
+_LEAST_PATTERN_RATIO = 10.0  # times what the noise of the mean frame tells, that its pattern must
+_MOST_PATTERN_RATIO = 4.0  # times what the median part tells, more than which none should
+_MOST_ADDED_SHARE = 0.25  # of the mean light, more than which is not added between windows
 _LEAST_PARTS = 16
 _LEAST_PATTERN_POWER = 1e-3  # by a part, of what others tell
 
@@ -54,12 +54,16 @@ def find_stray_light(changes: Changes, window: int) -> float:
     if not (pattern_power > 0).any():
         return 0.0
     usual = np.median(pattern_power[pattern_power > 0])
-    lit = (pattern_power > 0) & (pattern_power < _ALIKE * usual)  # without dust and particles
+    lit = (pattern_power > 0) & (
+        pattern_power < _MOST_PATTERN_RATIO * usual
+    )  # without dust and particles
     if lit.sum() < _LEAST_PARTS:
         return 0.0
     mean, pattern_power = once[lit] / held[lit], pattern_power[lit]
     pixels = summed((light > 0).astype(np.float64))[lit]
-    if pattern_power.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
+    if pattern_power.sum() < _LEAST_PATTERN_RATIO * pixels.sum() * changes.noises.mean() / len(
+        changes.noises
+    ):
         return 0.0
     even = summed(change)[:, lit]
     seen = summed(change * more)[:, lit] - even * mean
@@ -70,7 +74,7 @@ def find_stray_light(changes: Changes, window: int) -> float:
     )
     error = spread.sum(axis=1) / (lit.sum() - 1) / pattern_power.sum()
     square = float(np.median(np.square(added)))
-    if square > _MOST**2:
+    if square > _MOST_ADDED_SHARE**2:
         return 0.0
     if square * pattern_power.sum() / light.sum() < changes.least(window) + changes.error:
         return 0.0
@@ -81,7 +85,7 @@ def find_stray_light(changes: Changes, window: int) -> float:
     squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
     gain = np.square(added) * pattern_power / noises
     left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)
-    doubt = _DOUBT * math.sqrt(2 * float(pixels.mean()) / left.size)
+    doubt = _RESIDUAL_SIGMAS * math.sqrt(2 * float(pixels.mean()) / left.size)
     if np.median(left) > np.median(gain) + doubt:
         return 0.0
     here = summed(each * more)[..., lit] - summed(each)[..., lit] * mean

@@ -24,14 +24,15 @@ from iscat_analysis.units import count, listed
 
 _CHANCE = 1e-9  # that noise alone makes a pixel unsteady
 _AROUND = 5  # pixels along each side, whose median tells how counts scatter there
-_CHANGING = 3.0  # times shot noise, by which most pixels change slowly where it is not the pixels
-_LINE = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
+# Times shot noise, by which most pixels change slowly where it is not the pixels
+_SLOW_CHANGE_RATIO = 3.0
+_LEAST_LINE_EXCESS = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
 _LINE_SIGMAS = 8.0  # robust standard deviations of all lines
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
-_FEWEST = 20  # frames that tell
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
+_FEWEST_FRAMES = 20  # frames that tell
 _LEAST_E = 20.0  # of light, below which noise is far from normal
-_WHOLE = 0.5  # of the pixels of a line that is named as such
-_MOST = 0.1  # of the pixels: where more are, it is not the pixels that are odd
+_LINE_SHARE = 0.5  # of the pixels of a line that is named as such
+_MOST_PIXEL_SHARE = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 
 
 def unsteady_message(pixels: BoolArray) -> str:
@@ -41,9 +42,9 @@ def unsteady_message(pixels: BoolArray) -> str:
     """
     number = int(pixels.sum())
     where = [
-        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _WHOLE), 4)}"
+        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _LINE_SHARE), 4)}"
         for axis, name in ((1, "row"), (0, "column"))
-        if (pixels.mean(axis=axis) > _WHOLE).any()
+        if (pixels.mean(axis=axis) > _LINE_SHARE).any()
     ]
     if not where:
         y, x = np.nonzero(pixels)
@@ -64,7 +65,7 @@ def find_unsteady(
     """
     frames = np.array([len(block) for block in blocks])
     freedom = int((frames - 1).sum()), len(blocks) - 1
-    if freedom[0] < _FEWEST or freedom[1] < 4:
+    if freedom[0] < _FEWEST_FRAMES or freedom[1] < 4:
         return None
     shape = blocks[0].shape[1:]
     summed = np.zeros(shape)
@@ -94,7 +95,9 @@ def find_unsteady(
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
-        if scatter is slow and usual > _CHANGING:  # by the light or the stage, and in what pattern
+        if (
+            scatter is slow and usual > _SLOW_CHANGE_RATIO
+        ):  # by the light or the stage, and in what pattern
             continue
         limit = chdtri(number, _CHANCE) / number
         more = ratio > usual * limit
@@ -106,7 +109,7 @@ def find_unsteady(
         if scatter is fast:
             found |= _noisy_lines(ratio, lit, usual, least_beside)
     found &= lit
-    return found if 0 < found.mean() < _MOST else None
+    return found if 0 < found.mean() < _MOST_PIXEL_SHARE else None
 
 
 def _largest_neighbour(values: FloatArray) -> FloatArray:
@@ -139,15 +142,15 @@ def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: 
     """Find rows and columns in which most pixels scatter more than in the neighbouring lines."""
     noisy = np.zeros(ratio.shape, dtype=np.bool_)
     for axis in (0, 1):
-        lines = np.flatnonzero(lit.mean(axis=axis) > _WHOLE)
+        lines = np.flatnonzero(lit.mean(axis=axis) > _LINE_SHARE)
         if lines.size < _AROUND:
             continue
         seen = np.where(lit, ratio, np.nan).take(lines, axis=1 - axis)
         excess = np.nanmedian(seen, axis=axis) - usual
-        spread = _NORMAL * float(np.median(np.abs(excess - np.median(excess))))
+        spread = _SIGMA_PER_MAD * float(np.median(np.abs(excess - np.median(excess))))
         padded = np.pad(excess, 1, mode="reflect")
         neighbours = np.maximum(padded[:-2], padded[2:])
-        off = excess > max(_LINE * usual, _LINE_SIGMAS * spread)
+        off = excess > max(_LEAST_LINE_EXCESS * usual, _LINE_SIGMAS * spread)
         odd = lines[off & (neighbours < least_beside * excess)]
         noisy[(slice(None), odd) if axis == 0 else odd] = True
     return noisy

@@ -17,7 +17,7 @@ from iscat_analysis.units import count
 SMALL_P = 0.01
 """A p-value below which a fit is counted as poor."""
 
-MANY_SMALL = 0.1
+MOST_SMALL_P_SHARE = 0.1
 """Share of small p-values, ten times the expected one, above which the model is doubted."""
 
 LARGEST_NOISE_RATIO = 1.5
@@ -26,10 +26,10 @@ LARGEST_NOISE_RATIO = 1.5
 FAR_PX = 1.0
 """Drift of the fixed pattern that is told [px]."""
 
-FEW = 10
+FEW_EVENTS = 10
 """Fewer events tell no species."""
 
-OUTSIDE = 0.1
+MOST_OUTSIDE_SHARE = 0.1
 """Share of the masses beyond the standards that is told."""
 
 NEAR_STANDARD = 0.05
@@ -68,11 +68,11 @@ def judge(
     if moved is not None and moved > FAR_PX and not landing.get("drift_corrected"):
         cautions.append(f"the pattern drifts {moved:.1f} px")
     small = float(np.mean(p_values < SMALL_P)) if p_values.size else None
-    if small is not None and small > MANY_SMALL and p_values.size >= FEW:
+    if small is not None and small > MOST_SMALL_P_SHARE and p_values.size >= FEW_EVENTS:
         cautions.append(f"{100 * small:.0f} % of p-values below {SMALL_P:g}")
     if summary.get("repeats", {}).get("understated"):
         cautions.append("σ is smaller than the measured spread")
-    if summary["events"] < FEW and movie.row.role != "blank":
+    if summary["events"] < FEW_EVENTS and movie.row.role != "blank":
         cautions.append(f"{count(summary['events'], 'event')}, too few for species")
     optics, focus = _optics(summary, config, day)
     if optics.startswith(("learned from this", "rejected")):
@@ -83,7 +83,7 @@ def judge(
     if scale.startswith(("none", "another")):
         cautions.append(f"mass scale: {scale}")
     outside = _outside(masses_kda, day)
-    if outside is not None and outside > OUTSIDE and masses_kda.size >= FEW:
+    if outside is not None and outside > MOST_OUTSIDE_SHARE and masses_kda.size >= FEW_EVENTS:
         low, high = min(day.standards_kda), max(day.standards_kda)
         cautions.append(
             f"{100 * outside:.0f} % of masses are beyond the standards, {low:g} to {high:g} kDa"

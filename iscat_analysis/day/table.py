@@ -36,7 +36,7 @@ COLUMNS = (
 TABLES = ("samples.csv", "samples.toml")
 """The table of a folder that is watched."""
 
-_CLOSE = 0.85  # likeness of a column's name to one that has a meaning
+_LEAST_LIKENESS = 0.85  # likeness of a column's name to one that has a meaning
 _LISTED_PROBLEMS = 5  # complaints in one line
 
 
@@ -232,7 +232,7 @@ def _names(source: Path, cells: list[str]) -> list[str]:
 def _check_names(source: Path, names: Sequence[str], where: str) -> None:
     """Refuse a table without paths, and a column whose name is a misspelled key."""
     for name in names:
-        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_CLOSE)
+        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_LEAST_LIKENESS)
         if near and name not in COLUMNS and near[0] not in names:
             raise ConfigError(
                 f"{source}: {where} has the column {name}: did you mean {near[0]}? If not, give it "

@@ -14,9 +14,10 @@ from iscat_analysis.camera.learned import LearnedCamera
 from iscat_analysis.camera.metadata import GainDiagnosis
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 
-_SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
+# Of the noise, and of masses if it is the offset, that is not left unsaid
+_LEAST_NOISE_ERROR = 0.03
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
-SAID = ("other light", "read noise")
+REPORTED_LAWS = ("other light", "read noise")
 """Laws by which noise is not what the camera's numbers predict, as `law_messages` has it."""
 
 _OTHERS = {
@@ -25,7 +26,7 @@ _OTHERS = {
     "noisy light": "light that is noisy by itself",
     "other light": "light that does not follow the laser",
 }
-_SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
+_SUBTRACTED_SIGMAS = 4.0  # standard errors below no counts, where no camera has its offset
 
 
 def zero_by_law(law: Law, level_e: float) -> LightZero | None:
@@ -131,7 +132,7 @@ def offset_message(zero: LightZero, camera: Camera) -> str:
     )
     if np.ndim(camera.offset_adu):
         message += "record a dark for `iscat calibrate camera --maps`"
-    elif found < -_SUBTRACTED * se:
+    elif found < -_SUBTRACTED_SIGMAS * se:
         message += "see whether counts were subtracted from the movie; record raw counts"
     else:
         message += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
@@ -147,7 +148,11 @@ def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: 
     An offset that is wrong by a share s of the light leaves 1 − s of the expected noise.
     """
     share = 1 - gain.noise_ratio
-    if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
+    if (
+        gain.shakes
+        or gain.noise_counts < 1
+        or abs(share) < _LEAST_NOISE_ERROR + 3 * gain.noise_ratio_se
+    ):
         return ""
     if zero is not None and not zero.may_be(share):
         return ""

@@ -29,16 +29,16 @@ FLAT = 0.05
 """Variance of the steps along z over that in the plane, below which particles move in a plane:
 near the coverslip those that do not have less along z too, but not so much less."""
 
-_RINGS = 0.01  # of the light, which rings of many bright particles make uneven
+_RING_UNEVENNESS = 0.01  # of the light, which rings of many bright particles make uneven
 _LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
-_GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
+_SIGMA_PER_MAD = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
 _LEAST_SCALE_CHANGE = 0.01  # change of the scale that makes it worth a line
-_SWAPPED = 10.0  # times less change along the axis of time than along both of space
+_LEAST_CHANGE_RATIO = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
-_MOSTLY = 0.5  # of fits that are poor
+_MOST_POOR_SHARE = 0.5  # of fits that are poor
 _SMEARED_NM = 20.0  # from where most fits of bright particles are,
 _DESCRIBED_NM = 15.0  # and where hardly any is
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
@@ -70,7 +70,7 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
         changes.append(float(np.mean(steps**2)) if lit.sum() > 1 else math.nan)
     for axis, lines_of in ((1, "rows"), (2, "columns")):
         others = min(changes[0], changes[3 - axis])
-        if _SWAPPED * changes[axis] < others:
+        if _LEAST_CHANGE_RATIO * changes[axis] < others:
             return (
                 f"{name}: frames differ more from each other than neighbouring {lines_of} of one "
                 f"frame do ({math.sqrt(others / changes[axis]):.0f} times), as if time ran along "
@@ -136,9 +136,9 @@ def uneven_warning(
     noise = after + windows.read_variance_after_e2[used]
     shot = math.sqrt(max(float(np.median(noise / expected**2)), 0.0))
     middle = float(np.median(light))
-    spread = _GAUSS * float(np.median(np.abs(light - middle)))
+    spread = _SIGMA_PER_MAD * float(np.median(np.abs(light - middle)))
     uneven = math.sqrt(max(spread**2 - shot**2, 0.0))
-    if uneven <= max(shot, 0.0 if explained is not None else _RINGS * middle):
+    if uneven <= max(shot, 0.0 if explained is not None else _RING_UNEVENNESS * middle):
         return ""
     times = float(f"{uneven / shot:.2g}")
     advice = "give frames without particles as background.frames"
@@ -306,7 +306,7 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
         return ""
     poor = table["flags"].fillna("").str.contains(Status.POOR_FIT.value)
     smear = float(np.median(smear_nm))
-    if poor.mean() < _MOSTLY or smear < _SMEARED_NM:
+    if poor.mean() < _MOST_POOR_SHARE or smear < _SMEARED_NM:
         return ""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if exposure is None and rate is not None:

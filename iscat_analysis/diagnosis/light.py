@@ -28,7 +28,8 @@ PAIRS = 12
 _LEAST_PAIRS = 3  # of a range of frames
 _FRAMES_SUMMED = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
-_NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
+# Of half the movie, of every second of these: what comes again must not be missed
+_SHORTER_GAP = 0.62
 # Every how many-th place in the background is also compared with the frames after it.
 _BACKGROUND_STRIDE = 2
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
@@ -146,7 +147,7 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         room = stop - gap - frames_each - start
         # no pair has another's frames
         number = min(pairs_wanted // len(spans), room // frames_each + 1)
-        gaps = (gap, math.ceil(_NEARER * gap)) if mode == "tracks" else (gap,)
+        gaps = (gap, math.ceil(_SHORTER_GAP * gap)) if mode == "tracks" else (gap,)
         for k, frame in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
             pairs_read.append((frame, frame + gaps[k % len(gaps)]))
             parts += [movie.read(k, k + frames_each) for k in pairs_read[-1]]

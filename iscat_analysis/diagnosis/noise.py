@@ -19,7 +19,7 @@ from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.camera.successive import shared_light
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import (
-    SAID,
+    REPORTED_LAWS,
     allow_for_correlation,
     offset_is_wrong,
     offset_message,
@@ -48,11 +48,12 @@ SPECTRUM_FRAMES = 128
 
 _GAIN_FRAMES = 64  # on which the gain is judged
 _FEWEST_FRAMES = 8  # on which it is judged beside particles that move
-_FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
-_AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
+_LEAST_FREE_SHARE = 0.25  # share of the pixels that no particle may come near in the frames judged
+# λ/NA from a particle, from where its light changes the variance by some per cent
+_LEAST_DISTANCE = 1.5
 _ENOUGH_FITS = 10  # of which the best
 _BEST_FITS = 0.1  # leave over the noise and no more; this quantile is theirs
-_LESS = 0.75  # of the noise, which small pictures leave over by chance at least
+_MOST_NOISE_SHARE = 0.75  # of the noise, which small pictures leave over by chance at least
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,7 @@ class Noise:
         if self.excess is None or len(known) < _ENOUGH_FITS:
             return self
         least = float(np.quantile(known, _BEST_FITS))
-        return Noise() if least < _LESS * self.excess.ratio else self
+        return Noise() if least < _MOST_NOISE_SHARE * self.excess.ratio else self
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -118,7 +119,7 @@ def judge_counts(
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
     law = camera.law
-    if law is not None and (law.bent or law.kind in SAID):  # already
+    if law is not None and (law.bent or law.kind in REPORTED_LAWS):  # already
         excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
         return Noise((), gain.off, excess, spectrum)
     if law is not None:
@@ -190,7 +191,7 @@ def judge_beside(
     Shapes: `seen` (n,), `used` (y, x).
     """
     optics = context.config.optics
-    away = _AWAY * optics.wavelength_nm / optics.na
+    away = _LEAST_DISTANCE * optics.wavelength_nm / optics.na
     y, x = np.indices(used.shape) * context.pixel_nm
     pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
@@ -198,7 +199,7 @@ def judge_beside(
     while count >= _FEWEST_FRAMES:
         near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
-        if free.any() and free.sum() >= _FREE * used.sum():
+        if free.any() and free.sum() >= _LEAST_FREE_SHARE * used.sum():
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
             if judge_counts(counts, camera, masked=~free, additive=additive).messages:

@@ -45,8 +45,9 @@ MAX_ROUNDS = 8
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
 _MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
-_TRIED = 0.1  # share of the χ² in excess that a particle explains which is tried among others
-_SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
+# Share of the χ² in excess that a particle explains which is tried among others
+_LEAST_EXPLAINED_SHARE = 0.1
+_LEAST_SNR_CHANGE = 0.1  # change of signal-to-noise ratios from one sweep to the next
 _AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
@@ -126,7 +127,9 @@ def _with_concealed(
     for _ in range(MAX_ROUNDS):
         if not any(Status.POOR_FIT in event.fit.flags for event in trial):
             break
-        fresh, _ = search_field(context, power, trial, excess_noise, explains=_TRIED)
+        fresh, _ = search_field(
+            context, power, trial, excess_noise, explains=_LEAST_EXPLAINED_SHARE
+        )
         if not fresh:
             break
         both = _fit_all(context, power, [*(e.candidate for e in trial), *fresh], trial, pool)
@@ -349,7 +352,7 @@ def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: floa
     places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in after])
     apart = np.hypot(*(places[:, None] - places).T) + 2 * near_px * np.eye(len(places))
     moved = np.array([a.snr - b.snr for a, b in zip(before, after, strict=True)])
-    return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
+    return bool(np.all((np.abs(moved) < _LEAST_SNR_CHANGE) | (apart.min(axis=0) > near_px)))
 
 
 def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list[Fitted]:

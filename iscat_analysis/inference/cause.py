@@ -83,7 +83,7 @@ _UNITS = {
 _NAMES = (*_STEPS, PIXEL, _TURNED, *_OTHERS)
 _WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
 _WHOLE_STEP = 0.5  # of one that is tried whole, which the residuals ask for at least
-_STRETCH = 30.0  # per cent, farther than which no pixel size is tried
+_MOST_SCALE_CHANGE = 30.0  # per cent, farther than which no pixel size is tried
 
 _Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
 
@@ -316,7 +316,7 @@ def _neighbours(
     """
     optics = config.optics
     if name == PIXEL:
-        percent = 1.0 if far is None else max(min(far, _STRETCH), -_STRETCH)
+        percent = 1.0 if far is None else max(min(far, _MOST_SCALE_CHANGE), -_MOST_SCALE_CHANGE)
         larger = 1 + percent / 100
         model = forward_model(config, reach_nm * max(1.01 * larger, 1.0))
 

@@ -27,8 +27,9 @@ SIGNIFICANT = 3.0
 LEAST_EXCESS = 0.02
 """Relative excess below which nothing is said."""
 
-_DRIFTS = 4.0  # growth of the excess from half a window to a whole one, above which it is a drift
-_WIDEST = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
+# Growth of the excess from half a window to a whole one, above which it is a drift
+_LEAST_DRIFT_GROWTH = 4.0
+_MOST_HALF_WIDTH = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
 _FEWEST_TILES = 6
 _FEWEST_COUNTS = 200
 
@@ -72,7 +73,7 @@ class EmpiricalSpread:
             near, far = (max(self.by_frames[k] ** 2 - self.fast2, 1e-3) for k in (0, -1))
             return far / near > self.frames[-1] / self.frames[0] > 1
         halves, whole = (self.empty[k] ** 2 for k in (-2, -1))
-        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _DRIFTS
+        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _LEAST_DRIFT_GROWTH
 
     @property
     def exceeds(self) -> bool:
@@ -116,7 +117,7 @@ def pooled(
     ratio2 = max(found.ratio2, 1e-6)
     error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
     ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
-    reach = min(float(stdtrit(degrees, 0.975)) * error, _WIDEST)
+    reach = min(float(stdtrit(degrees, 0.975)) * error, _MOST_HALF_WIDTH)
     # what Student's law makes of the error, in normal standard errors
     chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
     significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))

@@ -22,8 +22,8 @@ from scipy.special import ndtr
 
 from iscat_analysis.records import FloatArray
 
-_HIGHEST = 40.0  # no threshold is larger
-_FINEST = 1e-10  # to which a level is found
+_HIGHEST_LEVEL = 40.0  # no threshold is larger
+_LEVEL_TOLERANCE = 1e-10  # to which a level is found
 
 LOWEST = 2.0
 """Level from which on both terms of N fall as it rises."""
@@ -104,12 +104,12 @@ class Excursions:
         if not self.area > 0 or excess(low) <= 0:
             return lowest
         high = low
-        while excess(high) > 0 and high < _HIGHEST:
-            high = min(high + 1.0, _HIGHEST)
+        while excess(high) > 0 and high < _HIGHEST_LEVEL:
+            high = min(high + 1.0, _HIGHEST_LEVEL)
         # by halves: loading SciPy's search of roots takes longer than a small search for particles
-        steps = range(math.ceil((high - low) / _FINEST))
-        few = bisect_left(steps, True, key=lambda k: excess(low + k * _FINEST) <= 0)
-        return low + few * _FINEST
+        steps = range(math.ceil((high - low) / _LEVEL_TOLERANCE))
+        few = bisect_left(steps, True, key=lambda k: excess(low + k * _LEVEL_TOLERANCE) <= 0)
+        return low + few * _LEVEL_TOLERANCE
 
 
 def height_reached(

@@ -30,11 +30,11 @@ from iscat_analysis.search.residue import RINGS, chi2_excess
 from iscat_analysis.search.sliding import STRIDES, Chunk
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
-_OUTLIER = 3.0  # standard deviations from which a pixel counts less
+_OUTLIER_SIGMAS = 3.0  # standard deviations from which a pixel counts less
 _FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
 _LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
-_LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
+_LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold where it hides others
 # Farthest that the centre may lie from the fit of the model, in sides of the region.
 _LARGEST_SHIFT_SHARE = 0.35
 
@@ -83,7 +83,7 @@ def _hides_others(step: Step, threshold: float) -> bool:
     described = step.excess < _LITTLE * step.snr**2
     if described and RINGS * step.start.snr > threshold:
         return True
-    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEFT) ** 2)
+    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEAST_MISFIT_SHARE) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
@@ -190,5 +190,5 @@ def ring_average(
         image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
         off = np.abs(value - image) * accuracy
         scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
-        kept = accuracy**2 * np.minimum(1.0, _OUTLIER * scale / np.maximum(off, 1e-9)) ** 2
+        kept = accuracy**2 * np.minimum(1.0, _OUTLIER_SIGMAS * scale / np.maximum(off, 1e-9)) ** 2
     return np.asarray(image.reshape(contrast.shape))

@@ -32,7 +32,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 WHOLE = (slice(None), slice(None))
 """All of an image."""
 
-_WEAK = 0.05  # contrast up to which several add up
+_WEAK_CONTRAST = 0.05  # contrast up to which several add up
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ class Neighbours:
 
         A weak one has the same image, its own, at all times.
         """
-        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
+        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK_CONTRAST
         if strong or step.is_measured or self._pattern is not None:
             return self.factor(step, before, after) - 1, 1.0
         return step.image, self.presence(step, after) - self.presence(step, before)

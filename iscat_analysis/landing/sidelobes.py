@@ -18,7 +18,7 @@ from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, RINGS, is_hidden, s
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
 
-_RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
+_RESIDUE_SHARE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class SidelobeFilter:
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
-        share = _RESIDUE if on_top else 0.0 if step.is_measured else RINGS
+        share = _RESIDUE_SHARE if on_top else 0.0 if step.is_measured else RINGS
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:

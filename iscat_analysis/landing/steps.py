@@ -52,9 +52,10 @@ ROUNDS = 10
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
-_EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
+# Of the threshold; a fit that reaches less is what other steps explain
+_LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
-_MUCH = 5.0  # times the mass of a step that another has, of whose light it may be
+_LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
 @dataclass(frozen=True)
@@ -330,7 +331,7 @@ class ChunkFitter:
             task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
             task.at.rise,
         )  # fmt: skip
-        if event.snr < _EXPLAINED * context.templates.threshold:
+        if event.snr < _LEAST_THRESHOLD_SHARE * context.templates.threshold:
             return None
         step = replace(step, at=task.at)
         seen = (
@@ -374,7 +375,10 @@ class ChunkFitter:
         frame = np.array([s.at.frame for s in steps])
         width = np.array([s.at.half_width for s in steps])
         x_px, y_px = _places(steps)
-        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._context.templates.threshold
+        kept = (
+            np.array([s.snr for s in steps])
+            > _LEAST_THRESHOLD_SHARE * self._context.templates.threshold
+        )
         for number in np.flatnonzero(kept).tolist():
             same = kept[:number] & (sign[:number] == sign[number])
             same &= np.abs(frame[:number] - frame[number]) <= np.maximum(
@@ -395,7 +399,7 @@ def _has_moved(old: Step, new: Step) -> bool:
 
 def _outshines(other: Step, step: Step) -> bool:
     """Whether a step may be what is left of another, much stronger one whose light rises slowly."""
-    return other.at.rise > 0 and other.start.mass_kda > _MUCH * step.start.mass_kda
+    return other.at.rise > 0 and other.start.mass_kda > _LEAST_MASS_RATIO * step.start.mass_kda
 
 
 def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:

@@ -39,7 +39,7 @@ from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread
 from iscat_analysis.tracking.tracks import judge_times
 
-_OPENING = 64  # frames that are looked at before anything else
+_FIRST_FRAMES = 64  # frames that are looked at before anything else
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
@@ -74,7 +74,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
-    stop = min(stop, start + _OPENING, movie.shape[0])
+    stop = min(stop, start + _FIRST_FRAMES, movie.shape[0])
     seen = movie.read(start, max(start, stop))
     if mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")

@@ -54,7 +54,7 @@ from iscat_analysis.tracking.moving_field import (
 Redraw = Callable[[int], EventView]
 """Row of the table → its images."""
 
-_TURNS = 3  # of level and power of a background under particles that are known
+_BACKGROUND_TURNS = 3  # of level and power of a background under particles that are known
 
 
 def redraw(
@@ -235,7 +235,7 @@ def _moving(
             follows = config.background.power_normalization
             ground = initial_background(config, field)
             restore_particle_light(context, field, movie, camera, start, ground, rows)
-            for _ in range(_TURNS):
+            for _ in range(_BACKGROUND_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level
                 ground = BackgroundEstimate(level, found.power if follows else ground.power)

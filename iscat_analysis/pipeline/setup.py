@@ -36,8 +36,8 @@ SAMPLES = ("protein", "gold", "silica", "polystyrene")
 """Kinds of samples: what the particles are made of."""
 
 _PREVIEW_PLACES = 5  # places in a movie at which the search looks
-_LIT = 16  # frames whose light is averaged
-_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
+_LIGHT_FRAMES = 16  # frames whose light is averaged
+_SIGMA_PER_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _search_preview(preview: Preview) -> dict[str, Any]:
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
     found = [look.found() for look in looks]
-    lit = preview.steady.read(first, min(first + _LIT, last))
+    lit = preview.steady.read(first, min(first + _LIGHT_FRAMES, last))
     strongest = max((float(table["snr"].abs().max()) for table in found if len(table)), default=0.0)
     return {
         "frames": [look.frame for look in looks],
@@ -253,7 +253,9 @@ def _spread(image: np.ndarray[Any, Any]) -> float:
     Shapes: `image` (y, x).
     """
     used = image[np.isfinite(image)]
-    return float(_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
+    return (
+        float(_SIGMA_PER_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
+    )
 
 
 def _toml_text(setup: Setup) -> str:

@@ -27,7 +27,7 @@ and n/2 frames on one side."""
 FEWEST_PLACES = 60
 """Places below which nothing is said."""
 
-_TRIM = 4.0  # robust standard deviations beyond which something else than noise is there
+_TRIM_SIGMAS = 4.0  # robust standard deviations beyond which something else than noise is there
 _KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
 _NORMAL_QUARTILE = 0.6744897501960817
 _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where nothing is measured
@@ -169,7 +169,7 @@ class EmptyField:
             noise = noise * left[:, kept]
         whole = (means[1] - means[0]) / np.sqrt(noise)
         scale = np.median(np.abs(whole), axis=1, keepdims=True) / _NORMAL_QUARTILE
-        quiet = np.all(np.abs(whole) < _TRIM * scale, axis=0)
+        quiet = np.all(np.abs(whole) < _TRIM_SIGMAS * scale, axis=0)
         if quiet.sum() < FEWEST_PLACES:
             return nothing
         found = [(whole**2 / _KEPT_VARIANCE, 1)]

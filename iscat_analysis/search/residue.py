@@ -40,7 +40,7 @@ is not measured."""
 _EXCESS_SIGMAS = 3.0  # of χ²'s own scatter, below which an excess may be noise
 _RING_PX = 2.0  # on either side of the candidate's distance
 _SECTOR_PX = 4.0  # of the ring, along it
-_HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
+_RING_QUANTILE = 0.8  # share of the ring that is lower than what counts as its height
 _PATCH_PX = 5.0  # around the candidate, which is its own
 
 
@@ -110,4 +110,4 @@ def size_on_ring(
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
         return 0.0
-    return float(np.interp(_HEIGHT * (seen.size - 1), np.arange(seen.size), seen))
+    return float(np.interp(_RING_QUANTILE * (seen.size - 1), np.arange(seen.size), seen))

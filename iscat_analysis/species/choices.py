@@ -6,8 +6,8 @@ A ladder is oligomers: n_k copies of one monomer at
 
 m₁ free or held, b free or zero.  Which n there are is given, or found: from all that the masses
 reach, the rung with the fewest events goes as long as BIC falls.  Where no monomer is named, masses
-of free species over small numbers are tried, and the heaviest that is within `_TIE` of the least
-BIC is taken, for half of a monomer's mass explains as much as the monomer.
+of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the least
+is taken, for half of a monomer's mass explains as much as the monomer.
 
 Given masses and ladders share one width τ unless widths are free, and stand on a background: a
 species of fixed, great width that takes what is none of them.
@@ -37,10 +37,10 @@ Widths = Literal["common", "free"]
 MOST_RUNGS = 12
 """Rungs that a ladder without given steps may have."""
 
-_TIE = 6.0  # of BIC
-_SMALL = 4  # multiples that a free species may be
+_BIC_TIE = 6.0  # of BIC
+_MOST_FREE_MULTIPLES = 4  # multiples that a free species may be
 _REACH = 0.97  # quantile of the masses that the ladder must reach
-_WIDEST = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
+_MOST_RELATIVE_WIDTH = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
 _SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
 
 
@@ -136,12 +136,14 @@ class Ladder:
         if self.monomer_kda is not None:
             return self._from(events, self.monomer_kda)
         free = Searched().choose(events).best
-        wanted = sorted({float(m / n) for m in free.mean for n in range(1, _SMALL + 1)})
+        wanted = sorted(
+            {float(m / n) for m in free.mean for n in range(1, _MOST_FREE_MULTIPLES + 1)}
+        )
         least = 0.5 * float(events.x.min())
         found = [self._from(events, m) for m in wanted if m >= least]
         n = events.x.size
         bic = np.array([one.best.bic(n) for one in found])
-        near = [one for one, value in zip(found, bic, strict=True) if value < bic.min() + _TIE]
+        near = [one for one, value in zip(found, bic, strict=True) if value < bic.min() + _BIC_TIE]
         return max(near, key=lambda one: one.best.mean[0] / one.steps[0])
 
     def _from(self, events: Events, monomer: float) -> Chosen:
@@ -251,7 +253,7 @@ def rungs(
         start[1, k] = (low + high) / 2
         start[2, k] = max((high - low) / 2, unit_kda) ** 2
     sigma = max(float(np.median(events.sigma)), 1e-9)
-    widest = (_WIDEST * unit_kda) ** 2
+    widest = (_MOST_RELATIVE_WIDTH * unit_kda) ** 2
     return Structure(design, start), Limits(
         np.concatenate([np.full(every - 1, -LOGIT_REACH), ranges[0], np.zeros(q)]),
         np.concatenate([np.full(every - 1, LOGIT_REACH), ranges[1], np.full(q, widest)]),

@@ -30,7 +30,7 @@ from iscat_analysis.records import FloatArray
 _Factor = tuple[FloatArray, bool]
 
 _ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
-_SETTLED = 1e-9  # of the mass
+_MASS_TOLERANCE = 1e-9  # of the mass
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def combine_masses(
     for _ in range(_ROUNDS):
         before, there = mass, _at(mass, mass_kda, power)
         mass, variance = _least_squares(mass_kda, sigma_kda * there, factor)
-        if abs(mass - before) <= _SETTLED * abs(mass):
+        if abs(mass - before) <= _MASS_TOLERANCE * abs(mass):
             break
     there = _at(mass, mass_kda, power)
     _, bound = _least_squares(mass_kda, crb_kda * there, factor)

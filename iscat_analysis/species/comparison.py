@@ -57,7 +57,7 @@ COMPARISON_COLUMNS = (
 other's less the first's, intervals are 95 %, fractions are of the particles that came."""
 
 _TWO_SIDED_95 = 1.959964
-_BROAD = 0.3  # width over mass
+_MOST_RELATIVE_WIDTH = 0.3  # width over mass
 _TOLERANCE = 1e-9  # of the log-likelihood per event: 2·10⁻⁵ of χ² for 10 000 events
 
 
@@ -131,7 +131,7 @@ def compare(
     known = start.weight.size - int(background)
     samples = (first, other)
     seen = np.array([start.shares(events).sum(axis=0)[:known] for events in samples])
-    narrow = np.sqrt(start.variance[:known]) < _BROAD * start.mean[:known]
+    narrow = np.sqrt(start.variance[:known]) < _MOST_RELATIVE_WIDTH * start.mean[:known]
     moves = (seen.min(axis=0) >= LEAST_COMPARED) & narrow
     free = _Hypothesis(samples, start, known, moves, own_fractions=True)
     full = free.fit(start)

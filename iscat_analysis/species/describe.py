@@ -55,9 +55,9 @@ is where its events lie at the lowest, without error or interval, and what came 
 its fraction; those of the others are among the others."""
 
 _TWO_SIDED_95 = 1.959964
-_ENDS = (0.025, 0.975)
+_INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
-_BROAD = 0.4  # width over mass
+_MOST_RELATIVE_WIDTH = 0.4  # width over mass
 _NO_LADDER = 0.01  # p-value
 _DIGITS = 6  # of the curves in summary.json
 
@@ -241,7 +241,7 @@ def _table(
         if not values:
             nothing = np.full(best.weight.size, math.nan)
             return nothing, nothing
-        low, high = np.quantile(np.array(values), _ENDS, axis=0, method=_UNBIASED)
+        low, high = np.quantile(np.array(values), _INTERVAL_ENDS, axis=0, method=_UNBIASED)
         return low, high
 
     mass_low, mass_high = interval([r.mixture.mean for r in repeats])
@@ -306,7 +306,7 @@ def _ladder(
     error, low, high = (np.full(2, math.nan) for _ in range(3))
     if len(drawn) > 1:
         error = drawn.std(axis=0, ddof=1)
-        low, high = np.quantile(drawn, _ENDS, axis=0, method=_UNBIASED)
+        low, high = np.quantile(drawn, _INTERVAL_ENDS, axis=0, method=_UNBIASED)
     scale = np.zeros(1) if scale_error is None else scale_error(np.array([monomer]))
     below, above = (float(_widening(np.array([r]), scale)[0]) for r in
                     (monomer - low[0], high[0] - monomer))  # fmt: skip
@@ -365,7 +365,7 @@ def _remarks(species: pd.DataFrame) -> list[str]:
             f"what lies at {{}} kDa is fewer than {LEAST_SPECIES} events: outliers, and no species",
         ),
         (
-            species["width_kda"] > _BROAD * species["mass_kda"],
+            species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
             "the species at {} kDa is as broad as a background: read it as what the other species "
             "leave over",
         ),

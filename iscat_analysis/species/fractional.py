@@ -22,12 +22,13 @@ from iscat_analysis.species.displacements import Displacements
 
 _EXPONENTS = (0.02, 1.98)
 _LN_D = 20.0  # from ln D of free diffusion at most
-_FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
-_PART = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
-_SETTLED = 0.1  # standard errors: of a step of Newton's method that is the last one
+# An exposure this small a part of a lag blurs by a series; the closed form cancels
+_SHORT_EXPOSURE = 1e-2
+_EXPONENT_STEP = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
+_LAST_STEP_SIGMAS = 0.1  # standard errors: of a step of Newton's method that is the last one
 _NO_STEP = 1e-6  # of ln D and α
-_MOST = 50  # steps
-_SMALL = 80  # rows of a matrix that is not halved to be inverted
+_MOST_STEPS = 50  # steps
+_MOST_ROWS_DIRECT = 80  # rows of a matrix that is not halved to be inverted
 
 
 class Fractional(NamedTuple):
@@ -73,9 +74,9 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
     here = _likelihood(track, lags, free, 1.0)
     if not math.isfinite(here.value):
         return Fractional(here.value, free, 1.0, math.nan)
-    for _ in range(_MOST):
+    for _ in range(_MOST_STEPS):
         step, gain = _newton(here, low - at, high - at)
-        if 2 * gain < _SETTLED**2:
+        if 2 * gain < _LAST_STEP_SIGMAS**2:
             break
         there = _likelihood(track, lags, *_powers(at + step))
         while not there.value > here.value and np.abs(step).max() > _NO_STEP:
@@ -108,11 +109,12 @@ def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArr
 def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
     """Log-likelihood of fractional Brownian motion, all axes; −∞ where rounding spoils it."""
     before, there, after = (
-        d * _msd(track, lags.distinct, power) for power in exponent + _PART * np.arange(-1, 2)
+        d * _msd(track, lags.distinct, power)
+        for power in exponent + _EXPONENT_STEP * np.arange(-1, 2)
     )
     motion = covariance(lags, there)
-    turn = covariance(lags, (after - before) / (2 * _PART))
-    motion_curvature = covariance(lags, (after - 2 * there + before) / _PART**2)
+    turn = covariance(lags, (after - before) / (2 * _EXPONENT_STEP))
+    motion_curvature = covariance(lags, (after - 2 * there + before) / _EXPONENT_STEP**2)
     n = len(motion)
     value, slope = -0.5 * track.steps_nm.size * math.log(2 * math.pi), np.zeros(2)
     curvature, information = np.zeros((2, 2)), np.zeros((2, 2))
@@ -155,7 +157,7 @@ def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
     SciPy calls it, does not.
     """
     n = len(sigma)
-    if n <= _SMALL:
+    if n <= _MOST_ROWS_DIRECT:
         factor = np.linalg.cholesky(sigma)
         out = np.asarray(np.linalg.inv(sigma), dtype=np.float64)
         return out, 2 * float(np.log(np.diag(factor)).sum())
@@ -182,7 +184,7 @@ def _msd(track: Displacements, lags: FloatArray, exponent: float) -> FloatArray:
         high = exponent + 2
         closed = (lags + e) ** high + np.abs(lags - e) ** high - 2 * lags**high
         closed /= e**2 * (exponent + 1) * high
-        far = lags * _FLASH > e
+        far = lags * _SHORT_EXPOSURE > e
         series = 1 + exponent * (exponent - 1) / 12 * (e / np.where(far, lags, 1.0)) ** 2
         smooth = np.where(far, smooth * series, closed)
     return np.asarray(2 * track.interval_s * (smooth - smooth[0]))

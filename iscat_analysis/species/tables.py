@@ -46,13 +46,14 @@ from iscat_analysis.units import count
 UNKNOWN_SIGMA_KDA = 1.0
 """Error of an event whose table has none [kDa]."""
 
-_CLEAR = 3.0  # standard deviations above the threshold, where hardly any is missed
+_CLEAR_SIGMAS = 3.0  # standard deviations above the threshold, where hardly any is missed
 _LEAST_EXTRA = 0.05  # of σ_d: noise of the filter's estimate beyond that of the fit
-_ENOUGH = 10  # events to measure σ_d by
+_FEWEST_EVENTS = 10  # events to measure σ_d by
 _NEAR_EDGE = 10  # values that tell where a distribution begins
-_SHARP = 1e-6  # of a cut: its width
+_CUT_WIDTH = 1e-6  # of a cut: its width
 _OURS = ("fits.parquet", "fits.csv")
-_NEAREST = 0.5  # of the lightest mass, and the heaviest over it, between which an event must lie
+# Of the lightest mass, and the heaviest over it, between which an event must lie
+_LEAST_MASS_RATIO = 0.5
 _LARGEST = 2_000_000_000  # bytes
 _FRAMES, _PIXELS, _RATIOS = (0.0, 2.0**40), (0.0, 1e6), (0.0, 1e9)
 _RANGES = {
@@ -113,7 +114,7 @@ def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
 def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
     """Refuse masses of species without an event near them, such as masses in another unit."""
     seen = np.abs(np.concatenate([table.mass_kda for table in tables]))
-    low, high = _NEAREST * min(masses_kda), max(masses_kda) / _NEAREST
+    low, high = _LEAST_MASS_RATIO * min(masses_kda), max(masses_kda) / _LEAST_MASS_RATIO
     if not seen.size or ((seen >= low) & (seen <= high)).any():
         return
     middle = float(np.median(seen))
@@ -171,7 +172,7 @@ def event_table(
     edge = None
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
-        efficiency = _sharp(edge * (1 - 10 * _SHARP))
+        efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
     return replace(found, efficiency=efficiency, edge_kda=edge)
 
 
@@ -186,8 +187,8 @@ def filter_efficiency(
         return None
     each = mass / snr
     # Near the threshold those are seen whose estimate is too large; they would make σ_d too small.
-    clear = mass > (threshold_snr + _CLEAR) * float(np.median(each))
-    if np.count_nonzero(clear) >= _ENOUGH:
+    clear = mass > (threshold_snr + _CLEAR_SIGMAS) * float(np.median(each))
+    if np.count_nonzero(clear) >= _FEWEST_EVENTS:
         each = each[clear]
     elif "sigma_mass_kda" in good:
         sigma = good["sigma_mass_kda"].to_numpy(dtype=float)[known]
@@ -389,7 +390,7 @@ def _edge(values: FloatArray) -> float:
 
 def _sharp(edge_kda: float) -> Efficiency:
     """Efficiency that is 1 above a mass and 0 below."""
-    return Efficiency(1 / _SHARP, edge_kda * _SHARP)
+    return Efficiency(1 / _CUT_WIDTH, edge_kda * _CUT_WIDTH)
 
 
 def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:

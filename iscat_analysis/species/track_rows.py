@@ -16,7 +16,7 @@ from iscat_analysis.records import BoolArray, FloatArray, Status, track_numbers
 NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 """Of rows that do not say how a particle moves."""
 
-_USELESS = 300.0  # times the median error: such a place says nothing
+_LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class TrackRows:
         missing.
         """
         errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
-        useful = errors <= _USELESS * of_known(np.median, errors)
+        useful = errors <= _LARGEST_ERROR_RATIO * of_known(np.median, errors)
         useful &= np.diff(self.frame, prepend=-1) > 0
         for status in NO_PLACE:
             useful &= self.status != status

@@ -65,16 +65,16 @@ SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
-_DOUBT = 0.1
+_MOST_DOUBTFUL_SHARE = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
 _LEAST_KNOWN_SHARE = 0.05  # of the information on a mass is left by the background
-_SEEN = 0.9  # of all frames, in which a particle that hardly moves is seen at least
+_LEAST_SEEN_SHARE = 0.9  # of all frames, in which a particle that hardly moves is seen at least
 # Relative error of a mass beyond which the error of D that it makes is reported.
 _LARGEST_SCALE_ERROR = 0.02
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
-_UM2 = 1e6  # nm²
+_NM2_PER_UM2 = 1e6  # nm²
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,7 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
     for _ in range(_DISPLACEMENT_PASSES):
         counted = inside
         d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
-        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _UM2 * gaps_s)
+        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _NM2_PER_UM2 * gaps_s)
         if inside.sum() < least - 1:
             return None
         if np.array_equal(inside, counted):
@@ -317,7 +317,7 @@ def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> di
     track = tuple(part[:TESTED_POSITIONS] for part in whole)
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
-    if walls.p_value <= _DOUBT:
+    if walls.p_value <= _MOST_DOUBTFUL_SHARE:
         walls = confinement_test(*track, **times, resamples=_FULL_LOOK, rng=rng)
     power = anomalous_test(*track, **times)
     return {
@@ -349,9 +349,9 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
 def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
     """Whether a particle that hardly moves is detected in only a part of the movie."""
     frames = setup.frames[1] - setup.frames[0]
-    if setup.frame_rate_hz is None or record["n_frames"] > _SEEN * frames:
+    if setup.frame_rate_hz is None or record["n_frames"] > _LEAST_SEEN_SHARE * frames:
         return False
-    way_nm = math.sqrt(2 * _UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
+    way_nm = math.sqrt(2 * _NM2_PER_UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
     return way_nm < setup.hidden_nm
 
 
@@ -359,7 +359,7 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     """Say whether the track begins and ends with the movie, at the border, or inside the field."""
     step_nm = 0.0
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
-        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _UM2 / setup.frame_rate_hz))
+        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _NM2_PER_UM2 / setup.frame_rate_hz))
     border, room = setup.near_nm + step_nm, _room(rows, setup)
     ends = {}
     for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):

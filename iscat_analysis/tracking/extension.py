@@ -23,8 +23,9 @@ LEAST_SHARE = 0.5
 """Of its track's mass that it needs beside another: one particle is not two of half the mass."""
 
 _SWEEPS = 6  # fits in turn of particles that overlap
-_MEETING = 1.5  # resolutions λ/NA within which particles are fitted from their predictions
-_SAME = 0.25  # resolutions within which two rows are one particle
+# Resolutions λ/NA within which particles are fitted from their predictions
+_MEETING_RESOLUTIONS = 1.5
+_SAME_RESOLUTIONS = 0.25  # resolutions within which two rows are one particle
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def extended(
         ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
     refitted: dict[int, Localizations] = {}
     added = 0
-    meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
+    meeting, same = _MEETING_RESOLUTIONS * resolution_nm, _SAME_RESOLUTIONS * resolution_nm
     while ends:
         proposed: dict[int, dict[int, _End]] = {}
         for end in ends:

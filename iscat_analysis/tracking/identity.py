@@ -44,7 +44,7 @@ MERGED_FRAMES = 100
 
 _APART_FRAMES = 5  # in which two must be apart before they meet again
 _NEIGHBOURS_FRAMES = 300  # who stay beside each other for longer are met by others one by one
-_NEVER = -1e9  # in log-likelihood
+_LOG_ZERO = -1e9  # in log-likelihood
 _MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
 
 IntArray = NDArray[np.int64]
@@ -206,7 +206,7 @@ def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
     gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
     linked = np.array([[a is b for b in go] for a in come])
     # what fits nothing may end or begin here if it does, and else goes on all the same
-    least = np.array([[0.0 if a.ends or b.begins else _NEVER for b in go] for a in come])
+    least = np.array([[0.0 if a.ends or b.begins else _LOG_ZERO for b in go] for a in come])
     worth = np.maximum(gain, least) + LEAST_GAIN / 2 * linked
     moves: dict[_Side, _Side] = {}
     for i, j in zip(*scipy.optimize.linear_sum_assignment(worth, maximize=True), strict=True):

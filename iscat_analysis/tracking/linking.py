@@ -24,9 +24,10 @@ OUTLYING = 5.0
 AS_FOUND = 0.9
 """Of the threshold, that a fit must keep to have found its particle."""
 
-_STEP = 0.1  # of the farthest that a particle goes: what an error of the mass counts in linking
+# Of the farthest that a particle goes: what an error of the mass counts in linking
+_MASS_STEP_SHARE = 0.1
 _MASS_ERROR_FREE_Z = 0.25  # of the mass, where z is free
-_BESIDE = 0.75  # resolutions λ/NA within which two rows may be one particle
+_NEAR_RESOLUTIONS = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 _MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
 
@@ -79,8 +80,8 @@ def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -
 def mass_places(config: Config, rows: Localizations) -> FloatArray:
     """Positions for linking: x, y, and the mass expressed as a length.
 
-    A change of the mass by its own error counts as `_STEP` of the largest step, so that particles
-    of different mass keep their identities where they cross.
+    A change of the mass by its own error counts as `_MASS_STEP_SHARE` of the largest step, so that
+    particles of different mass keep their identities where they cross.
 
     Shapes: result (n, 3).
     """
@@ -94,7 +95,7 @@ def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
 
     Shapes: result (n, 3).
     """
-    length = _STEP * config.track.max_step_nm / mass_error(config, rows, error)
+    length = _MASS_STEP_SHARE * config.track.max_step_nm / mass_error(config, rows, error)
     return np.column_stack([rows.theta[:, :2], rows.theta[:, 3] * length])
 
 
@@ -132,7 +133,7 @@ def alone(
     config = context.config
     if not len(rows.frame):
         return rows
-    near = crowded(rows, _BESIDE * config.optics.wavelength_nm / config.optics.na)
+    near = crowded(rows, _NEAR_RESOLUTIONS * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
     keep = (free >= _least(config, rows, inner)) & seen(context, rows)

@@ -27,11 +27,11 @@ FEWEST = 6
 """Events without which nothing is said of a spread that all particles have."""
 
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it,
-_DOUBTFUL = 2.5  # and beyond which systematic errors have it
+_SYSTEMATIC_SIGMAS = 2.5  # and beyond which systematic errors have it
 _CHANCE = 1e-5  # of one event that is flagged with no spread, and of pictures of all that are long
 # Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
 _LEAST_SHIFT_SIGMAS = 0.5
-_OUTLYING = 4.0  # standard errors beyond which an event is not one of many
+_OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
 
@@ -82,7 +82,7 @@ class Extension:
                 ),
                 key=lambda found: found[0] / found[1],
             )
-        if mean > _DOUBTFUL * error:
+        if mean > _SYSTEMATIC_SIGMAS * error:
             shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * mean
         if mean > _SIGNIFICANT * error:
             own = own | (
@@ -126,7 +126,7 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     """
     away = np.abs(q - np.median(q))
     wide = np.sqrt((1.48 * np.median(away)) ** 2 + se**2)
-    kept = away <= _OUTLYING * wide
+    kept = away <= _OUTLIER_SIGMAS * wide
     weight = se[kept] ** -2.0
     mean = float(np.average(q[kept], weights=weight))
     chi2_reduced = float(np.sum(weight * (q[kept] - mean) ** 2)) / max(int(kept.sum()) - 1, 1)
@@ -143,7 +143,7 @@ def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[f
     """
     parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
     squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-    squares = squares[squares < np.median(squares) * _OUTLYING**2]
+    squares = squares[squares < np.median(squares) * _OUTLIER_SIGMAS**2]
     n = squares.size
     if n < FEWEST or chdtrc(2 * n - 2, squares.sum()) > _CHANCE:
         return 0.0, 1.0

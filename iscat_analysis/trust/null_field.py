@@ -32,7 +32,8 @@ from iscat_analysis.search.empty import CONTRASTS, EmptyField, EmptySpread
 MOST_DISTANCES = 6
 """Distances between a frame and its background at which the noise is told apart."""
 
-_NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
+# Of the square's side; a poor fit leaves its rings over
+_NEAR_SHARE, _NEAR_SHARE_POOR = 1 / 3, 1 / 2
 _LARGEST_SIGNAL_SHARE = 0.1
 _EXACTLY = 1e-12  # variance of a background that is given, over that of one frame
 _WHOLE = CONTRASTS.index("whole")
@@ -47,7 +48,7 @@ def taken_places(
     """
     taken = np.zeros(shape, dtype=np.bool_)
     for x, y, described in places:
-        reach = context.roi_px * (_NEAR if described else _NEAR_POOR)
+        reach = context.roi_px * (_NEAR_SHARE if described else _NEAR_SHARE_POOR)
         top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
         box = taken[
             top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)

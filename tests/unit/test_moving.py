@@ -174,7 +174,7 @@ def test_particles_that_hardly_move_end_at_the_maximum(
     assert min(ends) > log_likelihood(field, ground, truth)
     rows, found, _ = ascend(field, ground, truth, follow_power=True)
     assert abs(log_likelihood(field, found, rows) - ends[1]) < 2
-    monkeypatch.setattr(settling, "AMPLIFIED", np.inf)
+    monkeypatch.setattr(settling, "MOST_STEP_RATIO", np.inf)
     assert min(height(by) for by in starts) < min(ends) - 5
 
 

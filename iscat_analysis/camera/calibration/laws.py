@@ -56,9 +56,10 @@ TOLERANCE = 0.01
 SIGMAS = 4.0
 """And the excess over the tolerance that chance must not explain."""
 
-_BETTER = 16.0  # of χ², by which a law with one number more must describe the pixels better
-_BOTH = 20.0  # the same, where an offset is wrong besides
-_ALIKE = 6.0  # of χ², within which another law is as good
+# Of χ², by which a law with one number more must describe the pixels better
+_LEAST_CHI2_GAIN = 16.0
+_LEAST_CHI2_GAIN_OFFSET = 20.0  # the same, where an offset is wrong besides
+_MOST_CHI2_LOSS = 6.0  # of χ², within which another law is as good
 _RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
 _STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
 _MOST_FILLED = 0.98  # of full scale, up to which the light follows from the counts
@@ -159,14 +160,14 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
         if found.flicker is not None and family.kind in BENT
     ]
     both = min(pairs, key=lambda law: law.chi2, default=best)
-    if best.chi2 - both.chi2 > _BOTH:
+    if best.chi2 - both.chi2 > _LEAST_CHI2_GAIN_OFFSET:
         return both
-    if linear - best.chi2 < _BETTER:
+    if linear - best.chi2 < _LEAST_CHI2_GAIN:
         zero = next(law for law in laws if law.kind == "offset")
         se = math.hypot(zero.value, zero.se)  # of zero, which is kept
         flickers = found.flicker is not None
         return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
-    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _ALIKE])
+    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _MOST_CHI2_LOSS])
 
 
 def _among(best: Law, alike: list[Law]) -> Law:

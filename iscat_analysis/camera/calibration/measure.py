@@ -43,8 +43,8 @@ LEAST_FRAMES_FOR_MAPS = 100
 
 _LEAST_PIXELS = 64
 _SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
-_CLIPPED = 0.01  # of a dark's pixels at zero that are worth a line
-_CURVED = 3.0  # reduced χ² of the photon-transfer curve
+_MOST_CLIPPED_SHARE = 0.01  # of a dark's pixels at zero that are worth a line
+_MOST_CHI2_REDUCED = 3.0  # reduced χ² of the photon-transfer curve
 _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
 
 
@@ -78,7 +78,7 @@ def measure_camera(
         masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
         masked["dead"] |= dark_found.variance <= 0
         low = float(np.mean(clipped(dark_found.lowest)))
-        if low > _CLIPPED:
+        if low > _MOST_CLIPPED_SHARE:
             notes.append(
                 f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
                 "off: its offset is too high and its read noise too small; raise the camera's "
@@ -246,7 +246,7 @@ def _curve(
     chi2 = float(
         (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
     )
-    if chi2 > _CURVED:
+    if chi2 > _MOST_CHI2_REDUCED:
         notes.append(
             f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
             "not linear, the frames were processed, or the light itself is noisy"

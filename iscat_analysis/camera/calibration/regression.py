@@ -24,8 +24,9 @@ _SIGMAS = 3.0
 _USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
 _GOOD_SLOPE = 0.05
 _USABLE_OFFSET = 0.05  # standard error over the light level
-_STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has moved
-_SEEN = 3.5  # of half of the pixels, standard errors from which read noise is not chance
+_MOST_FLICKER_CHI2 = 2.0  # robust χ² of the flicker line beyond which the scene has moved
+# Of half of the pixels, standard errors from which read noise is not chance
+_READ_NOISE_SIGMAS = 3.5
 _LEAST_HALF = 32  # pixels
 _TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlated less far
 
@@ -94,8 +95,8 @@ def solve(
         return Solution(gain, offset, "line", None, None, None, intercept, slope)
     read = _read_variance(line, offset)
     half = _half(found, used, given)
-    if half is not None and half.value > _SEEN * half.se:
-        electrons = _root(_unselected(read, half, _SEEN * half.se))
+    if half is not None and half.value > _READ_NOISE_SIGMAS * half.se:
+        electrons = _root(_unselected(read, half, _READ_NOISE_SIGMAS * half.se))
         # in counts the gain has no part in the error
         narrower = read.adu2.se / (slope**2 * read.e2.se)
         adu = Estimate(electrons.value * slope, electrons.se * slope * narrower)
@@ -360,7 +361,7 @@ def zero_of_flicker(
         residual = (slope - level - gradient * x) * np.sqrt(weight)
         robust = robust_sigma(residual)
         kept = np.abs(residual) < 5 * max(robust, 1e-12)
-    if robust**2 > _STEADY or gradient <= 0:
+    if robust**2 > _MOST_FLICKER_CHI2 or gradient <= 0:
         return None
     rest = w * (slope - level - gradient * x)
     by_level, by_gradient = _together(np.stack([rest, rest * x], axis=1), tiles).T

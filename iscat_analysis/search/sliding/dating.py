@@ -22,7 +22,7 @@ from iscat_analysis.search.sliding.rises import find_rise, line
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-_STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
+_CLEAR_FRAME_SNR2 = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def _half(rise: int) -> int:
 
 
 def _gap(per_frame_snr: float) -> int:
-    return round(_STEEP / max(per_frame_snr, 0.5) ** 2)
+    return round(_CLEAR_FRAME_SNR2 / max(per_frame_snr, 0.5) ** 2)
 
 
 def locate_step(

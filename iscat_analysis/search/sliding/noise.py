@@ -28,8 +28,8 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_APART = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
-_PARTICLE = 4.0  # standard deviations, from which on a difference is not asked of motion
+_SLOPE_DISTANCES_PX = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
+_PARTICLE_SIGMAS = 4.0  # standard deviations, from which on a difference is not asked of motion
 _NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
@@ -144,10 +144,14 @@ class _Strip:
             return _Compared(noise, math.nan, math.nan)
         light = before + after
         slopes = np.stack(
-            [_across(light, reach, axis) / light for axis in (1, 2) for reach in _APART]
+            [
+                _across(light, reach, axis) / light
+                for axis in (1, 2)
+                for reach in _SLOPE_DISTANCES_PX
+            ]
         )
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
-        usual = np.abs(change) < _PARTICLE * math.sqrt(noise)
+        usual = np.abs(change) < _PARTICLE_SIGMAS * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
         projection = turned @ change[..., None]
         moved = np.linalg.pinv(turned @ seen, hermitian=True) @ projection

@@ -17,9 +17,9 @@ from iscat_analysis.records import FloatArray
 
 IntArray = NDArray[np.int64]
 
-_RISES = 6.0  # log-likelihood by which a line describes the frames better than a step
-_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
-_DECAYS = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
+_LEAST_GAIN = 6.0  # log-likelihood by which a line describes the frames better than a step
+_RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
+_DECAY_SHARES = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
 
     Shapes: `heights` (t,), `weight` (t,).
     """
-    if step < _RISES:
+    if step < _LEAST_GAIN:
         return None
     lit = np.flatnonzero(weight > 0)
     w = weight[lit]
     y = heights[lit] - np.average(heights[lit], weights=w)
-    best, found = step + _RISES, (0, turn)
+    best, found = step + _LEAST_GAIN, (0, turn)
 
     def tried(rise: int, centres: IntArray) -> None:
         nonlocal best, found
@@ -63,7 +63,7 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
             if gains[top] > best:
                 best, found = float(gains[top]), (rise, int(centres[top]))
 
-    for rise in _FRAMES:
+    for rise in _RISE_FRAMES:
         if 2 * rise < heights.size:
             half = rise // 2
             tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
@@ -75,7 +75,7 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
         tried(max(rise, 2), np.arange(centre - reach, centre + reach + 1))
     rise, centre = found
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
-    curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAYS]
+    curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
     better = float(_gains(np.concatenate(curves), w, y).max()) - best
     p_line = float(erfc(np.sqrt(max(better, 0.0))))  # of χ² with one degree of freedom
     return Rise(rise, centre, _gain_beyond(heights, weight, centre, rise // 2 + 1), p_line)

@@ -39,11 +39,12 @@ IntArray = NDArray[np.int64]
 
 _SINGULAR = 1e-9
 _IMAGES = 4  # that are sent through E at a time
-_LEFT = 3e-4  # of the variance of a row, that may be left out
+_MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
 _SEED = 1  # of the images to begin with
 _ROUNDS = 3  # of a mean and of the weights there
-_UNLIKE = 2.0  # amplitude over the mean, beyond which weights stay
-_UNSOLVED = 1e-6  # of the information on a mass, that a step of the conjugate gradients adds
+_MOST_AMPLITUDE_RATIO = 2.0  # amplitude over the mean, beyond which weights stay
+# Of the information on a mass, that a step of the conjugate gradients adds
+_LEAST_INFORMATION_SHARE = 1e-6
 _MOST_STEPS = 400
 
 
@@ -86,7 +87,7 @@ def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
     inner = turned @ coupling.own() @ root
     most = float(np.linalg.eigvalsh(inner)[:, -1].max())
     # as no eigenvalue is larger than their sum
-    if _variance_left_out(most, float(np.einsum("nii->", inner))) > _LEFT:
+    if _variance_left_out(most, float(np.einsum("nii->", inner))) > _MOST_VARIANCE_LEFT_OUT:
         more = _krylov_part(coupling, root, most)
         if more is None:
             return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
@@ -108,7 +109,7 @@ def _krylov_part(coupling: Coupling, root: FloatArray, most: float) -> FloatArra
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
-    while len(basis) < rank and _variance_left_out(most, largest) > _LEFT:
+    while len(basis) < rank and _variance_left_out(most, largest) > _MOST_VARIANCE_LEFT_OUT:
         added = _orthonormal(images, basis)[: rank - len(basis)]
         seen, images = coupling.followed(covariance, added)
         seen = seen @ root
@@ -223,7 +224,7 @@ def _at_their_mean(
     power = np.average(growth, weights=information)
     mean, more = float(np.average(estimate, weights=information)), np.ones(len(estimate))
     for _ in range(_ROUNDS):
-        more = np.clip(amplitude / mean, 1 / _UNLIKE, _UNLIKE) ** -power
+        more = np.clip(amplitude / mean, 1 / _MOST_AMPLITUDE_RATIO, _MOST_AMPLITUDE_RATIO) ** -power
         mean = float(np.average(estimate, weights=information * more))
     return mean, more
 
@@ -246,7 +247,7 @@ def _solve_conjugate_gradients(
         step = size / curvature
         answer += step * direction
         taken += step * size
-        if step * size < _UNSOLVED * (total - taken):
+        if step * size < _LEAST_INFORMATION_SHARE * (total - taken):
             break
         left -= step * turned
         before, size = size, float(left @ left)

@@ -58,15 +58,16 @@ COARSE = 2
 BLOCK = 32
 """Frames that one thread takes at a time."""
 
-_SWEPT = 4  # of them, where every row is fitted several times
+_FRAMES_PER_SWEEP = 4  # of them, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
-_PASSING = 0.02  # the same, of a fit that the next turn goes on with
+_ROUGH_TOLERANCE = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
-_ANY = 1e300
-_MORE_ROWS = 2.0  # for which there is room, than those of the first fit: untouched it is free
-_BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
+_NO_LIMIT = 1e300
+_ROOM_FACTOR = 2.0  # for which there is room, than those of the first fit: untouched it is free
+# Resolutions λ/NA outside the field, from where a particle is still seen
+_VISIBLE_RESOLUTIONS = 1.0
 
 
 class MovingField:
@@ -109,23 +110,25 @@ class MovingField:
         self._room_of_slopes = np.empty(0, dtype=np.int16)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
-        half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
+        half = pixel_nm / 2 + _VISIBLE_RESOLUTIONS * wavelength / near.optics.na
         if z_range_nm is not None:  # rings reach farther
             half = max(half, roi_px * pixel_nm / 4)
         low, high = z_range_nm or (near.height_nm, near.height_nm)
         sign_kept = z_range_nm is not None
         self._search = Search(
             self.free,
-            np.array([reach, reach, _ANY, _ANY, 0.0]),
+            np.array([reach, reach, _NO_LIMIT, _NO_LIMIT, 0.0]),
             np.array([-half, -half, low, 0.0 if sign_kept else -largest, 0.0]),
             np.array(
                 [(columns - 1) * pixel_nm + half, (rows - 1) * pixel_nm + half, high, largest, 0.0]
             ),
-            np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _ANY, 1.0]),
+            np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _NO_LIMIT, 1.0]),
             _TOLERANCE,
             _PASSES,
         )
-        farthest = max(rows, columns) + _BEYOND * wavelength / (near.optics.na * pixel_nm)
+        farthest = max(rows, columns) + _VISIBLE_RESOLUTIONS * wavelength / (
+            near.optics.na * pixel_nm
+        )
         self._book = PictureBook(
             near, far,
             pixel_nm=pixel_nm,
@@ -209,7 +212,7 @@ class MovingField:
         fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
-        search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=_ROUGH_TOLERANCE)
         slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
@@ -384,7 +387,7 @@ class MovingField:
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
 
         def block(part: int) -> None:
-            first, last = part * _SWEPT, min((part + 1) * _SWEPT, times.size)
+            first, last = part * _FRAMES_PER_SWEEP, min((part + 1) * _FRAMES_PER_SWEEP, times.size)
             draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
             fit_rows(
                 light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
@@ -392,7 +395,7 @@ class MovingField:
                 np.zeros(self.used.shape, dtype=np.float32),
             )  # fmt: skip
 
-        self.share(block, -(-times.size // _SWEPT))
+        self.share(block, -(-times.size // _FRAMES_PER_SWEEP))
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
     def on_wall(self, rows: Localizations) -> BoolArray:
@@ -431,7 +434,7 @@ class MovingField:
         size = rows * free * side**2
         if self._room_of_slopes.size < size:
             # It is cleared where it is first used, as long as a fit takes: once, for all to come.
-            most = round(_MORE_ROWS * rows) * free * self._whole.side**2
+            most = round(_ROOM_FACTOR * rows) * free * self._whole.side**2
             self._room_of_slopes = np.empty(most, dtype=np.int16)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
         squares, units, moves = np.zeros((rows, 4), dtype=np.int64), *np.zeros((2, rows, free))
