@@ -6,8 +6,8 @@ A ladder is oligomers: n_k copies of one monomer at
 
 m₁ free or held, b free or zero.  Which n there are is given, or found: from all that the masses
 reach, the rung with the fewest events goes as long as BIC falls.  Where no monomer is named, masses
-of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the least
-is taken, for half of a monomer's mass explains as much as the monomer.
+of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the
+least is taken, for half of a monomer's mass explains as much as the monomer.
 
 Given masses and ladders share one width τ unless widths are free, and stand on a background: a
 species of fixed, great width that takes what is none of them.

@@ -94,7 +94,7 @@ def _settling(frames: IntArray, decay: float, begin: FloatArray) -> FloatArray:
 def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
     """Log-likelihood of each time course with a free height, over that of a constant.
 
-    Shapes: `courses` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
+    Shapes: `traces` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
     """
     traces = traces - (traces @ weight / weight.sum())[:, None]
     along, known = traces @ (weight * heights), (traces**2) @ weight
