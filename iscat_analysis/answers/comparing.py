@@ -282,8 +282,8 @@ def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[st
     notes = list(dict.fromkeys(note for table in tables for note in table.remarks))
     if any(table.scale_error is not None for table in tables):
         notes.append(
-            "shifts hold no error of the mass scale: samples of different calibrations may differ "
-            "by theirs (systematic_mass_kda of the tables)"
+            "errors of shifts do not include that of the mass scale: samples with different "
+            "calibrations may differ by it (systematic_mass_kda of the tables)"
         )
     if len(found) > _MANY:
         notes.append(

@@ -119,8 +119,8 @@ class NoiseSpectrum:
             return ""
         return (
             " and ".join(parts)
-            + ": the search allows for it, and its false alarms are as many as configured; the "
-            "fits take pixels for independent, so their σ are not right"
+            + ": the search accounts for it, so that false alarms are as configured; the fits "
+            "assume independent pixels, so that their σ are wrong"
         )
 
 

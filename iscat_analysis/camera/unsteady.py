@@ -52,7 +52,7 @@ def unsteady_message(pixels: BoolArray) -> str:
     verb = "has" if number == 1 else "have"
     return (
         f"{count(number, 'pixel')} ({' and '.join(where)}) {verb} noise that is not the light's, "
-        "as where a pixel switches, an amplifier is noisy or a text is burnt in: taken for dead"
+        "as where a pixel switches, an amplifier is noisy or a text is burnt in; not used"
     )
 
 

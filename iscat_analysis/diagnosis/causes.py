@@ -247,9 +247,9 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
     seen, other = ("brighten", "darken") if brightens else ("darken", "brighten")
     by = "the configured optics" if config.calibration is None else "calibration.gradient_per_kda"
     return (
-        f"{turned} of {count(len(mass), 'particle')} have a negative mass, which is that of "
-        f"particles that leave: they {seen} the image, and by {by} those that land {other} it; if "
-        "they land, correct that sign, or optics.focus_nm"
+        f"{turned} of {count(len(mass), 'particle')} have a negative mass, as particles that "
+        f"leave: they {seen} the image, and by {by} particles that land {other} it; if these "
+        "particles land, correct that sign, or optics.focus_nm"
     )
 
 

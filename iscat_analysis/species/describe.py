@@ -362,12 +362,12 @@ def _remarks(species: pd.DataFrame) -> list[str]:
         ),
         (
             species["outlier"],
-            f"what lies at {{}} kDa is fewer than {LEAST_SPECIES} events: outliers, and no species",
+            f"at {{}} kDa there are fewer than {LEAST_SPECIES} events: outliers, and no species",
         ),
         (
             species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
-            "the species at {} kDa is as broad as a background: read it as what the other species "
-            "leave over",
+            "the species at {} kDa is as broad as a background: it may hold all events that the "
+            "other species do not explain",
         ),
     )
     return [

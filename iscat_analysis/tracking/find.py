@@ -165,10 +165,10 @@ def _no_particle_message(context: AnalysisContext, block: Block) -> str:
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
     height = math.sqrt(light * float(np.sum(signal**2)))
     return (
-        f"no particle was found: over {light:.3g} e per pixel and frame one of particle.mass_kda = "
-        f"{mass:.4g} stands out of the noise of a frame by {height:.2g} standard deviations, and "
-        f"{context.templates.threshold:.2g} are needed; if there are particles, record with more "
-        "light, or longer exposures"
+        f"no particle was found: with {light:.3g} e per pixel and frame, a particle of "
+        f"particle.mass_kda = {mass:.4g} has a signal-to-noise ratio of {height:.2g} in a frame, "
+        f"and the threshold is {context.templates.threshold:.2g}; if there are particles, record "
+        "with more light, or longer exposures"
     )
 
 

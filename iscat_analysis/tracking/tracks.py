@@ -119,7 +119,7 @@ def tracks_of(
     if setup.change:
         warn(
             f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
-            "frames, as where the focus drifts: tracks that this puts off by more than their "
+            "frames, as where the focus drifts: tracks whose masses it changes by more than their "
             "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
         )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
