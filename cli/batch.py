@@ -202,7 +202,7 @@ def print_batch(found: Batch) -> None:
     for row in found.kd.to_dict("records"):
         if not row["why"]:
             p = "" if math.isnan(row["p_value"]) else f", p = {row['p_value']:.2g}"
-            notes = f"; {row['notes']}" if row["remarks"] else ""
+            notes = f"; {row['remarks']}" if row["remarks"] else ""
             print_result(
                 f"{kd_name(row['condition'])} = {short(row['kd_nm'])} nM (95 %: "
                 f"{short(row['kd_low'])} to {upper_end(row['kd_high'])}), "

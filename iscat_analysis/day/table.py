@@ -298,8 +298,8 @@ def _row(
             )
     standards: tuple[tuple[float, float], ...] = ()
     try:
-        given = known["standards"]
-        standards = read_standards([given] if isinstance(given, (int, float)) else given)
+        masses = known["standards"]
+        standards = read_standards([masses] if isinstance(masses, (int, float)) else masses)
     except (TypeError, ValueError) as error:
         wrong.append(f"standards: {error}")
     if standards and role != "calibrant":

@@ -101,7 +101,7 @@ def table_of_tracks(
     judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
     status = [str(status) for status, _ in judged]
     flags = [";".join(map(str, flags)) for _, flags in judged]
-    status, flags = (np.array(text, dtype=object)[2 * numbers + off] for text in (status, flags))
+    status, flags = (np.array(each, dtype=object)[2 * numbers + off] for each in (status, flags))
     return make_rows(table, {"status": status, "flags": flags})
 
 
