@@ -46,19 +46,22 @@ _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass
 _WIDEST = 0.35  # of the lightest: standard deviation of a species
 _LONGEST = 0.4  # of the lightest: a tail
-_UNEQUAL = 0.5  # of the squared width: how the widths of species differ
-_SKEW = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
-_SLOPE = 0.7  # of the logarithm of the background's density over the window
-_BEND = 0.15  # of the same between its middles, away from the line between their neighbours
+_WIDTH_SPREAD = 0.5  # of the squared width: how the widths of species differ
+# Of a peak's width: a tail; less, and a tail of one width is taken for a limit
+_TAIL_SPREAD = 1.5
+_SLOPE_SPREAD = 0.7  # of the logarithm of the background's density over the window
+# Of the same between its middles, away from the line between their neighbours
+_BEND_SPREAD = 0.15
 _FIRST_BACKGROUND, _BACKGROUND = -6.0, 3.0  # logit of its share: of the series
-_UNLIKE = 0.7  # of one table about that
+_SHARE_SPREAD = 0.7  # of one table about that
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
-_LIMIT = 0.5  # of the lightest mass: where the limit may lie about the lower end of the events
-_RISING = 0.02  # quantile of the events where their edge is sought
+# Of the lightest mass: where the limit may lie about the lower end of the events
+_LIMIT_SPREAD = 0.5
+_EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
 _NODES = 64
-_KINDS = 8  # of noise, in each table
-_NEAR = 0.4  # of the lightest mass: events of a peak
-_MAD = 1.4826
+_NOISE_KINDS = 8  # of noise, in each table
+_PEAK_REACH = 0.4  # of the lightest mass: events of a peak
+_SIGMA_PER_MAD = 1.4826
 _NARROW = 0.1  # of the squared width: what a start leaves beside the tail
 _NO_TAIL = 1e-3  # of a peak's width
 _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
@@ -66,7 +69,7 @@ _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The events of one table within the window, and how its detector sees it.
+    """The events of one table inside the mass window, and its detector.
 
     Shapes: `x, noise` (n,), `size, kind_noise` (c,), `nodes, steps` (g,), `seen` (c, g).
     """
@@ -85,7 +88,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What all tables have in common, of parameters; `Series.shared` makes it."""
+    """Parameters that all tables share; `Series.shared` makes it."""
 
     mean: FloatArray
     variance: FloatArray
@@ -134,7 +137,7 @@ class Series:
         scale += [1.0] * bends
         if self.learned:
             edge = np.concatenate([t.x for t in self.tables if t.learned])
-            rise = float(np.quantile(edge, _RISING)) if edge.size else self.ends[0]
+            rise = float(np.quantile(edge, _EDGE_QUANTILE)) if edge.size else self.ends[0]
             low += [self.ends[0] - 3 * self.width, 0.25 * self.width]
             high += [max(1.3 * lightest, rise + self.width), 1.6 * self.width]
             start += [rise, _SOFT * self.width]
@@ -161,9 +164,9 @@ class Series:
         lightest = float(self.masses.min())
         found = []
         for mass in self.masses:
-            near = x[np.abs(x - mass) < _NEAR * lightest]
+            near = x[np.abs(x - mass) < _PEAK_REACH * lightest]
             if near.size > 0.05 * x.size:
-                found.append(_MAD * float(np.median(np.abs(near - np.median(near)))))
+                found.append(_SIGMA_PER_MAD * float(np.median(np.abs(near - np.median(near)))))
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
 
     def _middles(self) -> FloatArray:
@@ -177,7 +180,7 @@ class Series:
         return np.array([self.ends[0], *gaps, self.ends[1]])
 
     def _hats(self, x: FloatArray) -> FloatArray:
-        """Densities of area 1 that are each linear from one middle to the next."""
+        """Triangular basis functions of area 1 on the middles."""
         found = np.array([np.interp(x, self.knots, row) for row in np.eye(self.knots.size)])
         step = np.diff(self.knots)
         area = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))
@@ -193,7 +196,11 @@ class Series:
             low = min(max(low, known.threshold_kda), 0.5 * (low + high))
         inside = (table.x >= low) & (table.x < high)
         x, sigma = table.x[inside], table.sigma[inside]
-        parts = np.array_split(np.sort(sigma), _KINDS if np.ptp(sigma) > 0 else 1) if x.size else []
+        parts = (
+            np.array_split(np.sort(sigma), _NOISE_KINDS if np.ptp(sigma) > 0 else 1)
+            if x.size
+            else []
+        )
         size = np.array([float(part.size) for part in parts if part.size])
         each = np.array([float(part.mean()) for part in parts if part.size])
         points, steps = np.polynomial.legendre.leggauss(_NODES)
@@ -209,22 +216,22 @@ class Series:
         )  # fmt: skip
 
     def _priors(self) -> None:
-        """Middles and widths of what is known of combinations of parameters beforehand."""
+        """Mean and width of the prior of combinations of parameters."""
         lightest = float(self.masses.min())
         rows: list[tuple[dict[int, float], float, float]] = []
         place = self.parts
         rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
-        rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _UNEQUAL * self.width**2))
-        rows.append(({place + 3: 1.0}, 0.0, _SKEW * self.width))
+        rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _WIDTH_SPREAD * self.width**2))
+        rows.append(({place + 3: 1.0}, 0.0, _TAIL_SPREAD * self.width))
         last = self.shares - (2 if self.learned else 0) - 1
-        rows.append(({last: 1.0}, 0.0, _SLOPE))
+        rows.append(({last: 1.0}, 0.0, _SLOPE_SPREAD))
         for knot in range(1, self.knots.size - 1):
             at = place + 3 + knot  # the first knot's logarithm is 0 and no parameter
             below = {at - 1: -0.5} if knot > 1 else {}
-            rows.append(({**below, at: 1.0, at + 1: -0.5}, 0.0, _BEND))
+            rows.append(({**below, at: 1.0, at + 1: -0.5}, 0.0, _BEND_SPREAD))
         if self.learned:
             at = self.shares - 2
-            rows.append(({at: 1.0}, float(self.first[at]), _LIMIT * lightest))
+            rows.append(({at: 1.0}, float(self.first[at]), _LIMIT_SPREAD * lightest))
             rows.append(({at + 1: 1.0}, _SOFT * self.width, _SOFTNESS * self.width))
         self.prior_design = np.zeros((len(rows), self.own))
         for row, (parts, _, width) in enumerate(rows):
@@ -233,7 +240,7 @@ class Series:
         self.prior_middle = np.array([middle / width for _, middle, width in rows])
         # Shares of background scatter about a level that they have in common.
         covariance = np.full((self.number, self.number), _BACKGROUND**2)
-        covariance += _UNLIKE**2 * np.eye(self.number)
+        covariance += _SHARE_SPREAD**2 * np.eye(self.number)
         apart = np.zeros((self.number, self.own))
         apart[:, self.shares :] = np.linalg.inv(np.linalg.cholesky(covariance))
         self.prior_design = np.vstack([self.prior_design, apart])
@@ -241,7 +248,7 @@ class Series:
         self.prior_middle = np.append(self.prior_middle, apart[:, self.shares :] @ level)
 
     def shared(self, theta: FloatArray) -> Shared:
-        """Give what parameters stand for."""
+        """Convert parameters to masses, widths and the shape of the background."""
         place = self.parts
         mean = self.composition @ theta[:place] + theta[place]
         light, heavy, tail = theta[place + 1 : place + 4]
