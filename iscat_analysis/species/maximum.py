@@ -1,35 +1,36 @@
-"""The maximum of a smooth function of parameters that have limits.
+"""The maximum of a smooth function of parameters that have limits, by Minuit's Migrad.
 
-Newton's method with an active set (Bertsekas, SIAM J. Control Optim. 20, 221, 1982).  Parameters at
-a limit that the slope points out of are held; the others take the step to the maximum of the
-parabola, and those that it carries beyond a limit stop there while the rest is solved anew.  Along
-directions in which the function bends upwards the step goes by the size of the bend, so that it
-leaves saddles.  Second derivatives are kept from step to step as long as the steps are as good as
-these foretell.
+Migrad learns second derivatives on its way (Fletcher, Comput. J. 13, 317, 1970), which took it 230
+evaluations for a series of tables; told what they are at the start, it takes half, and a fifth on
+the way along a profile, where those of the last point serve.  It also ends where the slope is 0,
+and not where second derivatives that it has not learned yet let it seem so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
+from warnings import catch_warnings, simplefilter
 
 import numpy as np
+from iminuit import Minuit
+from iminuit.warnings import IMinuitWarning
 
 from iscat_analysis.records import BoolArray, FloatArray
 
-_MOST_STEPS = 100
-_PRECISE = 1e-5  # of the height that is left to gain: 0.005 standard errors of a log-likelihood
-_AT_REST = 1e-9  # the same on a saddle, which a step doubles the distance from
-_FARTHEST = 3.0  # scales of a parameter that a step may go
-_ENOUGH = 1e-4  # of the rise along the slope (Armijo)
-_SHORTEST = 1e-6  # of a step
-_CONTRACTS = 0.3  # of what was left to gain, after a step whose second derivatives were right
-_FLATTEST = 1e-6  # second derivative, in units of the scales
+_FAST = 0  # strategy of Minuit that takes no further second derivatives
+_TOLERANCE = 0.01  # of Minuit: 1e-5 of a log-likelihood
+_INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
+_AT_LIMIT = 1e-4  # of its range from a limit
+_STEP = 0.02  # of the scale: the first step where second derivatives say nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
     """A function with its slope and minus its second derivatives, and its parameters' limits.
+
+    A parameter whose limits are the same is held.
 
     Shapes: `low, high, scale` (p,).
     """
@@ -62,68 +63,38 @@ class Maximum:
 
 
 def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None) -> Maximum:
-    """Climb from a start to a maximum; `near` are second derivatives from close by.
+    """Climb from a start to a maximum; `near` are second derivatives from close by, which are kept.
 
     Shapes: `start` (p,), `near` (p, p).
     """
-    theta = np.clip(start, problem.low, problem.high)
-    value, slope = problem.height(theta)
-    bend, fresh = (problem.curvature(theta), True) if near is None else (near, False)
-    before = np.inf
-    for _ in range(_MOST_STEPS):
-        step, left, peaked = _newton(problem, theta, slope, bend)
-        if not fresh and (left > max(_CONTRACTS * before, _PRECISE) or not peaked):
-            bend, fresh = problem.curvature(theta), True
-            step, left, peaked = _newton(problem, theta, slope, bend)
-        if left < (_PRECISE if peaked else _AT_REST):
-            break
-        reach = 1.0
-        while reach > _SHORTEST:
-            there = np.clip(theta + reach * step, problem.low, problem.high)
-            found, steeper = problem.height(there)
-            if found - value > _ENOUGH * float(slope @ (there - theta)):
-                break
-            reach /= 2
+    height = lru_cache(maxsize=1)(lambda theta: problem.height(np.frombuffer(theta)))
+    bends = lru_cache(maxsize=1)(lambda theta: problem.curvature(np.frombuffer(theta)))
+
+    def curvature(theta: FloatArray) -> FloatArray:
+        return bends(theta.tobytes()) if near is None else near
+
+    reach = problem.high - problem.low
+    inside = _INSIDE * reach
+    with catch_warnings():
+        # Minuit says that it needs no diagonal, and calls for one where the matrix is a saddle's.
+        simplefilter("ignore", IMinuitWarning)
+        search = Minuit(
+            lambda theta: -height(theta.tobytes())[0],
+            np.clip(start, problem.low + inside, problem.high - inside),
+            grad=lambda theta: -height(theta.tobytes())[1],
+            hessian=curvature,
+            g2=lambda theta: np.diag(curvature(theta)).copy(),
+        )
+    search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
+    search.errors = _STEP * problem.scale
+    held = reach == 0
+    for place, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
+        if held[place]:
+            search.fixed[place] = True
         else:
-            if fresh:
-                break
-            before = 0.0
-            continue
-        theta, value, slope = there, found, steeper
-        before, fresh = left if reach == 1 else 0.0, False
-    return Maximum(theta, value, bend, ~_held(problem, theta, slope))
-
-
-def _held(problem: Problem, theta: FloatArray, slope: FloatArray) -> BoolArray:
-    """Tell which parameters lie at a limit that the slope does not lead away from."""
-    below = (theta <= problem.low) & (slope <= 0)
-    return np.asarray(below | ((theta >= problem.high) & (slope >= 0)))
-
-
-def _newton(
-    problem: Problem, theta: FloatArray, slope: FloatArray, bend: FloatArray
-) -> tuple[FloatArray, float, bool]:
-    """Give the step to the parabola's maximum within limits, half its rise, and if it is one.
-
-    Shapes: `theta, slope` (p,), `bend` (p, p), step (p,).
-    """
-    scale = problem.scale
-    down, up = (problem.low - theta) / scale, (problem.high - theta) / scale
-    rise, free = slope * scale, ~_held(problem, theta, slope)
-    size, axes = np.linalg.eigh((bend * np.outer(scale, scale))[np.ix_(free, free)])
-    curve = np.eye(theta.size)
-    curve[np.ix_(free, free)] = (axes * np.maximum(np.abs(size), _FLATTEST)) @ axes.T
-    step, straight = np.zeros(theta.shape), None
-    while free.any():
-        wanted = rise[free] - curve[np.ix_(free, ~free)] @ step[~free]
-        step[free] = np.linalg.solve(curve[np.ix_(free, free)], wanted)
-        straight = step.copy() if straight is None else straight
-        beyond = free & ((step < down) | (step > up))
-        if not beyond.any():
-            break
-        step[beyond] = np.clip(step, down, up)[beyond]
-        free = free & ~beyond
-    if straight is not None and step @ rise <= 0:  # the limits turned it round
-        step = straight
-    step *= min(1.0, _FARTHEST / max(float(np.abs(step).max()), _FARTHEST))
-    return step * scale, 0.5 * float(step @ rise), bool(np.all(size > -_FLATTEST))
+            search.limits[place] = low, high
+    search.migrad()
+    theta = np.array(search.values)
+    edge = _AT_LIMIT * reach
+    free = ~held & (theta > problem.low + edge) & (theta < problem.high - edge)
+    return Maximum(theta, -float(search.fval), curvature(theta), free)
