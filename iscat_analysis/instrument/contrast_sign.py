@@ -20,16 +20,9 @@ from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
+from iscat_analysis.instrument.collect import bright_particle_images
 from iscat_analysis.instrument.crowded import seen_in_field
-from iscat_analysis.instrument.learner import (
-    FREE,
-    LEAST_SIGHTS,
-    OpticsCalibration,
-    ParticleImage,
-    Settings,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.instrument.fit_optics import calibrate_particle_images
 from iscat_analysis.instrument.learning import (
     LEAST_TESTED,
     NOISE,
@@ -40,14 +33,18 @@ from iscat_analysis.instrument.learning import (
     usable,
     why_not,
 )
+from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
-    calibrate_particle_images,
+    REJECTED_P,
     goodness,
+    median_p,
     microscopes,
+    reach_nm,
     with_sign,
 )
-from iscat_analysis.instrument.particle_images import bright_particle_images, reach_nm
-from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
+from iscat_analysis.instrument.parameters import FREE, Settings, heights_free, settings_of
+from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
 from iscat_analysis.threads import threads

@@ -18,17 +18,17 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.instrument.learner import (
-    LEAST_SIGHTS,
-    OpticsCalibration,
-    ParticleImage,
-    heights_free,
-    settings_of,
-    with_settings,
+from iscat_analysis.instrument.collect import bright_places, known_places
+from iscat_analysis.instrument.fit_optics import (
+    calibrate_particle_images,
+    learn_with_heights,
+    misfit_of,
 )
-from iscat_analysis.instrument.microscope import calibrate_particle_images, with_sign
-from iscat_analysis.instrument.particle_images import bright_places, known_places
-from iscat_analysis.instrument.unknown_heights import learn_with_heights, misfit_of
+from iscat_analysis.instrument.measure import LEAST_SIGHTS
+from iscat_analysis.instrument.microscope import with_sign
+from iscat_analysis.instrument.parameters import heights_free, settings_of, with_settings
+from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.records import Status, Windows
 
 LEAST_ROUGH = 6

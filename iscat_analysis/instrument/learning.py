@@ -22,34 +22,27 @@ from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.checks import number_in
+from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
 from iscat_analysis.instrument.crowded import learn_in_field, seen_in_field
-from iscat_analysis.instrument.focus_drift import (
+from iscat_analysis.instrument.fit_optics import (
     STEADY,
+    calibrate_particle_images,
     focus_drift,
     learned_with_drift,
     with_drift,
 )
-from iscat_analysis.instrument.learner import (
-    FREE,
-    LEAST_SIGHTS,
-    OpticsCalibration,
-    ParticleImage,
-    free_groups,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
-    calibrate_particle_images,
+    REJECTED_P,
+    TESTED,
+    median_p,
+    not_alone,
     refuse_uncalibratable,
     with_sign,
 )
-from iscat_analysis.instrument.particle_images import (
-    TESTED,
-    bright_particle_images,
-    kind_of,
-    scan_particle_images,
-)
-from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p, not_alone
+from iscat_analysis.instrument.parameters import FREE, free_groups, heights_free, settings_of
+from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames, well_lit

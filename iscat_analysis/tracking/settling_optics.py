@@ -15,14 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.instrument.learner import OpticsCalibration, Settings, optics_limits
-from iscat_analysis.instrument.learner.settings import settings_of, with_settings
+from iscat_analysis.instrument.parameters import (
+    Settings,
+    change_of,
+    optics_limits,
+    settings_of,
+    with_settings,
+)
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.records import FloatArray
 
 SETTLED = 1.0
 """Standard errors that are still to come, below which no other round is made."""
 
-_PERIODS = {"reference_phase_deg": 360.0, "polarization_deg": 180.0}
 _FIRST_SHARE = 0.5  # of an error that a round leaves, where one round says nothing of it
 _MOST_SHARE = 0.8
 _FARTHEST = 0.7  # times the last change that is added to it: some directions change back then
@@ -115,12 +120,7 @@ class Rounds:
 
 def _change(before: Config, after: Config, names: Sequence[str]) -> FloatArray:
     """Change of parameters, the short way round where they are angles."""
-    was, now = settings_of(before), settings_of(after)
-    out = np.array([now[name] - was[name] for name in names], dtype=float)
-    for i, name in enumerate(names):
-        if name in _PERIODS:
-            out[i] -= _PERIODS[name] * np.rint(out[i] / _PERIODS[name])
-    return out
+    return change_of(settings_of(before), settings_of(after), names)
 
 
 def _kind(settings: Settings) -> tuple[object, ...]:

@@ -22,19 +22,18 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.goodness import goodness_of_fit
-from iscat_analysis.instrument.learner import (
+from iscat_analysis.instrument.fit_optics import calibrate_particle_images, learn_with_heights
+from iscat_analysis.instrument.learning import taken, usable
+from iscat_analysis.instrument.measure import MOST_SIGHTS
+from iscat_analysis.instrument.microscope import REJECTED_P, with_sign
+from iscat_analysis.instrument.parameters import (
     FREE,
-    MOST_SIGHTS,
-    OpticsCalibration,
     Settings,
     heights_free,
     settings_of,
     with_settings,
 )
-from iscat_analysis.instrument.learning import taken, usable
-from iscat_analysis.instrument.microscope import calibrate_particle_images, with_sign
-from iscat_analysis.instrument.tested_optics import REJECTED_P
-from iscat_analysis.instrument.unknown_heights import learn_with_heights
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block

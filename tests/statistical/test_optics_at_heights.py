@@ -14,7 +14,7 @@ from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import load_config
 from iscat_analysis.instrument import crowded
-from iscat_analysis.instrument.learner import OpticsCalibration
+from iscat_analysis.instrument.result import OpticsCalibration
 
 pytestmark = pytest.mark.large
 

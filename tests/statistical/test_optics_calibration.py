@@ -13,11 +13,12 @@ from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.learner import Measured, build_microscope, maximise, settings_of
-from iscat_analysis.instrument.learner.estimate import optics_limits
-from iscat_analysis.instrument.learner.measure import HELD_OUT_P, _Search, measure_microscope
-from iscat_analysis.instrument.learner.starts import average_particle_images
-from iscat_analysis.instrument.microscope import calibrate_particle_images, goodness
+from iscat_analysis.instrument.fit_optics import calibrate_particle_images
+from iscat_analysis.instrument.joint_fit import maximise
+from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, _Search, measure_microscope
+from iscat_analysis.instrument.microscope import build_microscope, goodness
+from iscat_analysis.instrument.parameters import optics_limits, settings_of
+from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 
@@ -161,7 +162,7 @@ def test_a_parameter_at_its_limit_is_refused() -> None:
 
 def test_a_wrong_pixel_size_is_suspected() -> None:
     """Pixels that are said to be 6 % larger than they are look like a smaller aperture."""
-    from iscat_analysis.instrument.learner import OpticsCalibration
+    from iscat_analysis.instrument.result import OpticsCalibration
 
     said, factor = configuration(), 1.06
     pixel = said.camera.pixel_size_nm

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from iscat_analysis.inference.noise_models import POISSON
-from iscat_analysis.instrument.learner.estimate import Estimate
-from iscat_analysis.instrument.learner.measure import _Search
-from iscat_analysis.instrument.learner.particle_images import ParticleImage, Settings
+from iscat_analysis.instrument.joint_fit import Estimate
+from iscat_analysis.instrument.measure import _Search
+from iscat_analysis.instrument.parameters import Settings
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
 
 HEIGHTS_NM = (0.0, 1000.0)

@@ -16,8 +16,8 @@ from wanderers import SETTINGS, Wanderers, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.learner.estimate import _excess
-from iscat_analysis.instrument.learner.settings import settings_of, with_settings
+from iscat_analysis.instrument.joint_fit import _excess
+from iscat_analysis.instrument.parameters import settings_of, with_settings
 from iscat_analysis.tracking import tracked_optics
 from iscat_analysis.tracking.settling_optics import Round, Rounds
 from iscat_analysis.tracking.tracked_optics import (

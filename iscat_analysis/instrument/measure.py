@@ -14,20 +14,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.instrument.learner.estimate import Estimate, maximise
-from iscat_analysis.instrument.learner.neighbours import Neighbours
-from iscat_analysis.instrument.learner.null_directions import find_hidden
-from iscat_analysis.instrument.learner.particle_images import RISES, Build, ParticleImage, Settings
-from iscat_analysis.instrument.learner.settings import (
+from iscat_analysis.instrument.joint_fit import Estimate, Neighbours, maximise
+from iscat_analysis.instrument.parameters import (
     FREE,
     HIGHER,
+    PARAMETERS,
     PRIMARY,
     SECONDARY,
+    Settings,
+    find_hidden,
     free_names,
     is_term,
 )
-from iscat_analysis.instrument.learner.starts import average_particle_images, with_masses
-from iscat_analysis.instrument.learner.states import StateSearch, same_state
+from iscat_analysis.instrument.particle_image import (
+    Build,
+    ParticleImage,
+    average_particle_images,
+    with_masses,
+)
+from iscat_analysis.instrument.starts import StateSearch, same_state
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.threads import one_thread_algebra
 
@@ -333,13 +338,11 @@ class _Search:
         if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
             return best, None
         z = best.sights[0].z_nm
-        mirrored = dict(best.values)
+        mirrored = {
+            **best.values,
+            **{n: PARAMETERS[n].mirrored * best.values[n] for n in best.names},
+        }
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
-        mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
-        mirrored |= {name: -best.values[name] for name in RISES if name in best.names}
-        for name in best.names:
-            if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
-                mirrored[name] = -best.values[name]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
         other = self._fit(turned, mirrored, best.names, _TWIN_PASSES)
         if best.log_likelihood - other.log_likelihood > _CLOSE * best.log_likelihood:
