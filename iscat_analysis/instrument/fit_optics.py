@@ -35,55 +35,6 @@ from iscat_analysis.units import count
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
 
-
-def calibrate_particle_images(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    groups: Sequence[str],
-    source: Mapping[str, str],
-    *,
-    focus_step_nm: float | None = None,
-    least: int = LEAST_SIGHTS,
-    known: Settings | None = None,
-    mapper: Mapper = map,
-) -> OpticsCalibration:
-    """Measure the optics from pictures."""
-    if len(sights) < least:
-        raise DataError(
-            f"{source['movie']}: shows {count(len(sights), 'bright particle')} standing alone, and "
-            f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
-            "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
-        )
-    configured = settings_of(config)
-    limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
-    if focus_step_nm is not None:
-        configured[FOCUS_STEP] = focus_step_nm
-        low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
-        limits[FOCUS_STEP] = (low, high)
-    if known is not None and FOCUS_DRIFT in known:
-        configured[FOCUS_DRIFT] = 0.0
-    build = microscopes(config, max(reach_nm(sight) for sight in sights))
-    optics = config.optics
-    measured = measure_microscope(
-        sights,
-        configured,
-        build,
-        lambda sight, settings: goodness(sight, build(sight.seen_with(settings))),
-        free=groups,
-        limits=limits,
-        side=int(math.copysign(1, optics.focus_nm)) if optics.focus_nm else 0,
-        landing=1,
-        others=others,
-        build_wide=rings_of(config, sights[0]),
-        known=known,
-        mapper=mapper,
-    )
-    estimate = measured.estimate
-    pictures = make_pictures(estimate.sights, build, estimate.values)
-    return make_result(config, configured, measured, pictures, source)
-
-
 _FOCUS_MOVES_NM = tuple(FOCUS_STEP_NM * i for i in (0, -1, 1, -2, 2, -3, 3))
 _TURNS = 2  # of heights of neighbours, and of their rings
 _HEIGHT_PASSES = 12  # of a fit from one of several heights
@@ -94,27 +45,47 @@ _CLEAR = 1.0  # unless one describes the pictures to so many standard errors of 
 _DESCRIBED_CHI2 = 1.2  # of pictures that were not fitted, from which no other is looked for
 
 
-def learn_with_heights(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    groups: Sequence[str],
-    source: Mapping[str, str],
-    *,
-    known: Settings,
-    around: bool,
-    mapper: Mapper = map,
+@dataclass(frozen=True)
+class Collected:
+    """Pictures of particles, and what is known of the microscope that made them."""
+
+    config: Config
+    """As configured: where the search begins, and what stays where pictures do not tell it."""
+
+    images: Sequence[ParticleImage]
+    others: Sequence[ParticleImage] = ()
+    """Particles whose rings are in the pictures."""
+
+    near: Settings | None = None
+    """A microscope near theirs, from which the fit goes on; None: one is looked for."""
+
+    found_with: Config | None = None
+    """Optics with which they were found; None where no optics took part in that."""
+
+    least: int = LEAST_SIGHTS
+    focus_step_nm: float | None = None
+    """Of a scan of the focus."""
+
+
+def fit_optics(
+    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper = map
 ) -> OpticsCalibration:
-    """Learn the optics from particles whose heights are between limits."""
-    found = calibrate_particle_images(
-        sights, others, config, groups, source, known=known, mapper=mapper
-    )
-    if not around or (found.accepted and misfit_of(found) < _DESCRIBED_CHI2):
+    """Fit the optics to pictures; where each particle has a height of its own, with all heights.
+
+    Such pictures differ, so that nothing can be averaged.  A wrong focus has moved all their
+    heights, to other fringes too: foci around the configured one are tried, with every particle at
+    the height that suits it best among the rings of all.
+    """
+    free = any(image.heights_nm is not None for image in seen.images)
+    start = replace(seen, near=settings_of(seen.config)) if free and seen.near is None else seen
+    found = _fitted(start, groups, origin, mapper)
+    if not free or seen.near is not None or (found.accepted and misfit_of(found) < _DESCRIBED_CHI2):
         return found
-    begun = _likeliest(sights, others, config, known, groups, mapper)
-    other = calibrate_particle_images(
-        begun.sights, begun.others, config, groups, source, known=begun.settings, mapper=mapper
-    )
+    begun = _likeliest(start, groups, mapper)
+    other = _fitted(
+        replace(seen, images=begun.images, others=begun.others, near=begun.settings),
+        groups, origin, mapper,
+    )  # fmt: skip
     return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))
 
 
@@ -123,38 +94,73 @@ def misfit_of(found: OpticsCalibration) -> float:
     return float(found.measured.judgement.chi2_reduced.mean())
 
 
+def _fitted(
+    seen: Collected, groups: Sequence[str], origin: Mapping[str, str], mapper: Mapper
+) -> OpticsCalibration:
+    """Measure the microscope and put the result together."""
+    config, images = seen.config, seen.images
+    if len(images) < seen.least:
+        raise DataError(
+            f"{origin['movie']}: shows {count(len(images), 'bright particle')} standing alone, and "
+            f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
+            "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
+        )
+    configured = settings_of(config)
+    limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
+    if seen.focus_step_nm is not None:
+        configured[FOCUS_STEP] = seen.focus_step_nm
+        low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
+        limits[FOCUS_STEP] = (low, high)
+    if seen.near is not None and FOCUS_DRIFT in seen.near:
+        configured[FOCUS_DRIFT] = 0.0
+    build = microscopes(config, max(map(reach_nm, images)))
+    focus = config.optics.focus_nm
+    measured = measure_microscope(
+        images,
+        configured,
+        build,
+        lambda image, settings: goodness(image, build(image.seen_with(settings))),
+        free=groups,
+        limits=limits,
+        side=int(math.copysign(1, focus)) if focus else 0,
+        landing=1,
+        others=seen.others,
+        build_wide=rings_of(config, images[0]),
+        known=seen.near,
+        mapper=mapper,
+    )
+    estimate = measured.estimate
+    pictures = make_pictures(estimate.sights, build, estimate.values)
+    return make_result(config, configured, measured, pictures, origin)
+
+
 @dataclass(frozen=True)
 class _Begun:
     """A microscope, and all particles at the heights that suit it best."""
 
     settings: Settings
-    sights: list[ParticleImage]
+    images: list[ParticleImage]
     others: list[ParticleImage]
     misfit: float
 
 
-def _likeliest(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    known: Settings,
-    groups: Sequence[str],
-    mapper: Mapper,
-) -> _Begun:
-    """Look for the microscope to begin with around the known one.
+def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun:
+    """Look for the microscope to begin with around the one that is near.
 
     The foci and lights that suit the pictures best are followed for some rounds of optics, and of
     heights and rings in them.  Where particles are at one height this is done on the average of
     their pictures.
     """
+    config, known = seen.config, dict(seen.near or {})
+    images, others = seen.images, seen.others
     optics = config.optics
     limits = optics_limits(optics.n_immersion, optics.n_glass)
-    build = microscopes(config, max(map(reach_nm, sights)))
-    build_wide = rings_of(config, sights[0])
+    build = microscopes(config, max(map(reach_nm, images)))
+    build_wide = rings_of(config, images[0])
     lights = ("linear", "circular") if "polarization" in groups else (known["polarization"],)
     focus_moves = _FOCUS_MOVES_NM if "focus" in groups else (0.0,)
     # a focus and heights that are one fringe off describe the pictures nearly as well
-    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(sights[0].grid.shape))
+    clear = 1 + _CLEAR * math.sqrt(2 / math.prod(images[0].grid.shape))
 
     def placed(
         settings: Settings,
@@ -177,12 +183,12 @@ def _likeliest(
             near = [sight for _, sight in best(among, [-fringe, 0.0, fringe])]
         found = best(Neighbours(tuple(near), wide).around(some, mapper), anywhere)
         misfit = float(np.median([chi2 for chi2, _ in found]))
-        return _Begun(settings, [sight for _, sight in found], near, misfit)
+        return _Begun(settings, [image for _, image in found], near, misfit)
 
     def better(one: _Begun) -> _Begun:
         names = free_names(groups, one.settings, FREE["zernike"])
         fit = maximise(
-            one.sights, build, one.settings, names, limits=limits, passes=_OPTICS_PASSES,
+            one.images, build, one.settings, names, limits=limits, passes=_OPTICS_PASSES,
             mapper=mapper,
         )  # fmt: skip
         return placed(fit.values, fit.sights, one.others)
@@ -190,7 +196,7 @@ def _likeliest(
     tried = [
         placed(
             {**known, "polarization": light, "focus_nm": known["focus_nm"] + moved},
-            sights, others, moved,
+            images, others, moved,
         )
         for light in lights for moved in focus_moves
     ]  # fmt: skip
@@ -297,46 +303,23 @@ def focus_drift(
     return drift if drift.is_plausible else STEADY
 
 
-def learned_with_drift(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    settings: Settings,
-    drift: FocusDrift,
-    source: Mapping[str, str],
-    mapper: Mapper = map,
-) -> OpticsCalibration:
-    """Learn the optics together with the rise of their focus."""
-    build, frames = microscopes(config, max(map(reach_nm, sights))), drift.frames
+def in_moving_focus(
+    seen: Collected, settings: Settings, drift: FocusDrift, mapper: Mapper = map
+) -> Collected:
+    """Give pictures their times, and a microscope near theirs whose focus rises."""
+    images, frames = seen.images, drift.frames
+    build = microscopes(seen.config, max(map(reach_nm, images)))
     near: dict[str, object] = {**settings, FOCUS_DRIFT: drift.nm}
-    signed = with_masses(sights, build, settings)  # what leaves is seen before
+    signed = with_masses(images, build, settings)  # what leaves is seen before
     placed = with_masses(dated(signed, frames), build, near)
     fitted = maximise(
         placed, build, near, ("focus_nm", FOCUS_DRIFT), passes=_DRIFT_PASSES, mapper=mapper
     )
-    optics = config.optics.model_copy(update={"focus_frame": _middle(frames)})
-    return calibrate_particle_images(
-        fitted.sights, dated(others, frames), config.model_copy(update={"optics": optics}),
-        tuple(FREE), source, known=fitted.values, mapper=mapper,
+    optics = seen.config.optics.model_copy(update={"focus_frame": _middle(frames)})
+    return Collected(
+        seen.config.model_copy(update={"optics": optics}),
+        fitted.sights, dated(seen.others, frames), near=fitted.values,
     )  # fmt: skip
-
-
-def with_drift(
-    found: OpticsCalibration,
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    frames: tuple[int, int],
-    source: Mapping[str, str],
-    mapper: Mapper = map,
-) -> OpticsCalibration:
-    """Look whether the focus moved in what was learned, and then learn the optics with that."""
-    settings = found.measured.settings
-    drift = focus_drift(found.measured.estimate.sights, config, settings, frames, mapper)
-    if not drift.moves:
-        return found
-    moving = learned_with_drift(sights, others, config, settings, drift, source, mapper)
-    return moving if moving.accepted or not found.accepted else found
 
 
 def dated(sights: Sequence[ParticleImage], frames: tuple[int, int]) -> list[ParticleImage]:

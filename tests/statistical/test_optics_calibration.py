@@ -13,7 +13,7 @@ from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.fit_optics import calibrate_particle_images
+from iscat_analysis.instrument.fit_optics import Collected, fit_optics
 from iscat_analysis.instrument.joint_fit import maximise
 from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, _Search, measure_microscope
 from iscat_analysis.instrument.microscope import build_microscope, goodness
@@ -141,7 +141,7 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
 def test_too_few_particles_are_refused_with_what_to_record() -> None:
     sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        calibrate_particle_images(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
+        fit_optics(Collected(configuration(), sights), ROUND, {"movie": "faint.tif"})
 
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
@@ -180,12 +180,12 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
         )
         for s in sights
     ]
-    found = calibrate_particle_images(stretched, (), larger, ROUND, {"movie": "m.tif"})
+    found = fit_optics(Collected(larger, stretched), ROUND, {"movie": "m.tif"})
     assert isinstance(found, OpticsCalibration)
     (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
     guess = float(note.partition("pixels of about ")[2].split()[0])
     assert guess == pytest.approx(pixel, rel=0.02)
-    fine = calibrate_particle_images(sights, (), said, ROUND, {"movie": "m.tif"})
+    fine = fit_optics(Collected(said, sights), ROUND, {"movie": "m.tif"})
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 
