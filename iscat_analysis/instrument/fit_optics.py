@@ -13,7 +13,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.moving_focus import DRIFT_FRAMES
 from iscat_analysis.instrument.joint_fit import Neighbours, first_step, maximise
-from iscat_analysis.instrument.measure import LEAST_SIGHTS, measure_microscope
+from iscat_analysis.instrument.measure import LEAST_SIGHTS, OpticsSearch
 from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm, rings_of
 from iscat_analysis.instrument.parameters import (
     FOCUS_DRIFT,
@@ -115,20 +115,18 @@ def _fitted(
         configured[FOCUS_DRIFT] = 0.0
     build = microscopes(config, max(map(reach_nm, images)))
     focus = config.optics.focus_nm
-    measured = measure_microscope(
-        images,
+    search = OpticsSearch(
         configured,
         build,
-        lambda image, settings: goodness(image, build(image.seen_with(settings))),
-        free=groups,
-        limits=limits,
+        groups,
+        limits,
         side=int(math.copysign(1, focus)) if focus else 0,
-        landing=1,
         others=seen.others,
         build_wide=rings_of(config, images[0]),
         known=seen.near,
         mapper=mapper,
     )
+    measured = search.run(images)
     estimate = measured.estimate
     pictures = make_pictures(estimate.sights, build, estimate.values)
     return make_result(config, configured, measured, pictures, origin)

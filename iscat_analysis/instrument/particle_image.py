@@ -9,8 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import ndimage
 
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
 from iscat_analysis.instrument.parameters import PARAMETERS, Settings
+from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -292,3 +294,40 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
     )
     near = np.abs(found + shift).max() <= FARTHEST_CENTRE_PX
     return np.asarray(-found if near else shift)
+
+
+def place_particle_images(
+    sights: Sequence[ParticleImage], nominal: ForwardModel
+) -> list[ParticleImage]:
+    """Register pictures on their average, and say how much of it each shows."""
+    (average,), placed = average_particle_images(sights)
+    scale = peak_per_amplitude(nominal)
+    shown = average.data[0] / (average.data[1] - average.data[0]) - 1
+    top = float(np.abs(shown).max())
+    out = []
+    for sight in placed:
+        rows, columns = (
+            (axis[:, None] - at) / sight.grid.pixel_nm + (n - 1) / 2
+            for axis, at, n in (
+                (sight.grid.y_nm, sight.y_nm, shown.shape[0]),
+                (sight.grid.x_nm, sight.x_nm, shown.shape[1]),
+            )
+        )
+        places = np.broadcast_arrays(rows, columns.T)
+        moved = ndimage.map_coordinates(shown, places, order=3, mode="nearest") / top
+        contrast, weight = signal_of(sight, nominal, np.zeros(sight.grid.shape))
+        moved = moved - np.average(moved, weights=weight)
+        strength = np.sum(weight * moved * contrast) / np.sum(weight * moved**2)
+        out.append(replace(sight, mass_kda=float(strength) / scale))
+    return out
+
+
+def signal_of(
+    sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Measured signal of a picture and its information, 0 where masked; the model takes no part.
+
+    Shapes: `signal` (ny, nx), both results (ny, nx).
+    """
+    likelihood = Likelihood(nominal, sight.grid, sight.noise, sight.data)
+    return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)

@@ -21,7 +21,6 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
@@ -32,8 +31,13 @@ from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, LEAST_SIGHTS, Judgement, judge
-from iscat_analysis.instrument.microscope import goodness, reach_nm, refuse_uncalibratable
-from iscat_analysis.instrument.particle_image import ParticleImage, average_particle_images
+from iscat_analysis.instrument.microscope import reach_nm, refuse_uncalibratable
+from iscat_analysis.instrument.parameters import settings_of
+from iscat_analysis.instrument.particle_image import (
+    ParticleImage,
+    place_particle_images,
+    signal_of,
+)
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import (
     ForwardModel,
@@ -205,7 +209,7 @@ def _judged(
 
     def judged(some: Sequence[ParticleImage], found: PictureFit) -> Judgement:
         model = with_template(nominal, found.template)
-        return judge(some, {}, lambda sight, _: goodness(sight, model), mapper)
+        return judge(some, lambda _: model, settings_of(config), mapper)
 
     first = fit([s for i, s in enumerate(sights) if i % _HELD_OUT != 1])
     held = fitted_with(sights[1::_HELD_OUT], first)
@@ -363,40 +367,6 @@ def fit_own(sight: ParticleImage, model: ForwardModel, *, level: bool) -> Partic
     return sight.moved(found)
 
 
-def place_particle_images(
-    sights: Sequence[ParticleImage], nominal: ForwardModel
-) -> list[ParticleImage]:
-    """Register pictures on their average, and say how much of it each shows."""
-    (average,), placed = average_particle_images(sights)
-    scale = peak_per_amplitude(nominal)
-    shown = average.data[0] / (average.data[1] - average.data[0]) - 1
-    top = float(np.abs(shown).max())
-    out = []
-    for sight in placed:
-        rows, columns = (
-            (axis[:, None] - at) / sight.grid.pixel_nm + (n - 1) / 2
-            for axis, at, n in (
-                (sight.grid.y_nm, sight.y_nm, shown.shape[0]),
-                (sight.grid.x_nm, sight.x_nm, shown.shape[1]),
-            )
-        )
-        places = np.broadcast_arrays(rows, columns.T)
-        moved = ndimage.map_coordinates(shown, places, order=3, mode="nearest") / top
-        contrast, weight = _seen(sight, nominal, np.zeros(sight.grid.shape))
-        moved = moved - np.average(moved, weights=weight)
-        strength = np.sum(weight * moved * contrast) / np.sum(weight * moved**2)
-        out.append(replace(sight, mass_kda=float(strength) / scale))
-    return out
-
-
-def _seen(
-    sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Measured signal of a picture and its information, 0 where masked; the model takes no part."""
-    likelihood = Likelihood(nominal, sight.grid, sight.noise, sight.data)
-    return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
-
-
 def _solve(
     sights: Sequence[ParticleImage],
     nominal: ForwardModel,
@@ -421,7 +391,7 @@ def _solve(
         basis = waves.on(grid.x_nm - sight.x_nm, grid.y_nm - sight.y_nm, blur)
         shown = strength * (basis @ coefficients)
         bright = (1 + shown / 2) ** 2
-        contrast, weight = _seen(sight, nominal, (bright - 1).reshape(grid.shape))
+        contrast, weight = signal_of(sight, nominal, (bright - 1).reshape(grid.shape))
         root = np.sqrt(weight.ravel())
         rest = root * (contrast.ravel() - (gain * bright - 1))
         rate = root * gain * (1 + shown / 2) * strength

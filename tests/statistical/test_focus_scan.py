@@ -9,8 +9,7 @@ from instruments import Instrument, focus_scan, strength_of_sphere
 
 import iscat_analysis as ia
 from iscat_analysis.instrument.learning import calibrate_movie
-from iscat_analysis.instrument.measure import measure_microscope
-from iscat_analysis.instrument.microscope import goodness
+from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.parameters import optics_limits, settings_of
 from iscat_analysis.instrument.particle_image import best_amplitudes
 from iscat_analysis.instrument.result import OpticsCalibration
@@ -118,16 +117,13 @@ def test_the_direction_of_linear_light_is_told(direction: float) -> None:
     config = configuration()
     changes = {"polarization_deg": direction, "focus_nm": -350.0}
     sights, _, build = make_sights(changes, 15, seed=int(direction))
-    found = measure_microscope(
-        sights,
+    found = OpticsSearch(
         settings_of(config),
         build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=("focus", "phase", "polarization"),
-        limits=optics_limits(1.515, 1.515),
+        ("focus", "phase", "polarization"),
+        optics_limits(1.515, 1.515),
         side=-1,
-        landing=1,
-    )
+    ).run(sights)
     assert not found.refusals
     assert found.settings["polarization"] == "linear"
     sigma = dict(

@@ -15,8 +15,8 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.fit_optics import Collected, fit_optics
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, _Search, measure_microscope
-from iscat_analysis.instrument.microscope import build_microscope, goodness
+from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, OpticsSearch
+from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.parameters import optics_limits, settings_of
 from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
@@ -39,15 +39,8 @@ def _measure(
 ) -> Measured:
     config = configuration() if config is None else config
     sights, _, build = make_sights(changes, count, seed=seed, config=config, **light)
-    return measure_microscope(
-        sights,
-        settings_of(config),
-        build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=free,
-        limits=optics_limits(1.515, 1.515),
-        side=-1,
-        landing=1,
+    return OpticsSearch(settings_of(config), build, free, optics_limits(1.515, 1.515), side=-1).run(
+        sights
     )
 
 
@@ -70,11 +63,9 @@ def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None
 
     _, placed = average_particle_images(sights)
     assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
-    found = measure_microscope(
-        sights, settings_of(config), build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=ROUND, limits=optics_limits(1.515, 1.515), side=-1, landing=1,
-    )  # fmt: skip
+    found = OpticsSearch(
+        settings_of(config), build, ROUND, optics_limits(1.515, 1.515), side=-1
+    ).run(sights)  # fmt: skip
     assert len(found.estimate.sights) >= 6
 
 
@@ -123,6 +114,22 @@ def test_what_may_not_change_is_missed() -> None:
     assert "not fitted" in found.refusals[0]
 
 
+def test_optics_that_make_other_pictures_worse_are_refused() -> None:
+    """Two thirds of the pictures are of another focus; control: they all are of that."""
+    sights, _, build = make_sights({"focus_nm": -340.0}, 18, seed=21)
+    of_configured, _, _ = make_sights({}, 18, seed=21)
+    order = sorted(range(18), key=lambda k: -sights[k].snr)
+    mixed = [
+        replace((of_configured if rank % 3 == 1 else sights)[k], snr=100.0 - rank)
+        for rank, k in enumerate(order)
+    ]
+    configured, limits = settings_of(configuration()), optics_limits(1.515, 1.515)
+    for pictures, refused in ((mixed, True), (sights, False)):
+        found = OpticsSearch(configured, build, ("focus",), limits, side=-1).run(pictures)
+        worse = "the configured optics describe pictures that were not fitted better"
+        assert (worse in found.refusals) == refused
+
+
 def test_weak_particles_below_the_critical_angle_have_a_twin() -> None:
     config = configuration(na=1.2)
     changes = {"z5": 8.0, "focus_nm": -350.0, "reference_phase_deg": 20.0}
@@ -147,16 +154,13 @@ def test_too_few_particles_are_refused_with_what_to_record() -> None:
 def test_a_parameter_at_its_limit_is_refused() -> None:
     config = configuration()
     sights, _, build = make_sights({"na": 1.33}, 15, seed=19)
-    found = measure_microscope(
-        sights,
+    found = OpticsSearch(
         settings_of(config),
         build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=("focus", "na", "phase"),
-        limits={**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
+        ("focus", "na", "phase"),
+        {**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
         side=-1,
-        landing=1,
-    )
+    ).run(sights)
     assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
 
 
@@ -195,7 +199,7 @@ def test_what_the_pictures_do_not_tell_is_held() -> None:
     configured = settings_of(configuration())
     names = ("focus_nm", "na", "reference_phase_deg", "z11")
     rough = maximise(truth, build, configured, names, passes=1)
-    search = _Search(configured, build, _never, ROUND, {}, -1, 1, map)
+    search = OpticsSearch(configured, build, ROUND, {}, side=-1)
     found, held = search._identified(rough)
     assert held
     for name in held:
@@ -203,7 +207,3 @@ def test_what_the_pictures_do_not_tell_is_held() -> None:
         assert name not in found.names
     bright = maximise(make_sights({}, 14, seed=18)[1], build, configured, names, passes=1)
     assert not search._identified(bright)[1]
-
-
-def _never(_sight: Any, _settings: Any) -> tuple[float, float]:
-    raise AssertionError

@@ -14,8 +14,8 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.instrument.microscope import goodness
-from iscat_analysis.instrument.particle_image import ParticleImage
-from iscat_analysis.instrument.template import fit_own, fit_picture, place_particle_images
+from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images
+from iscat_analysis.instrument.template import fit_own, fit_picture
 from iscat_analysis.optics.forward import (
     ForwardModel,
     PixelGrid,
