@@ -202,7 +202,7 @@ class Rounds:
         last, names = self._steps[-1], taken.found.names
         rest = dict(zip(last.found.names, self.to_come.tolist(), strict=True))
         to_come = np.array([rest.get(name, 0.0) for name in names], dtype=float)
-        return change_of(taken.after, last.after, names) + to_come
+        return np.asarray(change_of(taken.after, last.after, names) + to_come)
 
 
 def _kind(settings: Settings) -> tuple[object, ...]:

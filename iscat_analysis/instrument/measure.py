@@ -232,7 +232,9 @@ class OpticsSearch:
         A mask of which the configuration knows nothing must earn its two parameters.
         The pictures that are not fitted come back with their places and masses.
         """
-        states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
+        states = StateSearch(
+            self.configured, self.build, tuple(self.free), self.limits, self.mapper
+        )
         refined = states.run(averages)
         top = refined[0].log_likelihood
         joint: list[tuple[float, Estimate, tuple[ParticleImage, ...]]] = []

@@ -11,7 +11,6 @@ configured optics fit it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -124,7 +123,7 @@ class WholeField:
 
 def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
-) -> tuple[Sequence[ParticleImage], Sequence[ParticleImage]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Fit the field, and cut out the particles that are farthest from others."""
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})
