@@ -23,14 +23,14 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.fit_optics import Collected, fit_optics
 from iscat_analysis.instrument.microscope import with_sign
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.optics.parameters import (
     Settings,
     change_of,
     optics_limits,
     settings_of,
     with_settings,
 )
-from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.records import FloatArray, Mapper
 
 SETTLED = 1.0

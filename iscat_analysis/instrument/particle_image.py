@@ -11,9 +11,9 @@ from scipy import ndimage
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
-from iscat_analysis.instrument.parameters import PARAMETERS, Settings
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import PARAMETERS, Settings
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5

@@ -28,9 +28,8 @@ from iscat_analysis.instrument.fit_optics import (
     misfit_of,
 )
 from iscat_analysis.instrument.loop import Rounds
-from iscat_analysis.instrument.measure import LEAST_SIGHTS
-from iscat_analysis.instrument.parameters import heights_free, settings_of
 from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.optics.parameters import LEAST_SIGHTS, heights_free, settings_of
 from iscat_analysis.records import Status, Windows
 
 LEAST_ROUGH = 6
