@@ -1,14 +1,14 @@
 """Which microscope was it?  One loop, whoever the particles are: collect, test, fit, accept, again.
 
 The loop collects pictures of particles, tests whether the optics with which they were found
-describe them, fits optics to them, and accepts or refuses the result.  Where pictures depend on the optics,
-it collects them again with what was learned, until nothing changes.
+describe them, fits optics to them, and accepts or refuses the result.  Where pictures depend on the
+optics, it collects them again with what was learned, until nothing changes.
 
 Pictures of tracks do.  The light under particles that move is learned with their tracks.  With
-wrong optics it takes up a part of what they leave over, and the pictures show only the rest: what is
-learned from them is nearer to the truth, but not there, though it may describe the pictures.  Each
-round leaves a share of the error of the round before.  The share is seen in how much less a round
-changes than the one before, and with it what is still to come.
+wrong optics it takes up a part of what they leave over, and the pictures show only the rest: what
+is learned from them is nearer to the truth, but not there, though it may describe the pictures.
+Each round leaves a share of the error of the round before.  The share is seen in how much less a
+round changes than the one before, and with it what is still to come.
 """
 
 from __future__ import annotations
