@@ -14,7 +14,7 @@ import pytest
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.instrument.focus_drift import FocusDrift
+from iscat_analysis.instrument.fit_optics import FocusDrift
 from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.measured_images import ring_average
