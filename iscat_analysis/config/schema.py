@@ -1,4 +1,4 @@
-"""The whole configuration: its sections, and what one asks of another.
+"""The whole configuration: its sections, and conditions between them.
 
 Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open ``[start, stop)`` frames;
 complex numbers are ``[re, im]``.  The description of each field is what `iscat config` prints

@@ -1,7 +1,7 @@
 """From a configuration to its forward model: optics, particle and camera → `ForwardModel`.
 
-The amplitude of the scattered field over that of the reference is put together here, and the field
-is tabulated as the pupil's symmetry allows (D21, section II; physics.md, sections 1–3 and 8).
+This module computes the amplitude of the scattered field over that of the reference, and tabulates
+the field as the symmetry of the pupil allows (D21, section II; physics.md, sections 1–3 and 8).
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 PEAK_REACH = 4.0
-"""Distance, over λ/NA, up to which the peak contrast that a calibration is about is looked for: out
-of focus it lies on a ring, and a model made for a few pixels must have the scale of any other."""
+"""Largest distance, over λ/NA, at which the peak contrast of a calibration is searched: out of
+focus the peak lies on a ring, and the mass scale must not depend on the size of a model."""
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
-_STANDARDS_KEPT = 16  # optics of standards whose contrast per kDa is at hand
+_STANDARDS_KEPT = 16  # cached optics of standards, with their contrast per kDa
 
 
 def forward_model(
@@ -146,7 +146,7 @@ def forward_model(
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
-    """Put a measured picture in the place of the computed one."""
+    """Replace the computed image by a measured one."""
     wave = MeasuredField(template, peak_per_amplitude(model), model.reach_nm)
     return replace(model, wave=wave, scale=MassScale())
 
@@ -168,7 +168,7 @@ def signed_peak(model: ForwardModel) -> float:
 def _pupil(
     optics: Optics, reach_nm: float, sample_nm: float, oil_nm: float, nodes: int | None
 ) -> Aperture:
-    """Pupil with as many nodes as its phase turns; optical paths in sample and oil [nm]."""
+    """Pupil with enough nodes for its phase; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
     k = 2 * math.pi / optics.wavelength_nm
     critical = critical_angle(optics)
@@ -219,7 +219,7 @@ def _wave(
 
 
 def _lowest_nm(config: Config) -> float:
-    """Give the lowest height that a normal prior lets a fit look at, below the coverslip too."""
+    """Give the lowest height of a fit with a normal prior, which may be below the coverslip."""
     particle = config.particle
     sd_nm = particle.height_prior_sd_nm
     if config.fit.mode != "mass" or not sd_nm:
@@ -228,7 +228,7 @@ def _lowest_nm(config: Config) -> float:
 
 
 def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> MassScale:
-    """Let the line say what amplitude a mass has, at the optics of its standards."""
+    """Make the map from mass to amplitude, from the line and the optics of its standards."""
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
     linear, quadratic = _peak_terms(model)
@@ -270,7 +270,7 @@ def _peak_terms(model: ForwardModel) -> tuple[float, float]:
 
 
 def _same_template(here: Optics, there: Optics) -> bool:
-    """Tell whether two measured pictures are one."""
+    """Tell whether two measured images are the same."""
     if here.psf != "measured" or there.psf != "measured":
         return False
     if here.template == there.template:
