@@ -1,7 +1,7 @@
-"""The likelihood of a particle's track that diffuses freely, in time proportional to its length.
+"""The likelihood of the track of a freely diffusing particle, in time proportional to its length.
 
-Positions are averages over an exposure and have an error of their own each.  Their displacements
-then have a covariance with three bands, linear in the diffusion coefficient.
+Each position is an average over an exposure and has its own error.  The displacements therefore
+have a tridiagonal covariance, which is linear in the diffusion coefficient.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 LOG_2PI = math.log(2.0 * math.pi)
 
 TOGETHER = 8
-"""Variances whose product is far from overflow, of which one logarithm is taken."""
+"""Number of variances whose product cannot overflow, so that one logarithm is enough for them."""
 
 _SPAN = 1e-5  # the lowest of the first ladder's values of D over the highest
 _RUNGS = 25
@@ -37,7 +37,7 @@ def displacement_likelihood(
     rate_next: FloatArray,
     diffusion: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """Log-likelihood of displacements whose covariance is E + D·A, both with three bands.
+    """Log-likelihood of displacements whose covariance is E + D·A, both tridiagonal.
 
     The pivots p_k and residuals z_k of its factorisation are differentiated with respect to D as
     they are made.  Because the covariance is linear in D, the second derivative of its
@@ -88,10 +88,10 @@ def displacement_likelihoods(
     rate_next: FloatArray,
     diffusion: FloatArray,
 ) -> FloatArray:
-    """Log-likelihoods alone, of many D at once.
+    """Log-likelihoods of many D at once, without derivatives.
 
-    A pivot waits for the division by the one before it; those of several D need not wait for each
-    other, so that ten cost twice as much as one.
+    Each pivot needs the division by the one before it.  The pivots of several D are independent, so
+    that ten D take only twice as long as one.
 
     Shapes: `diffusion` (m,), result (m,).
     """

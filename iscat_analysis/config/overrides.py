@@ -50,9 +50,9 @@ def configure(
         ``{"optics.na": 1.3}``, or a configuration to change; without it, the defaults.
     settings : mapping of str to Any, or iterable of str, optional
         Changes, which replace values of the source, in their order:
-        ``{"optics.na": 1.3, "fit.frames": (200, 400)}``, or text as in ``["optics.na=1.3"]``.  None as a value unsets a key.  Where
-        two keys exclude each other, as ``particle.mass_kda`` and ``particle.diameter_nm`` do, the
-        later one replaces the earlier.
+        ``{"optics.na": 1.3, "fit.frames": (200, 400)}``, or text as in ``["optics.na=1.3"]``.
+        None as a value unsets a key.  If two keys exclude each other, as ``particle.mass_kda``
+        and ``particle.diameter_nm`` do, the later one replaces the earlier.
     arguments : mapping of str to Any, optional
         Further changes, which replace `settings`.
     called : mapping of str to str, optional
