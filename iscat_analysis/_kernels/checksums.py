@@ -28,7 +28,7 @@ class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
     """List the files of the functions that this process compiles, by the beginning of their names.
 
     Numba writes a function's files right after it has compiled it.  They are listed when the next
-    function is compiled, so that other processes can use the files of a process that runs for hours.
+    function is compiled, so that other processes can use them while this one runs for hours.
     """
 
     def __init__(self, folder: str) -> None:
@@ -37,14 +37,14 @@ class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
         self._running: list[object] = []  # a called function is compiled while its caller is
 
     def on_start(self, event: event.Event) -> None:
-        """Note a function, by what Numba names its files after."""
+        """Note a function, by the beginning of its file names."""
         if not self._running:
             self.record()
         dispatcher = event.data["dispatcher"]
         self._running.append(dispatcher)
         function = dispatcher.py_func
         code = getattr(function, "__code__", None)
-        if code is None:  # nothing that has a file
+        if code is None:  # it has no file
             return
         name = f"{inspect.getmodulename(code.co_filename)}.{function.__qualname__}"
         name = name.replace("<", "").replace(">", "")
@@ -81,12 +81,12 @@ def remove_damaged(folder: str) -> None:
 
 
 def record(folder: str, compiled: tuple[str, ...]) -> None:
-    """Add the files that begin so to the list; a full disk costs the next run time."""
+    """Add the files with these beginnings to the list; if the disk is full, nothing is listed."""
     found = _digests(folder, compiled) if compiled else {}
     if not found:
         return
     lock = FileLock(f"{folder}/{_LOCK}", fallback_to_soft=False)
-    with suppress(OSError):  # without, the later of two processes wins
+    with suppress(OSError):  # without the lock, the later of two processes wins
         lock.acquire(timeout=_PATIENCE_S)
     try:
         _replace(folder, _listed(folder) | found)

@@ -51,7 +51,7 @@ class UnbindingRate(Closed):
 
 
 class Kinetics(Closed):
-    """Rates of a table that has frames."""
+    """Rates of a table that has a column frame."""
 
     landing: LandingRate = key("Landings")
     unbinding: UnbindingRate | None = key("Leavings; null where there are none, or no places")
@@ -90,8 +90,8 @@ class SampleComparison(Document):
     background_other: float = key("The same of this sample")
     species: list[dict[str, Any]] = key(
         "By rising mass: mass_kda and fraction of the first sample, *_other of this one, "
-        "shift_kda, shift_percent and difference (this one's less the first's) with 95 % "
-        "intervals *_low and *_high; null where a species is too rare to compare"
+        "shift_kda, shift_percent and difference (of this sample minus the first) with 95 % "
+        "intervals *_low and *_high; null if a species is too rare to compare"
     )
 
 
@@ -125,8 +125,8 @@ class Kd(Document):
     dof: int = key("Its degrees of freedom")
     p_value: Share = key("Chance of at least as much if the tables follow the equilibrium")
     samples: list[dict[str, Any]] = key(
-        "The rows of the samples, with events, complexes (fraction of the particles that came, "
-        "with 95 % interval), predicted (the same by the equilibrium), pull (their distance in "
+        "The rows of the samples, with events, complexes (fraction of the particles that landed, "
+        "with 95 % interval), predicted (the fraction at equilibrium), pull (their difference in "
         "standard errors) and background"
     )
     curve: dict[str, Any] = key("Model dimer: columns concentration_nm and complexes")

@@ -94,7 +94,7 @@ class BoundsPlanned(Document):
 
 
 class Holevo(Closed):
-    """What one measurement of all free parameters can reach, for the planned frames."""
+    """Holevo bound of one measurement of all free parameters, for the planned frames."""
 
     weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
     sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
@@ -105,7 +105,7 @@ class Holevo(Closed):
 
 
 class Crosstalk(Document):
-    """The direction among the free parameters that is hidden worst."""
+    """The combination of free parameters that is determined worst."""
 
     inflation: Number
     direction: dict[str, Number]
@@ -223,7 +223,7 @@ class Bounds(Document):
     holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")
     information_fraction_joint: dict[Parameter, Number] = key(
-        "Share of what one measurement of all free parameters can take: (Holevo / CRB joint)²"
+        "Share of the best measurement of all free parameters: (Holevo / CRB joint)²"
     )
     incompatible: dict[str, float] = key(
         "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
@@ -251,7 +251,7 @@ class OpticsParameter(Closed):
 
 
 class HiddenDirection(Closed):
-    """A parameter that would be held, and the direction that pictures do not show."""
+    """A parameter that would be held, and the combination that images do not determine."""
 
     name: str
     others: list[str] = key("Parameters from which it is not told apart")
@@ -259,7 +259,7 @@ class HiddenDirection(Closed):
 
 
 class EventsNeeded(Closed):
-    """Particles of one mass that the goals take; null where no number suffices."""
+    """Number of particles of one mass for each goal; null if no number is enough."""
 
     mass_kda: float
     snr: NotNegative = key("Signal-to-noise ratio of one picture")
@@ -269,7 +269,7 @@ class EventsNeeded(Closed):
 
 
 class OpticsBounds(Document):
-    """What iscat bounds --for optics prints: how well particles would tell the microscope."""
+    """What iscat bounds --for optics prints: how well particles would determine the optics."""
 
     at: dict[str, Number] = key("The experiment")
     events: Natural = key("Particles that are fitted together")
@@ -280,10 +280,10 @@ class OpticsBounds(Document):
     unidentifiable: list[str] = key("What the pictures would not tell, one sentence each")
     hidden: list[HiddenDirection] = key("The same in numbers")
     common: dict[str, dict[Parameter, Number]] = key(
-        "Mode: standard deviation that the microscope's error puts into all fits alike [nm, kDa]"
+        "Mode: standard deviation common to all fits, from the error of the optics [nm, kDa]"
     )
     single: dict[str, dict[Parameter, Number]] = key(
-        "Mode: Cramér–Rao bound of one particle where the optics are known [nm, kDa]"
+        "Mode: Cramér–Rao bound of one particle if the optics are known [nm, kDa]"
     )
     goals: dict[str, float] = key("Precisions whose price is told")
     needed: list[EventsNeeded] = key("Their price, for several masses")

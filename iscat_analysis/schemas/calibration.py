@@ -78,7 +78,7 @@ class ContrastPeak(Closed):
 
 
 class Standard(Closed):
-    """A standard and what the line makes of its peak."""
+    """A standard, and the mass of its peak on the line."""
 
     mass_kda: float = key("Known mass [kDa]")
     mass_se: NotNegative = key("Its standard error [kDa]")
@@ -116,7 +116,7 @@ class StandardsCovariance(Closed):
 
 
 class Standards(Closed):
-    """With what the standards were recorded and analysed."""
+    """Optics and camera with which the standards were recorded and analysed."""
 
     optics: dict[str, Any] = key("Keys of [optics]")
     covariance: StandardsCovariance | None = key("Of these, where they were learned")
@@ -157,13 +157,13 @@ class OpticsParameter(Closed):
     crb: Number = key("Its Cramér–Rao bound, null where it was not measured")
     configured: float = key("What the configuration says")
     state: Literal["measured", "held", "dropped", "given"] = key(
-        "measured; held, because the pictures do not determine it; dropped, because it improves "
-        "nothing; or given, because it was not asked for"
+        "measured; held, because the images do not determine it; dropped, because it does not "
+        "improve the fits; or given, because it was not to be learned"
     )
 
 
 class HeldOut(Closed):
-    """How pictures that were not fitted agree with a microscope."""
+    """How well optics describe images that were held out."""
 
     p_values: list[float] = key("Of each picture")
     chi2_reduced: list[float] = key("Of each picture")
@@ -171,7 +171,7 @@ class HeldOut(Closed):
 
 
 class Twin(Closed):
-    """Another microscope that makes the same pictures."""
+    """Other optics that give the same images."""
 
     settings: dict[str, float | bool | str] = key("Its parameters")
     gap: float = key("Log-likelihood by which it is worse")
@@ -194,7 +194,7 @@ class Template(Document):
 
 
 class OpticsPictures(Closed):
-    """What the page shows."""
+    """Data of the page."""
 
     measured: list[list[float]] = key("Average contrast of the particles")
     model: list[list[float]] = key("The same, by the microscope that was found")

@@ -21,7 +21,7 @@ class SetupValue(Document):
 
 
 class Look(Document):
-    """What the search saw at some places of the movie."""
+    """What the search found in some parts of the movie."""
 
     frames: list[Count] = key("The frames at which it looked")
     window: Natural = key("Frames in each of its windows")
