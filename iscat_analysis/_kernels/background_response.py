@@ -232,8 +232,8 @@ def _overlap(
             variance = power * background[j] * (1.0 + others[j]) + read[j]
             weight[j] = 1.0 / variance if variance > 0.0 else 0.0
     for a in range(k):
-        _look_at_part(slopes, r, a, c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
-        _look_at_part(slopes, s, a, d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
+        _copy_part(slopes, r, a, c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
+        _copy_part(slopes, s, a, d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
         mine = work[1 + a]
         for j in range(size):
             mine[j] *= work[0, j]
@@ -244,7 +244,7 @@ def _overlap(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _look_at_part(
+def _copy_part(
     slopes: Slopes, row: int, k: int, width: int, top: int, left: int, nx: int, size: int,
     out: NDArray[np.float32],
 ) -> None:  # fmt: skip

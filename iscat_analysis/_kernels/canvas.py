@@ -334,7 +334,7 @@ def _add_rings(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def leave_over(
+def subtract_expected(
     light: Light, signal: NDArray[np.float32], first: int, out: NDArray[np.float32]
 ) -> None:
     """Subtract the expected light from frames.

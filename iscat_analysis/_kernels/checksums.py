@@ -19,7 +19,7 @@ from numba.core import event
 
 _LIST = "checksums.json"
 _LOCK = "checksums.lock"
-_PATIENCE_S = 5.0  # to wait for others that write the list; a lost entry costs a compilation
+_LOCK_TIMEOUT_S = 5.0  # to wait for others that write the list; a lost entry costs a compilation
 _ROOM_BYTES = 2**25  # all kernels of one analysis
 _KINDS = (".nbi", ".nbc")  # Numba's indices and its compiled code
 
@@ -87,7 +87,7 @@ def record(folder: str, compiled: tuple[str, ...]) -> None:
         return
     lock = FileLock(f"{folder}/{_LOCK}", fallback_to_soft=False)
     with suppress(OSError):  # without the lock, the later of two processes wins
-        lock.acquire(timeout=_PATIENCE_S)
+        lock.acquire(timeout=_LOCK_TIMEOUT_S)
     try:
         _replace(folder, _listed(folder) | found)
     finally:

@@ -22,8 +22,8 @@ _TINY = 1e-250  # smaller densities are added by their logarithms
 _BLOCK = 128  # events whose numbers fit into the cache
 # Ln 2; the first has few digits
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.90821492927058770002e-10
-_HALVES = np.exp2(-np.arange(1024.0))
-_LAST_HALF = np.uint32(_HALVES.size - 1)
+_POWERS_OF_HALF = np.exp2(-np.arange(1024.0))
+_LAST_INDEX = np.uint32(_POWERS_OF_HALF.size - 1)
 
 
 @njit(inline="always")
@@ -45,7 +45,7 @@ def _exp_falling(x: float) -> float:
     value = value * r + 0.5
     value = value * r + 1.0
     value = value * r + 1.0
-    value *= _HALVES[np.uint32(halvings) & _LAST_HALF]  # inside the table whatever x is
+    value *= _POWERS_OF_HALF[np.uint32(halvings) & _LAST_INDEX]  # inside the table whatever x is
     return value
 
 

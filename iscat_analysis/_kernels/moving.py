@@ -111,7 +111,9 @@ def fit_frames(
         t = place[0]
         total = canvas.total[t]
         if sweeps and place[4] == 0:
-            expected[t] = _look_over(light.counts[t])  # stored, or the compiler would drop the loop
+            expected[t] = _read_ahead(
+                light.counts[t]
+            )  # stored, or the compiler would drop the loop
         while place[1] < sweeps:
             for r in range(place[2], starts[t + 1]):
                 p, helped = theta[r], place[4] > 0
@@ -163,7 +165,7 @@ def fit_frames(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _look_over(frame: Counts) -> float:
+def _read_ahead(frame: Counts) -> float:
     """Read a whole frame in order, so that it is in the cache when its squares are fitted."""
     total = np.float32(0.0)
     for i in range(frame.shape[0]):

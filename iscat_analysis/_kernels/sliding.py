@@ -165,7 +165,7 @@ def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
 
 
 @kernel()
-def in_shadow(
+def near_earlier_peaks(
     peaks: FloatArray,
     frames: tuple[int, int],
     distances: tuple[float, float, float],

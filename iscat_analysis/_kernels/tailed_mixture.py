@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 
 _SHORT = 0.05  # of √v: for a shorter tail the series is used
 _ORDERS = 7
-_DEEP = 24.0  # beyond it the complementary error function vanishes
+_ERFC_LIMIT = 24.0  # beyond it the complementary error function vanishes
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _TINY = 1e-290
 
@@ -34,7 +34,7 @@ _TINY = 1e-290
 def _over_normal(a: float) -> float:
     """Give Φ(a)/φ(a) for a ≤ 0."""
     y = -a * math.sqrt(0.5)
-    if y < _DEEP:
+    if y < _ERFC_LIMIT:
         return math.sqrt(0.5 * math.pi) * math.exp(y * y) * math.erfc(y)
     b = 1.0 / (a * a)
     return -(1.0 - b * (1.0 - 3.0 * b * (1.0 - 5.0 * b))) / a

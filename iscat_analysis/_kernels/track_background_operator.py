@@ -59,12 +59,12 @@ def send(
 @kernel(fastmath=FAST, _nrt=False)
 def follow(
     slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray,
-    images: FloatArray, felt: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
+    images: FloatArray, projections: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
 ) -> None:  # fmt: skip
     """Give Gᵀ times images for each row, and add G F⁻¹ Gᵀ times these images to `out`.
 
-    Shapes: `covariance` (n, k, k), `images` (b, y, x), `felt` (n, b, k), `out` (b, y, x), `work`
-    (side²,), `by` (k,).
+    Shapes: `covariance` (n, k, k), `images` (b, y, x), `projections` (n, b, k), `out` (b, y, x),
+    `work` (side²,), `by` (k,).
     """
     k = slopes.values.shape[1]
     for q in range(rows.size):
@@ -72,10 +72,10 @@ def follow(
         for v in range(images.shape[0]):
             size = gather(images[v], square, work)
             for a in range(k):
-                felt[q, v, a] = units[a] * product(values[a], work, size)
+                projections[q, v, a] = units[a] * product(values[a], work, size)
             for a in range(k):
                 by[a] = 0.0
                 for b in range(k):
-                    by[a] += covariance[q, a, b] * felt[q, v, b]
+                    by[a] += covariance[q, a, b] * projections[q, v, b]
             mix(values, units, by, size, work)
             put(work, square, out[v])

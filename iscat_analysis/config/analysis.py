@@ -20,7 +20,7 @@ from iscat_analysis.config.values import (
     length,
 )
 
-THINNEST_MPA_S = 0.1
+LOWEST_VISCOSITY_MPA_S = 0.1
 """Half the viscosity of ether, the thinnest liquid near room temperature."""
 
 TEMPERATURES_C = (-100.0, 250.0)
@@ -142,7 +142,7 @@ class Fit(Section):
 
 
 def _no_pascal_seconds(viscosity: float) -> float:
-    if viscosity < THINNEST_MPA_S:
+    if viscosity < LOWEST_VISCOSITY_MPA_S:
         raise ValueError(
             f"{viscosity:g} mPa·s is less than any liquid has; if {viscosity:g} is in Pa·s, write "
             f"{1e3 * viscosity:g}"

@@ -11,7 +11,7 @@ from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
 
-_ALIKE = 0.7  # of two words, as difflib measures it
+_LEAST_SIMILARITY = 0.7  # of two words, as difflib measures it
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
 
@@ -72,7 +72,7 @@ def _nearest(word: str, location: list[str]) -> str:
     ]
     if sections and len(location) < 2:
         return " or ".join(f"{section}.{small}" for section in sections)
-    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_ALIKE)
+    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_LEAST_SIMILARITY)
     return known[near[0]] if near else ""
 
 

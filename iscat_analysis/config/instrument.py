@@ -24,16 +24,16 @@ from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
 
 Index = Annotated[Positive, AfterValidator(refractive_index)]
 
-MOST_WAVES = 0.5
+LARGEST_ABERRATION = 0.5
 """Largest Zernike term over the wavelength; ten times that of a poor objective."""
 
 LARGEST_SD_NM = 100.0
 """Largest standard deviation of heights, half a fringe: for more, use mode joint."""
 
-MOST_PASSES = 3.0
+LARGEST_ATTENUATION = 3.0
 """Largest attenuation: transmitted amplitude of the reference over that of scattered light."""
 
-PER_KDA = (1e-7, 0.01)
+CONTRAST_PER_KDA = (1e-7, 0.01)
 """Range of contrast per kDa: a protein has some 1e-5; at the upper limit, the contrast of 100 kDa
 would be 1."""
 
@@ -188,10 +188,10 @@ class Optics(Section):
                 "whole pupil is attenuation without mask_na"
             )
         for name, size in self.aberrations_nm.items():
-            if abs(size) > MOST_WAVES * self.wavelength_nm:
+            if abs(size) > LARGEST_ABERRATION * self.wavelength_nm:
                 raise ValueError(
-                    f"aberrations_nm.{name} = {size:g} exceeds {MOST_WAVES:g} wavelengths rms: "
-                    "give nanometres of path, rms over the pupil"
+                    f"aberrations_nm.{name} = {size:g} exceeds {LARGEST_ABERRATION:g} wavelengths "
+                    "rms: give nanometres of path, rms over the pupil"
                 )
         if self.na >= self.n_immersion:
             raise ValueError(
@@ -217,10 +217,10 @@ class Optics(Section):
             raise ValueError(
                 "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
             )
-        if self.attenuation > MOST_PASSES:
+        if self.attenuation > LARGEST_ATTENUATION:
             raise ValueError(
-                f"attenuation = {self.attenuation:g} is more than {MOST_PASSES:g}: it is the part "
-                "of the reference's amplitude that passes, as 0.1 for a tenth"
+                f"attenuation = {self.attenuation:g} is more than {LARGEST_ATTENUATION:g}: it is "
+                "the part of the reference's amplitude that passes, as 0.1 for a tenth"
             )
         if self.scheme != "darkfield" and self.attenuation == 0:
             raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
@@ -464,7 +464,7 @@ class Calibration(Section):
     def _usable(self) -> Calibration:
         if self.gradient_per_kda == 0:
             raise ValueError("gradient_per_kda = 0 says nothing about mass")
-        least, most = PER_KDA
+        least, most = CONTRAST_PER_KDA
         if not least <= abs(self.gradient_per_kda) <= most:
             raise ValueError(
                 f"gradient_per_kda = {self.gradient_per_kda:g} is not between {least:g} and "

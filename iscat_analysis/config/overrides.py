@@ -23,7 +23,7 @@ from iscat_analysis.config.values import ALL
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.reading import toml_of
 
-_RIVALS = {
+_EXCLUSIVE_KEYS = {
     ("particle", "mass_kda"): ("diameter_nm",),
     ("particle", "diameter_nm"): ("mass_kda",),
     ("particle", "index"): ("permittivity",),
@@ -214,7 +214,7 @@ def _change(
         table.pop(key, None)
         return
     table[key] = value
-    for rival in _RIVALS.get((section, key), ()) if exclude else ():
+    for rival in _EXCLUSIVE_KEYS.get((section, key), ()) if exclude else ():
         table.pop(rival, None)
 
 

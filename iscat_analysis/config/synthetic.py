@@ -18,7 +18,7 @@ from iscat_analysis.config.values import (
 MOST_FRAMES = 10_000_000
 """Longest simulated movie; particles that move have positions in all of its frames."""
 
-_MOST_PLACES = 100_000_000
+_MOST_POSITIONS = 100_000_000
 
 
 class SimulatedEvent(Section):
@@ -144,10 +144,10 @@ class Simulation(Section):
         if self.leavings and (self.count is None or self.leavings > self.count):
             raise ValueError(f"leavings = {self.leavings} needs a count at least as large")
         moving = sum(mover.count for mover in self.movers)
-        if moving * self.frames > _MOST_PLACES:
+        if moving * self.frames > _MOST_POSITIONS:
             raise ValueError(
                 f"{moving} movers in frames = {self.frames} have {moving * self.frames} places, "
-                f"more than {_MOST_PLACES}: simulate fewer, or a shorter movie"
+                f"more than {_MOST_POSITIONS}: simulate fewer, or a shorter movie"
             )
         for number, event in enumerate(self.events):
             inside = (

@@ -60,7 +60,7 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-PEAK_REACH = 4.0
+PEAK_SEARCH_RADIUS = 4.0
 """Largest distance, over λ/NA, at which the peak contrast of a calibration is searched: out of
 focus the peak lies on a ring, and the mass scale must not depend on the size of a model."""
 
@@ -81,7 +81,7 @@ def forward_model(
     """Build the forward model of a configuration."""
     optics = config.optics
     if config.calibration is not None:
-        reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
+        reach_nm = max(reach_nm, PEAK_SEARCH_RADIUS * optics.wavelength_nm / optics.na)
     height = config.particle.nominal_height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm
@@ -289,7 +289,7 @@ def _standards_peak_terms(optics: str, particle: str) -> tuple[float, float]:
         optics=Optics.model_validate_json(optics), particle=Particle.model_validate_json(particle)
     )
     return _peak_terms(
-        forward_model(config, PEAK_REACH * config.optics.wavelength_nm / config.optics.na)
+        forward_model(config, PEAK_SEARCH_RADIUS * config.optics.wavelength_nm / config.optics.na)
     )
 
 

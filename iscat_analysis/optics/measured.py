@@ -31,7 +31,7 @@ from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 FloatArray = NDArray[np.float64]
 
 _MOST_LATTICES = 4  # cached lattices, one for each number of orders
-_SLOW = 1e-3  # a rate [rad/nm] for tables along z, although nothing changes along z
+_AXIAL_RATE = 1e-3  # a rate [rad/nm] for tables along z, although nothing changes along z
 _STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
 _LARGEST_NUMBER = 1e9  # of its numbers
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
@@ -119,7 +119,7 @@ class MeasuredField:
     @property
     def axial(self) -> NDArray[np.complex128]:
         """Phases per height, for tables along z; nothing changes along z [rad/nm]."""
-        return np.array([-_SLOW, _SLOW], dtype=np.complex128)
+        return np.array([-_AXIAL_RATE, _AXIAL_RATE], dtype=np.complex128)
 
     @property
     def half(self) -> int:

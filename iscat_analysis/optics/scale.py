@@ -21,7 +21,7 @@ from iscat_analysis.config import Calibration, Optics
 
 FloatArray = NDArray[np.float64]
 
-MOST_CHANGE = 1 / 3
+LARGEST_SCALE_CHANGE = 1 / 3
 """Largest change of the contrast per kDa, from the optics of the standards to others, for which the
 model converts the scale: beyond it, small errors of the optics are large errors of the mass."""
 
@@ -40,7 +40,7 @@ def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
             f"they were measured at {there.wavelength_nm:g} nm, and this is at "
             f"{here.wavelength_nm:g} nm"
         )
-    if not abs(ratio - 1) <= MOST_CHANGE:
+    if not abs(ratio - 1) <= LARGEST_SCALE_CHANGE:
         return (
             f"by the model the contrast per kDa is {ratio:.3g} of that with the standards' optics, "
             "a change of more than a third"

@@ -33,7 +33,7 @@ Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
 NEGLIGIBLE_CHANGE = 1e-6
 """Share of the change of light below which its azimuthal harmonics are left out."""
 
-COARSER = 2
+STEP_RATIO = 2
 """Radial step of these tables over that of the field: their error is one part in 10⁶."""
 
 
@@ -105,7 +105,7 @@ def sensitivity_lattices(
     series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
     count = len(field)
     lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
-    stack = lattice.lattices(series, whole.pupil.transverse, COARSER)
+    stack = lattice.lattices(series, whole.pupil.transverse, STEP_RATIO)
     return lattice.lens(rho), stack.reshape(2 + len(names), count, *stack.shape[1:])
 
 

@@ -49,7 +49,7 @@ _HEIGHTS_KEPT = 8  # cached profiles; if z is fixed, every image needs the same 
 _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is searched
 _PEAK_POINTS = 8  # the same, in each step of the radial table
 _NEWTON = 4  # steps from there
-_AT_ONCE = 16  # heights of the axial table made together
+_HEIGHTS_AT_ONCE = 16  # heights of the axial table made together
 
 
 def check_table(what: str, numbers: float) -> None:
@@ -198,8 +198,8 @@ class LatticeField:
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
         parts = [
-            self._stack(heights_nm[i : i + _AT_ONCE], 3, kappa)
-            for i in range(0, heights_nm.size, _AT_ONCE)
+            self._stack(heights_nm[i : i + _HEIGHTS_AT_ONCE], 3, kappa)
+            for i in range(0, heights_nm.size, _HEIGHTS_AT_ONCE)
         ]
         return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * len(self.harmonics), -1)
 

@@ -40,8 +40,8 @@ FloatArray = NDArray[np.float64]
 SATURATION_NM = 500.0
 """A fit is flagged if a saturated pixel is nearer than this."""
 
-_FEWEST = 0.5  # share of a region's pixels that must be usable
-_MARGIN = 0.15  # of the region's side at each edge, where a particle is not looked for
+_LEAST_USABLE_SHARE = 0.5  # share of a region's pixels that must be usable
+_EDGE_SHARE = 0.15  # of the region's side at each edge, where a particle is not looked for
 
 
 def fit_rois(
@@ -213,7 +213,7 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     likelihood = counts.likelihood(index)
     config, model, pixel_nm = counts.config, counts.model, counts.grid.pixel_nm
     saturated = counts.saturated[index]
-    if likelihood.n_pixels < _FEWEST * saturated.size:
+    if likelihood.n_pixels < _LEAST_USABLE_SHARE * saturated.size:
         flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
         status, noticed = verdict(flags)
         return {
@@ -268,7 +268,7 @@ def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
     ranked = np.abs(snr) if templates.two_sided else snr
     rows, columns = likelihood.grid.shape
     inner = np.full(ranked.shape, -np.inf)
-    top, left = (int(_MARGIN * size) for size in (rows, columns))
+    top, left = (int(_EDGE_SHARE * size) for size in (rows, columns))
     inside = (slice(None), slice(top, rows - top), slice(left, columns - left))
     inner[inside] = ranked[inside]
     k, row, column = (int(i) for i in np.unravel_index(np.argmax(inner), inner.shape))

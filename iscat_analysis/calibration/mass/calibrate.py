@@ -24,11 +24,11 @@ LEAST_EVENTS = 30
 """Fewest events for a histogram."""
 
 _LANDING_SHARE = 0.4
-_PER_KDA = (3e-7, 1.5e-3)
+_CONTRAST_PER_KDA = (3e-7, 1.5e-3)
 # Contrast per kDa of any microscope: 3e-5 in visible light, up to 30 times as much if a mask dims
 # the reference; less for dense metals, and at long wavelengths if the reference is not dimmed.
-_LIGHT_KDA = 10.0  # lighter than any standard that can be detected
-_DETAILS = (1.0, 2.0, 4.0, 0.5)
+_LIGHTEST_KDA = 10.0  # lighter than any standard that can be detected
+_KERNEL_WIDTHS = (1.0, 2.0, 4.0, 0.5)
 
 
 def calibrate_mass(
@@ -69,7 +69,7 @@ def calibrate_mass(
     # kernels hardly accepts more wrong standards (3 in 100 random ones, with twelve events each),
     # since a line through other peaks must meet the same limits.
     refusals: list[tuple[int, DataError]] = []
-    for detail in _DETAILS:
+    for detail in _KERNEL_WIDTHS:
         peaks = find_contrast_peaks(size, size_errors, detail=detail)
         try:
             chosen = match(peaks, masses, name)
@@ -133,7 +133,7 @@ def _standards(
 
 def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str) -> None:
     """Refuse a line that no microscope can have, which shows that a unit is wrong."""
-    low, high = _PER_KDA
+    low, high = _CONTRAST_PER_KDA
     if low <= abs(slope) <= high:
         return
     shown = ",".join(f"{m:g}" for m in masses)
@@ -145,7 +145,7 @@ def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
         )
-    if masses.max() < _LIGHT_KDA:
+    if masses.max() < _LIGHTEST_KDA:
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
         )

@@ -21,7 +21,7 @@ LEAST_PROBABILITY = 1e-4
 OFFSET_SHARE = 0.35
 """Largest contrast at zero mass, over the contrast of the lightest peak."""
 
-_FITS = 0.05  # largest relative distance of a standard that a message says to fit
+_FITTING_DISTANCE = 0.05  # largest relative distance of a standard that a message says to fit
 _MOST_STANDARDS = 8  # with more, no subsets are tried for a message
 
 
@@ -104,7 +104,7 @@ def _fitting(peaks: Sequence[ContrastPeak], masses: FloatArray) -> FloatArray | 
             contrast = np.array([peak.contrast for peak in chosen])
             slope, offset = np.polyfit(some, contrast, 1, w=1 / contrast)
             off = np.abs((contrast - offset) / slope / some - 1).max() if slope > 0 else math.inf
-            if off < _FITS and abs(offset) < OFFSET_SHARE * contrast[0]:
+            if off < _FITTING_DISTANCE and abs(offset) < OFFSET_SHARE * contrast[0]:
                 fits.append((cost, some))
         if fits:
             return min(fits, key=lambda fit: fit[0])[1]

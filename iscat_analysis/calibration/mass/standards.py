@@ -17,7 +17,7 @@ from iscat_analysis.config import (
     StandardsCamera,
     toml_value,
 )
-from iscat_analysis.optics.forward import PEAK_REACH, forward_model
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 
 _OF_A_MOVIE = {
     "file": None, "covariance": None, "calibrate": "auto", "focus_drift_nm": 0.0, "focus_frame": 0,
@@ -101,7 +101,7 @@ def as_given(config: Config) -> Config:
 def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     """Give the contrast per mass over that of standards, and why it cannot be converted."""
     config = config.model_copy(update={"calibration": None})
-    reach_nm = PEAK_REACH * config.optics.wavelength_nm / config.optics.na
+    reach_nm = PEAK_SEARCH_RADIUS * config.optics.wavelength_nm / config.optics.na
     rises = (
         forward_model(config, reach_nm).peak_contrast(config.particle.nominal_height_nm, 1e-3) > 0
     )
