@@ -1,4 +1,4 @@
-"""The configuration: what the keys are, how files are read, and how single keys are changed.
+"""The configuration: its keys, how files are read, and how single keys are changed.
 
 `instrument`, `analysis` and `synthetic` have the sections and their keys, `values` the allowed
 values, and `schema` the whole configuration.  Only `configure` makes a `Config`: files, mappings,

@@ -124,7 +124,7 @@ def config_to_toml(
         isinstance(sections, Iterable)
         and all(isinstance(name, str) and name in known for name in sections)
     ):
-        raise ConfigError(f"`sections`: names what is no section; they are {', '.join(known)}")
+        raise ConfigError(f"`sections`: has an unknown name; the sections are {', '.join(known)}")
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:

@@ -475,7 +475,7 @@ class Calibration(Section):
 
 
 class Uncertainty(Section):
-    """Standard deviations of inputs that nobody measured; 0 turns one off.
+    """Standard deviations of inputs that were not measured; 0 turns one off.
 
     If standards were recorded with the same optics, they have the same errors, which cancel.
     """

@@ -155,7 +155,8 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
             texts = [settings]
         if not all(isinstance(text, str) for text in texts):
             raise ConfigError(
-                "`settings`: holds what is no text; give a mapping, or texts as optics.na=1.42"
+                "`settings`: has an item that is not text; give a mapping, or texts such as "
+                "optics.na=1.42"
             )
         return [_parsed(text) for text in texts]
     found = []

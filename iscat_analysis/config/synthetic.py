@@ -87,8 +87,8 @@ class SimulatedMover(Section):
             raise ValueError("give x_px and y_px, or neither")
         if self.x_px is not None and self.count != 1:
             raise ValueError(
-                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the place "
-                "out, or give each a block of its own"
+                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the "
+                "position out, or give each particle its own block"
             )
         if self.ceiling_nm is not None:
             if self.space == "membrane":
@@ -128,7 +128,7 @@ class Simulation(Section):
     events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
     movers: tuple[SimulatedMover, ...] = Field((), description="particles that diffuse, by kind")
     count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
-        None, description="landings at random places and times, in place of events; 0: a blank"
+        None, description="landings at random positions and times, instead of events; 0: a blank"
     )
     leavings: Annotated[int, Field(ge=0)] = Field(
         0, description="how many of the count leave before the movie ends"
@@ -146,7 +146,7 @@ class Simulation(Section):
         moving = sum(mover.count for mover in self.movers)
         if moving * self.frames > _MOST_POSITIONS:
             raise ValueError(
-                f"{moving} movers in frames = {self.frames} have {moving * self.frames} places, "
+                f"{moving} movers in frames = {self.frames} have {moving * self.frames} positions, "
                 f"more than {_MOST_POSITIONS}: simulate fewer, or a shorter movie"
             )
         for number, event in enumerate(self.events):

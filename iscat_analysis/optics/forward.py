@@ -239,7 +239,7 @@ def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> M
         return MassScale(line, linear, quadratic)
     if measured or line.optics.psf == "measured":  # whose contrasts are measured, not computed
         same = _same_template(model.optics, line.optics)
-        refusal = "" if same else "they were measured with another picture of a particle"
+        refusal = "" if same else "they were measured with another image of a particle"
         return MassScale(line, linear, quadratic, linear, refusal)
     height = particle.nominal_height_nm if line.height_nm is None else line.height_nm
     there = particle.held_at(height)

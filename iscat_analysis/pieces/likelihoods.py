@@ -135,7 +135,7 @@ class LogLikelihood:
         return points, inside & np.all(np.isfinite(points), axis=1)
 
     def _inner(self, points: FloatArray) -> FloatArray:
-        """Turn points into what the kernels take: amplitudes, and the parameters held fixed."""
+        """Turn points into parameters of the kernels: with amplitudes, and fixed parameters."""
         inner = np.tile(self._fixed, (len(points), 1))
         inner[:, self._index] = points
         if "mass_kda" in self.names:

@@ -253,7 +253,7 @@ class _Setups:
         self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
         self.grid = PixelGrid.centred(pixels, self._pixel_nm)
         self._dark = config.optics.scheme == "darkfield"
-        # a calibration was measured at the focus of `optics`, whatever focus is asked about
+        # a calibration was measured at the focus of `optics`, not at the focus of the set-up
         nominal = forward_model(config, self._pixel_nm)
         self._scale = nominal.scale
         self._all = together(

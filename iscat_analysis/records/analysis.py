@@ -1,4 +1,4 @@
-"""What a report is made of."""
+"""Data of a report."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Everything one run of the main job found; what the report is made of.
+    """All results of one run of the main job, from which the report is made.
 
     Attributes
     ----------

@@ -54,7 +54,7 @@ class Kinetics(Closed):
     """Rates of a table that has a column frame."""
 
     landing: LandingRate = key("Landings")
-    unbinding: UnbindingRate | None = key("Leavings; null where there are none, or no places")
+    unbinding: UnbindingRate | None = key("Leavings; null if there are none, or no positions")
     frame_rate_hz: float = key("Frames per second")
     frames: tuple[int, int] = key("In which events were looked for, [start, stop)")
     notes: list[str] = key("What the user should know, one line each")
@@ -118,7 +118,9 @@ class Kd(Document):
     masses_kda: list[float] = key("Masses of the species [kDa], the complex last")
     width_kda: float = key("Width of the lightest species beside the events' own errors [kDa]")
     tail_kda: float = key("Mean of the peaks' exponential tail, negative towards light ones [kDa]")
-    limit_kda: Number = key("Mass detected every other time where the tables' edge tells [kDa]")
+    limit_kda: Number = key(
+        "Mass that is detected with probability 1/2, from the edge of the tables [kDa]"
+    )
     landing_power: float = key("p of landings ∝ concentration·mass^p")
     landing_power_se: float = key("Its standard error; 0 where it was given")
     chi2: float = key("Twice the gain of fractions that are free in every table")

@@ -139,11 +139,11 @@ class DetectionLimit(Closed):
 
     false_alarm: float = key("Probability that noise alone is taken for a particle")
     miss: float = key("Probability that the particle is not found")
-    threshold_known: float = key("Of the signal-to-noise ratio, where the place is known")
+    threshold_known: float = key("Of the signal-to-noise ratio, if the position is known")
     threshold_searched: float = key("The same where the field of [bounds] is searched")
-    snr_known: float = key("Signal-to-noise ratio that a particle needs, place known")
+    snr_known: float = key("Signal-to-noise ratio that a particle needs, position known")
     snr_searched: float = key("The same, field searched")
-    mass_known_kda: NotNegative = key("Its mass, place known [kDa]")
+    mass_known_kda: NotNegative = key("Its mass, position known [kDa]")
     mass_searched_kda: NotNegative = key("Its mass, field searched [kDa]")
     snr_per_amplitude: float = key("Square root of the empty field's Fisher information")
 
@@ -247,14 +247,14 @@ class OpticsParameter(Closed):
     value: float = key("As configured")
     sigma: Positive = key("Standard deviation, all fitted together; null where it would be held")
     prior_range: float = key("What is plausible")
-    determined: bool = key("Whether the pictures determine it within that")
+    determined: bool = key("Whether the images determine it within that range")
 
 
 class HiddenDirection(Closed):
     """A parameter that would be held, and the combination that images do not determine."""
 
     name: str
-    others: list[str] = key("Parameters from which it is not told apart")
+    others: list[str] = key("Parameters from which it cannot be told apart")
     direction: dict[str, Number] = key("One standard deviation, each in its own unit")
 
 
@@ -277,7 +277,9 @@ class OpticsBounds(Document):
     parameters: list[OpticsParameter]
     names: list[str] = key("Parameters that are determined, in the order of covariance")
     covariance: list[list[Number]] = key("Of these, fitted together")
-    unidentifiable: list[str] = key("What the pictures would not tell, one sentence each")
+    unidentifiable: list[str] = key(
+        "Parameters that the images would not determine, one sentence each"
+    )
     hidden: list[HiddenDirection] = key("The same in numbers")
     common: dict[str, dict[Parameter, Number]] = key(
         "Mode: standard deviation common to all fits, from the error of the optics [nm, kDa]"
@@ -285,7 +287,7 @@ class OpticsBounds(Document):
     single: dict[str, dict[Parameter, Number]] = key(
         "Mode: Cramér–Rao bound of one particle if the optics are known [nm, kDa]"
     )
-    goals: dict[str, float] = key("Precisions whose price is told")
+    goals: dict[str, float] = key("Precisions for which the number of particles is given")
     needed: list[EventsNeeded] = key("Their price, for several masses")
     warnings: list[str] = key("What the user should know, one line each")
 
