@@ -1,14 +1,14 @@
-"""The manual's code blocks: found, run in order, and their output kept.
+"""Find the code blocks of the manual, run them in order, and keep their output.
 
 A page's ``console`` blocks (lines that begin with ``$``) and ``python`` blocks are run one after
-the other in one folder, the Python blocks in one interpreter.  Comments in the page steer it:
+the other in one folder, the Python blocks in one interpreter.  Comments in the page control this:
 
 ``<!-- not run: REASON -->``
-    before a block that needs what is not there.
+    before a block that cannot be run.
 ``<!-- needs: MODULE -->``
-    before a block that is run only where a module of another package is installed.
+    before a block that is run only if a module of another package is installed.
 ``<!-- first: COMMAND -->``
-    before a block: a command that is run and not shown.
+    before a block: a command that is run but not shown.
 ``<!-- keep: NAME -->``
     before a block whose output the manual shows, as ``_build/generated/PAGE/NAME.txt``.
 """
@@ -51,7 +51,7 @@ class Block:
 
     @property
     def commands(self) -> list[str]:
-        """What a shell is given: the lines after ``$``, continued where they end in a backslash."""
+        """Commands for the shell: the lines after ``$``, continued if they end in a backslash."""
         found: list[str] = []
         going_on = False
         for line in self.text.splitlines():
@@ -67,7 +67,7 @@ class Block:
 
 @dataclass
 class Outcome:
-    """What a block printed."""
+    """Output of a block."""
 
     block: Block
     out: str = ""
@@ -75,7 +75,7 @@ class Outcome:
 
 
 def blocks_of(page: Path) -> Iterator[Block]:
-    """Find the blocks of a page that could be run."""
+    """Find the console and Python blocks of a page."""
     lines = iter(enumerate(page.read_text(encoding="utf-8").splitlines(), start=1))
     first: list[str] = []
     not_run: str | None = None
@@ -111,9 +111,9 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
     page : Path
         Markdown.
     folder : Path
-        Where; it should hold what the page takes for granted.
+        Folder to run in; it should contain the files that `prepare` copies.
     bin_folder : Path
-        Where `iscat` and `python` are.
+        Folder of `iscat` and `python`.
 
     Returns
     -------
@@ -172,7 +172,7 @@ for line in sys.stdin:
         return self
 
     def run(self, text: str) -> tuple[str, str | None]:
-        """Run a snippet; its output, and the traceback if it failed."""
+        """Run a snippet; return its output, and the traceback if it failed."""
         if self._process is None:
             arguments, folder, environment = self._arguments
             self._process = subprocess.Popen(
@@ -198,7 +198,7 @@ for line in sys.stdin:
 
 
 def main() -> None:
-    """Run the pages named on the command line, each in a folder of its own, and say how it went."""
+    """Run the pages named on the command line, each in its own folder, and print their output."""
     import shutil
 
     root = Path(__file__).resolve().parent.parent
@@ -216,7 +216,7 @@ def main() -> None:
 
 
 def prepare(root: Path, folder: Path) -> None:
-    """Put into a folder what every page takes for granted: the samples of the checkout."""
+    """Copy the files that every page needs into a folder: the samples of the checkout."""
     for name in ("sample_configs", "docs/tutorial.toml"):
         source, target = root / name, folder / name
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The manual's settings; the reference is written from the code when the manual is built."""
+"""Settings of the manual; the reference pages are written from the code during the build."""
 
 from __future__ import annotations
 
@@ -162,7 +162,7 @@ def _write_columns() -> None:
 def _run_pages() -> None:
     """Run every block of the manual and of README, as many pages at a time as there are cores.
 
-    Pages of many commands come first, so that no core is left with one.
+    Pages with many commands come first, so that no core has a long page at the end.
     """
     pages = [
         page
@@ -180,7 +180,7 @@ def _commands_of(page: Path) -> int:
 
 
 def _run_one_page(page: Path) -> None:
-    """Run a page's blocks and keep what they print or draw."""
+    """Run a page's blocks, and keep their output and figures."""
     target = GENERATED / page.stem
     if target.is_dir() and os.environ.get("DOCS_REUSE"):  # while writing
         return
@@ -201,7 +201,7 @@ def _run_one_page(page: Path) -> None:
 
 
 def _mathml(text: str, *, as_block: bool) -> str:
-    """Write an equation as browsers draw it themselves, without a script from the network."""
+    """Write an equation in MathML, which browsers draw without a script from the network."""
     known = text.replace(r"\dots", r"\ldots")
     return str(tex2mathml(known, as_block=as_block))
 

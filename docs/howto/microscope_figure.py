@@ -2,8 +2,8 @@
 
 python docs/howto/microscope_figure.py
 
-It simulates the page's movie, learns its optics, and averages the particles twice: with what the
-configured microscope makes of them, and with what the learned one does.
+It simulates the page's movie, learns its optics, and averages the particles twice: fitted with the
+configured optics, and with the learned optics.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRUE = {
     "optics.aberrations_nm.z8": -10,
     "optics.aberrations_nm.z11": 15,
 }
-"""What the movie's microscope has and the configuration does not know."""
+"""Differences of the movie's optics from the configuration."""
 
 STYLE = {"font.size": 9, "svg.fonttype": "none", "svg.hashsalt": "microscope"}
 RANGE = 6.0  # standard deviations

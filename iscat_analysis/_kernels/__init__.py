@@ -1,8 +1,8 @@
-"""Arrays in, arrays out: the compiled inner loops and the tables they run on.
+"""The compiled inner loops and their tables; they take and return arrays only.
 
-Numba keeps what it compiled in the package's folder, or where that cannot be written in the user's;
-NUMBA_CACHE_DIR names another.  Where nothing can be written, kernels are kept as long as the
-process lives.
+Numba stores compiled kernels in the package's folder, or in the user's cache if that folder cannot
+be written; NUMBA_CACHE_DIR names another folder.  If none can be written, they are kept until the
+process ends.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from iscat_analysis.errors import ConfigError
 try:
     from numba import config, njit
     from numba.core import event
-except ValueError as error:  # of a variable of the environment, as NUMBA_NUM_THREADS=0
+except ValueError as error:  # from an environment variable such as NUMBA_NUM_THREADS=0
     raise ConfigError(
         f"Numba refuses a variable of the environment ({error}): correct or unset those that "
         "begin with NUMBA_"
@@ -29,11 +29,11 @@ from iscat_analysis._kernels import checksums
 
 
 def _probe() -> None:
-    """Be something to compile."""
+    """Do nothing; Numba compiles this function to find its folder."""
 
 
 def _find_folder() -> tuple[str, bool]:
-    """Name the folder of compiled kernels, and tell whether it is removed in the end."""
+    """Name the folder of compiled kernels, and tell whether it is removed when the process ends."""
     if config.DISABLE_JIT:
         return "", False
     try:
@@ -52,10 +52,10 @@ def _find_folder() -> tuple[str, bool]:
 
 
 FOLDER, TEMPORARY = _find_folder()
-"""Where compiled kernels are kept, and whether every process compiles its kernels anew."""
+"""Folder of compiled kernels, and whether every process compiles its kernels again."""
 
 NO_ROOM = checksums.refusal(FOLDER)
-"""Why nothing more can be kept there, as on a full disk; empty where it can."""
+"""Why the folder cannot store more, for example on a full disk; empty if it can."""
 
 checksums.remove_damaged(FOLDER)
 
@@ -64,7 +64,7 @@ event.register("numba:compile", _COMPILED)
 
 
 def record_checksums() -> None:
-    """Vouch for what this process compiled, so that the next one takes it."""
+    """List the kernels that this process compiled, so that later processes load them."""
     _COMPILED.record()
 
 
@@ -72,16 +72,16 @@ atexit.register(record_checksums)
 
 
 def environment() -> dict[str, str]:
-    """Give the environment of a process that keeps compiled kernels where this one does."""
+    """Give the environment of a process that uses the same folder of compiled kernels."""
     return os.environ | ({"NUMBA_CACHE_DIR": config.CACHE_DIR} if TEMPORARY else {})
 
 
 def kernel(
     *, fastmath: bool | Set[str] = False, forceinline: bool = False, _nrt: bool = True
 ) -> Callable[[Callable[..., Any]], Any]:
-    """Compile a function by Numba when it is first called, and keep what was compiled.
+    """Compile a function with Numba at its first call, and store the compiled code.
 
-    It runs without the interpreter's lock, and divides by zero as NumPy does.
+    The function runs without the interpreter's lock, and divides by zero like NumPy.
     """
     decorator: Callable[[Callable[..., Any]], Any] = njit(
         cache=not NO_ROOM, nogil=True, error_model="numpy",

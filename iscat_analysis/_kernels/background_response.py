@@ -1,8 +1,9 @@
-"""How the rows of `iscat_analysis._kernels.moving` follow a change of their background.
+"""Response of the rows of `iscat_analysis._kernels.moving` to a change of their background.
 
-Where the logarithm of the background changes by δ, the estimates of rows change by -F⁻¹ G δ.  F is
-the information on all rows of a *cluster* together, those of a frame whose middles lie in one
-another's squares: each of two takes up a part of what both see, and alone would take up all of it.
+If the logarithm of the background changes by δ, the estimates of rows change by -F⁻¹ G δ.  F is the
+information on all rows of a *cluster*: rows of a frame whose centres lie in one another's squares.
+They must be taken together, because two overlapping rows share the response, and each alone would
+respond to the whole change.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
 _LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1.0
-"""What is added to F, relative to its diagonal, for rows that cannot be told from each other: the
-least, and the most where rounding makes of F what no information is."""
+"""Damping added to F, relative to its diagonal, for rows that cannot be told apart: the least, and
+the largest, which is used if rounding makes F not positive."""
 
 _LEAST_DAMPING_LINKED = 0.1
-"""The same, where rows follow one another: what two of them hardly tell apart stays as it is."""
+"""The same if rows respond to each other: combinations that are hardly determined do not change."""
 
 
 _LARGEST = 32767.0
-"""Of the numbers in which slopes are kept, for the root of the sum of all squares of a slope."""
+"""Largest number in which slopes are stored; the norm of a slope is scaled to it."""
 
 
 class Slopes(NamedTuple):
-    """What rows change of the light in their squares; without room, left alone."""
+    """Derivatives of the light in the squares of rows; not filled if the arrays are empty."""
 
     squares: IntArray
     values: NDArray[np.int16]
@@ -60,12 +61,12 @@ def keep_slopes(
     level: FloatArray, gradient: AnyFloatArray, index: IntArray, slopes: Slopes, row: int,
     square: tuple[int, int, int, int], room: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Keep level × gradient of the free parameters of a row in its square; `room` is for one."""
+    """Store level × gradient of the free parameters of a row; `room` is work space for one."""
     for i in range(4):
         slopes.squares[row, i] = square[i]
     ny, nx = level.shape
     for k in range(index.size):
-        for i in range(ny):  # lines by themselves are what the compiler makes vectors of
+        for i in range(ny):  # line by line, so that the compiler uses vector registers
             line, light = room[i * nx : (i + 1) * nx], level[i]
             slope = gradient[i, 1 + index[k]]
             for j in range(nx):
@@ -126,7 +127,7 @@ def mix(
 
 @kernel(_nrt=False)
 def find_clusters(squares: IntArray, starts: IntArray, owner: IntArray) -> None:
-    """Say which rows overlap by half their squares, directly or through others.
+    """Find the rows that overlap by half their squares, directly or through others.
 
     Shapes: `squares` (rows, 4), `starts` (t + 1,), `owner` (rows,).
     """
@@ -152,10 +153,10 @@ def join_rows(
     information: FloatArray, first: int, last: int, numbers: FloatArray, order: IntArray,
     work: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Factorise the information on the rows of some clusters, and let these follow one another.
+    """Factorise the information on the rows of some clusters, and let them respond to each other.
 
-    Each row was fitted with the others as they were then.  Those that came after it have moved
-    since, and left it a score of -Σ F Δ, which all rows of the cluster take up together.
+    Each row was fitted with the others at their positions then.  Rows that were fitted after it
+    have changed by Δ since, so that its score is now -Σ F Δ; all rows of the cluster respond to it.
 
     Shapes: `totals` (t, y, x), `information` (rows, k, k), `numbers` (2 n² + 2 n + k²,), `order`
     (n,), `work` (1 + 2 k, side²).
@@ -183,7 +184,7 @@ def join_rows(
                             joint[k * a + i, k * b + j] = block[i, j]
                             step[k * b + j] -= block[i, j] * slopes.moves[rows[a], i]
         for i in range(n):
-            if not joint[i, i] > 0.0:  # what it changes is not seen
+            if not joint[i, i] > 0.0:  # the pixels do not depend on this parameter
                 joint[i, i] = 1.0
             scale[i] = 1.0 / np.sqrt(joint[i, i])
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
@@ -231,8 +232,8 @@ def _overlap(
             variance = power * background[j] * (1.0 + others[j]) + read[j]
             weight[j] = 1.0 / variance if variance > 0.0 else 0.0
     for a in range(k):
-        _look_at_part(slopes, r, a, c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
-        _look_at_part(slopes, s, a, d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
+        _copy_part(slopes, r, a, c1 - c0, top - r0, left - c0, nx, size, work[1 + a])
+        _copy_part(slopes, s, a, d1 - d0, top - s0, left - d0, nx, size, work[1 + k + a])
         mine = work[1 + a]
         for j in range(size):
             mine[j] *= work[0, j]
@@ -243,11 +244,11 @@ def _overlap(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _look_at_part(
+def _copy_part(
     slopes: Slopes, row: int, k: int, width: int, top: int, left: int, nx: int, size: int,
     out: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Fill `out` with lines of nx pixels of a slope whose square is so wide."""
+    """Fill `out` with a part of a slope: lines of nx pixels from a square of some width."""
     slope, unit = slopes.values[row, k], np.float32(slopes.units[row, k])
     for i in range(size // nx):
         line, there = out[i * nx : (i + 1) * nx], slope[(top + i) * width + left :]
@@ -260,7 +261,7 @@ def follow_rows(
     slopes: Slopes, clusters: Clusters, first: int, last: int, move: FloatArray,
     steps: FloatArray, out: FloatArray, seen: NDArray[np.float32], step: FloatArray,
 ) -> None:  # fmt: skip
-    """Tell by what the rows of some clusters follow a change of the logarithm of the background.
+    """Give the response of the rows of some clusters to a change of ln(background).
 
     Shapes: `move` (y, x), `steps` (rows, k), `out` (y, x), `seen` (side²,).
     """

@@ -1,9 +1,9 @@
-"""What the particles of a frame add up to, drawn row by row; see `moving`.
+"""The sum of the signals of all particles of a frame, drawn row by row; see `moving`.
 
-The picture of a row is one of several, sharp or blurred, by its number in `group`: a table for the
-fit, which reaches over the fitted square, and one for drawing, which reaches farther.  What all
-rows of a frame add up to stays on a `Canvas` from one fit to the next: where a row moves by less
-than `Field.slack` only its fitted square is drawn anew, and its rings stay where they were.
+The number of a row in `group` chooses one of several images, sharp or blurred.  Each has a table
+for the fit, which covers the fitted square, and one for drawing, which reaches farther.  A `Canvas`
+keeps the sum of all rows of a frame from one fit to the next: if a row moves by less than
+`Field.slack`, only its fitted square is drawn again, and its rings stay where they were.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 Counts = NDArray[np.uint16] | NDArray[np.float32]
-"""Of which the one at hand is compiled for."""
+"""Types of counts; kernels are compiled for the type of the movie."""
 
 
 class Pictures(NamedTuple):
-    """Pictures of one microscope, one for each blur."""
+    """Images of one microscope, one for each blur."""
 
     heights: FloatArray
     first_nm: float
@@ -45,7 +45,7 @@ class Pictures(NamedTuple):
 
 
 class Light(NamedTuple):
-    """A movie and what is known of its light."""
+    """A movie, its camera and its background."""
 
     counts: Counts
     gain: float
@@ -67,7 +67,7 @@ class Field(NamedTuple):
 
 
 class Canvas(NamedTuple):
-    """What the rows add up to in every frame."""
+    """The sum of the signals of all rows in every frame."""
 
     total: NDArray[np.float32]
     rings: FloatArray
@@ -145,7 +145,7 @@ def _add_row(
     table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, sign: float,
     pixels: Pixels, profile: FloatArray, image: FloatArray, there: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Do the same as `add_row`; what a lens leaves out depends on an argument's type."""
+    """Do the same as `add_row`; the type of the lens chooses the compiled branches."""
     if len(lens) == STAMP:
         add_stamp(nodes, lens, pixels, theta[0], theta[1], theta[3], sign, there)
         return
@@ -171,7 +171,7 @@ def _draw_gradient(
     table: AxialTable, lens: Lens, nodes: AnyFloatArray, theta: FloatArray, pixels: Pixels,
     profile: FloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Do the same as `draw_gradient`; what a lens leaves out depends on an argument's type."""
+    """Do the same as `draw_gradient`; the type of the lens chooses the compiled branches."""
     if len(lens) == STAMP:
         stamp_gradient(nodes, lens, pixels, theta[0], theta[1], theta[3], out)
         return
@@ -204,7 +204,7 @@ def stage(
     `own` (ny, 5, nx) begins with the particle's own signal.
     """
     w, last, one = light.power[t], c0 + data.shape[2], data.dtype.type(1.0)
-    for i in range(data.shape[1]):  # among more arrays at once the compiler gives up on vectors
+    for i in range(data.shape[1]):  # with more arrays at once the compiler uses no vectors
         r = r0 + i
         seen, base, level, noise = data[0, i], data[1, i], data[2, i], data[3, i]
         background, others, mine = light.background[r, c0:last], total[r, c0:last], own[i, 0]
@@ -225,7 +225,7 @@ def draw_frames(
     theta: FloatArray, group: IntArray, canvas: Canvas, near_profile: FloatArray,
     far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
-    """Bring frames first…last − 1 of the canvas to the rows as they are.
+    """Update frames first…last − 1 of the canvas to the current rows.
 
     Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `image` (side²,).
     """
@@ -241,10 +241,10 @@ def _ready_frame(
     group: IntArray, canvas: Canvas, near_profile: FloatArray,
     far_profile: FloatArray, image: FloatArray,
 ) -> None:  # fmt: skip
-    """Bring a frame of the canvas to the rows as they are.
+    """Update a frame of the canvas to the current rows.
 
-    Rings that would have to stay where their rows no longer are, are drawn anew: of these rows
-    alone, or of all rows where that takes less.
+    If rows have moved too far from their rings, these rings are drawn again: those of these rows
+    only, or those of all rows if this is faster.
     """
     total = canvas.total[t]
     rows, columns = total.shape
@@ -321,7 +321,7 @@ def _add_rings(
     inner: tuple[int, int, int, int], outer: tuple[int, int, int, int], profile: FloatArray,
     image: FloatArray, total: NDArray[np.float32],
 ) -> None:  # fmt: skip
-    """Add the signal of one row, times a sign, to what lies around its fitted square."""
+    """Add the signal of one row, times a sign, to the pixels around its fitted square."""
     top, bottom, left, right = inner
     r0, r1, c0, c1 = outer
     if bottom <= top:
@@ -334,10 +334,10 @@ def _add_rings(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def leave_over(
+def subtract_expected(
     light: Light, signal: NDArray[np.float32], first: int, out: NDArray[np.float32]
 ) -> None:
-    """Take off frames what is expected of them.
+    """Subtract the expected light from frames.
 
     Shapes: `signal` (n, y, x), `out` (n, y, x).
     """

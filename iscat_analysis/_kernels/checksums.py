@@ -1,8 +1,8 @@
 """Checksums of compiled kernels on disk: code that is damaged is removed and compiled again.
 
-Numba runs the machine code that it finds in its cache as it is, and a flipped bit there ends the
-process.  A list of SHA-256 stands beside the files.  What is not in the list is not trusted, and a
-process adds only what it compiled itself.
+Numba runs the machine code in its cache without a check, and a flipped bit there crashes the
+process.  A list of SHA-256 checksums is therefore stored beside the files.  Files that are not in
+the list are not used, and a process adds only files that it compiled itself.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ from numba.core import event
 
 _LIST = "checksums.json"
 _LOCK = "checksums.lock"
-_PATIENCE_S = 5.0  # with others that write the list; an entry that is lost costs a compilation
+_LOCK_TIMEOUT_S = 5.0  # to wait for others that write the list; a lost entry costs a compilation
 _ROOM_BYTES = 2**25  # all kernels of one analysis
 _KINDS = (".nbi", ".nbc")  # Numba's indices and its compiled code
 
 
 class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
-    """Notes how the files of the functions begin that this process compiles, and lists them.
+    """List the files of the functions that this process compiles, by the beginning of their names.
 
     Numba writes a function's files right after it has compiled it.  They are listed when the next
-    one is compiled, so that a process that lives for hours has little that others do not trust.
+    function is compiled, so that other processes can use them while this one runs for hours.
     """
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
         self._begin: set[str] = set()
-        self._running: list[object] = []  # a function that others call is compiled within them
+        self._running: list[object] = []  # a called function is compiled while its caller is
 
     def on_start(self, event: event.Event) -> None:
-        """Note a function, by what Numba names its files after."""
+        """Note a function, by the beginning of its file names."""
         if not self._running:
             self.record()
         dispatcher = event.data["dispatcher"]
         self._running.append(dispatcher)
         function = dispatcher.py_func
         code = getattr(function, "__code__", None)
-        if code is None:  # nothing that has a file
+        if code is None:  # it has no file
             return
         name = f"{inspect.getmodulename(code.co_filename)}.{function.__qualname__}"
         name = name.replace("<", "").replace(">", "")
@@ -55,13 +55,13 @@ class Compiled(event.Listener):  # type: ignore[misc]  # Numba is not typed
         self._running.remove(event.data["dispatcher"])
 
     def record(self) -> None:
-        """List what this process compiled since it last did."""
+        """List the files that this process compiled since the last call."""
         compiled, self._begin = tuple(self._begin), set()
         record(self._folder, compiled)
 
 
 def refusal(folder: str) -> str:
-    """Tell why the system gives no room for compiled files; nothing where it does."""
+    """Say why compiled files cannot be stored; empty if they can."""
     try:
         with tempfile.TemporaryFile(dir=folder) as file:
             if folder and hasattr(os, "posix_fallocate"):
@@ -72,7 +72,7 @@ def refusal(folder: str) -> str:
 
 
 def remove_damaged(folder: str) -> None:
-    """Remove the compiled files of a folder that are not as they were written."""
+    """Remove the compiled files of a folder that have changed since they were written."""
     known = _listed(folder)
     for name, digest in _digests(folder).items():
         if known.get(name) != digest:
@@ -81,13 +81,13 @@ def remove_damaged(folder: str) -> None:
 
 
 def record(folder: str, compiled: tuple[str, ...]) -> None:
-    """Add the files that begin so to the list; a full disk costs the next run time."""
+    """Add the files with these beginnings to the list; if the disk is full, nothing is listed."""
     found = _digests(folder, compiled) if compiled else {}
     if not found:
         return
     lock = FileLock(f"{folder}/{_LOCK}", fallback_to_soft=False)
-    with suppress(OSError):  # without, the later of two processes wins
-        lock.acquire(timeout=_PATIENCE_S)
+    with suppress(OSError):  # without the lock, the later of two processes wins
+        lock.acquire(timeout=_LOCK_TIMEOUT_S)
     try:
         _replace(folder, _listed(folder) | found)
     finally:
@@ -95,7 +95,7 @@ def record(folder: str, compiled: tuple[str, ...]) -> None:
 
 
 def _replace(folder: str, digests: dict[str, str]) -> None:
-    """Write the list whole, or leave it as it is."""
+    """Write the whole list, or leave it as it is."""
     with suppress(OSError):
         handle, made = tempfile.mkstemp(dir=folder)
         try:
@@ -116,7 +116,7 @@ def _listed(folder: str) -> dict[str, str]:
 
 
 def _digests(folder: str, begin: tuple[str, ...] = ("",)) -> dict[str, str]:
-    """Hash the compiled files of a folder whose names begin so."""
+    """Hash the compiled files of a folder with these beginnings of names."""
     found: dict[str, str] = {}
     with suppress(OSError):
         for name in sorted(os.listdir(folder)):  # noqa: PTH208

@@ -215,7 +215,7 @@ def errors_and_bias(
     covariance: FloatArray,
     bias: FloatArray,
 ) -> bool:
-    """Fill what the likelihood says of the errors of a fit, with what a prior knows of z.
+    """Fill errors, covariance and bias of a fit, from the likelihood and a prior of z.
 
     Shapes: `like` (5, 5), `free, moving` (5,), `sigma` (4,), `covariance` (n, n), `bias` (5,).
     """

@@ -1,4 +1,4 @@
-"""Small dense systems: some of the parameters of a symmetric positive matrix."""
+"""Small dense linear systems with a symmetric positive matrix, for some of its parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LEAST = 1e-13
-"""Pivot of a matrix with ones on its diagonal below which it is no information."""
+"""Smallest pivot of a matrix with ones on its diagonal that counts as information."""
 
 
 @kernel(forceinline=True, _nrt=False)

@@ -1,7 +1,7 @@
-"""The likelihood of a particle's track that diffuses freely, in time proportional to its length.
+"""The likelihood of the track of a freely diffusing particle, in time proportional to its length.
 
-Positions are averages over an exposure and have an error of their own each.  Their displacements
-then have a covariance with three bands, linear in the diffusion coefficient.
+Each position is an average over an exposure and has its own error.  The displacements therefore
+have a tridiagonal covariance, which is linear in the diffusion coefficient.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ FloatArray = NDArray[np.float64]
 LOG_2PI = math.log(2.0 * math.pi)
 
 TOGETHER = 8
-"""Variances whose product is far from overflow, of which one logarithm is taken."""
+"""Number of variances whose product cannot overflow, so that one logarithm is enough for them."""
 
-_SPAN = 1e-5  # the lowest of the first ladder's values of D over the highest
-_RUNGS = 25
-_LADDERS = 2  # between the neighbours of the highest rung of the one before
-_NEWTON, _FINE = 20, 1e-12  # steps at most; the last one's length over the scale of D
+_LOWEST_RATIO = 1e-5  # lowest value of D on the first grid over the highest
+_GRID_POINTS = 25
+_GRIDS = 2  # a second, finer one between the neighbours of the best point
+_NEWTON, _TOLERANCE = 20, 1e-12  # steps at most; the last one's length over the scale of D
 
 
 @kernel()
@@ -37,7 +37,7 @@ def displacement_likelihood(
     rate_next: FloatArray,
     diffusion: float,
 ) -> tuple[float, float, float, float, float, float]:
-    """Log-likelihood of displacements whose covariance is E + D·A, both with three bands.
+    """Log-likelihood of displacements whose covariance is E + D·A, both tridiagonal.
 
     The pivots p_k and residuals z_k of its factorisation are differentiated with respect to D as
     they are made.  Because the covariance is linear in D, the second derivative of its
@@ -88,10 +88,10 @@ def displacement_likelihoods(
     rate_next: FloatArray,
     diffusion: FloatArray,
 ) -> FloatArray:
-    """Log-likelihoods alone, of many D at once.
+    """Log-likelihoods of many D at once, without derivatives.
 
-    A pivot waits for the division by the one before it; those of several D need not wait for each
-    other, so that ten cost twice as much as one.
+    Each pivot needs the division by the one before it.  The pivots of several D are independent, so
+    that ten D take only twice as long as one.
 
     Shapes: `diffusion` (m,), result (m,).
     """
@@ -138,15 +138,15 @@ def most_likely_diffusion(
     top = 2.0 * scale
     while displacement_likelihood(steps, error, error_next, rate, rate_next, top)[1] > 0.0:
         top *= 2.0
-    ladder = np.empty(_RUNGS + 1)
-    ladder[0] = 0.0
-    for k in range(_RUNGS):
-        ladder[k + 1] = top * _SPAN ** (1.0 - k / (_RUNGS - 1.0))
-    for _ in range(_LADDERS):
-        values = displacement_likelihoods(steps, error, error_next, rate, rate_next, ladder)
+    grid = np.empty(_GRID_POINTS + 1)
+    grid[0] = 0.0
+    for k in range(_GRID_POINTS):
+        grid[k + 1] = top * _LOWEST_RATIO ** (1.0 - k / (_GRID_POINTS - 1.0))
+    for _ in range(_GRIDS):
+        values = displacement_likelihoods(steps, error, error_next, rate, rate_next, grid)
         highest = largest(values)
-        best = ladder[highest]
-        low, high = ladder[max(highest - 1, 0)], ladder[min(highest + 1, ladder.size - 1)]
+        best = grid[highest]
+        low, high = grid[max(highest - 1, 0)], grid[min(highest + 1, grid.size - 1)]
         for _ in range(_NEWTON):
             there = displacement_likelihood(steps, error, error_next, rate, rate_next, best)
             if not there[2] < 0.0:
@@ -155,10 +155,10 @@ def most_likely_diffusion(
             if not low <= best + step <= high:
                 break
             best += step
-            if abs(step) < _FINE * scale:
+            if abs(step) < _TOLERANCE * scale:
                 return float(best)
-        ladder = np.empty(_RUNGS)
-        for k in range(_RUNGS):
-            ladder[k] = low + (high - low) / (_RUNGS - 1) * k
-        ladder[_RUNGS - 1] = high
+        grid = np.empty(_GRID_POINTS)
+        for k in range(_GRID_POINTS):
+            grid[k] = low + (high - low) / (_GRID_POINTS - 1) * k
+        grid[_GRID_POINTS - 1] = high
     return float(best)

@@ -1,4 +1,4 @@
-"""All that the tests of a fit ask of its pixels, in one call."""
+"""All numbers that the tests of a fit need from its pixels, in one call."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def count_and_test(
     rate: FloatArray,
     tails: FloatArray,
 ) -> tuple[float, int, float, float, float, int, float, float, int]:
-    """Look at the residuals of one fit; all arguments are those of the three kernels it calls."""
+    """Test the residuals of one fit; the arguments are those of the three kernels it calls."""
     residual, terms = np.empty(rate.shape), np.empty((rate.shape[0], 4, rate.shape[1]))
     chi2, pixels, excess, largest, least = residuals(kind, data, level, rows, rate, residual, terms)
     mode_chi2, freedom, mode_excess = mode_statistic(

@@ -1,6 +1,6 @@
-"""The likelihood of a particle's track in a harmonic well: a filter with one number as its state.
+"""The likelihood of a particle's track in a harmonic well, by a Kalman filter with a scalar state.
 
-Positions are averages over an exposure and have an error of their own each.
+Each position is an average over an exposure and has its own error.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from iscat_analysis._kernels.lines import copy_line, largest
 
 FloatArray = NDArray[np.float64]
 
-_SHORT = 1e-2  # below, a well hardly acts during one exposure and the moments are a series
-_RUNGS = 10  # of the stiffnesses among which the search begins
-_FIRST, _FINER = 0.3, 0.3  # distance of the points that are compared, and what is left of it
-_WIDEST = 10.0  # logarithm of D over that of free diffusion
-_SETTLED = 1e-4  # of a log-likelihood, in the search for its maximum
-_MOST = 100  # rounds of the search
+_SHORT = 1e-2  # stiffness times exposure below which the moments are computed from a series
+_STIFFNESSES = 10  # number of stiffnesses among which the search begins
+_FIRST, _FINER = 0.3, 0.3  # first distance of the compared points, and the factor of each step
+_LARGEST_LOG_RATIO = 10.0  # largest logarithm of D over that of free diffusion
+_TOLERANCE = 1e-4  # tolerance of the log-likelihood at its maximum
+_MOST_ROUNDS = 100  # largest number of rounds of the search
 
 
 @kernel(fastmath=FAST)
@@ -36,8 +36,9 @@ def harmonic_likelihoods(
 ) -> FloatArray:
     """Log-likelihoods of the displacements of a particle in harmonic wells of unknown centre.
 
-    The state is the place at the start of an exposure, dx = −κ x dt + √(2D) dW, in equilibrium at
-    first.  A flat prior of the centre is integrated out, which leaves the density of displacements.
+    The state is the position at the start of an exposure, dx = −κ x dt + √(2D) dW, which begins in
+    equilibrium.  The centre has a flat prior and is integrated out, which gives the density of
+    displacements.
 
     Shapes: `positions` (c, n), `variance` (c, n), `gaps` (n − 1,), `diffusion, stiffness` (m,),
     result (m,).
@@ -112,20 +113,26 @@ def most_likely_well(
 ) -> tuple[float, float, float]:
     """Maximise the likelihood of a harmonic well over D and stiffness.
 
-    Of a square of nine points in their logarithms the highest becomes the middle of the next; where
-    it is the middle already, the square shrinks around the vertex of a parabola.
+    The search compares a square of nine points in the logarithms.  The highest point becomes the
+    centre of the next square; if it is the centre, the square shrinks around the vertex of a
+    parabola.
     """
     low, high, best = np.empty(2), np.empty(2), np.empty(2)
-    low[0], low[1], high[0], high[1] = -_WIDEST, math.log(softest), _WIDEST, math.log(stiffest)
-    points, square, vertex = np.empty((2 * _RUNGS, 2)), np.empty((9, 2)), np.empty((1, 2))
-    for k in range(2 * _RUNGS):
+    low[0], low[1], high[0], high[1] = (
+        -_LARGEST_LOG_RATIO,
+        math.log(softest),
+        _LARGEST_LOG_RATIO,
+        math.log(stiffest),
+    )
+    points, square, vertex = np.empty((2 * _STIFFNESSES, 2)), np.empty((9, 2)), np.empty((1, 2))
+    for k in range(2 * _STIFFNESSES):
         points[k, 0] = 0.5 * (k % 2)
-        points[k, 1] = low[1] + (high[1] - low[1]) * (k // 2) / (_RUNGS - 1.0)
+        points[k, 1] = low[1] + (high[1] - low[1]) * (k // 2) / (_STIFFNESSES - 1.0)
     values = _logarithmic(positions, variance, gaps, exposure, scale, points)
     at = largest(values)
     copy_line(points[at], best)
     value, apart = values[at], _FIRST
-    for _ in range(_MOST):
+    for _ in range(_MOST_ROUNDS):
         for k in range(9):
             square[k, 0], square[k, 1] = best[0] + (k // 3 - 1) * apart, best[1]
             square[k, 1] += (k % 3 - 1) * apart
@@ -143,11 +150,11 @@ def most_likely_well(
         det = h0 * h1 - h01 * h01
         apart *= _FINER
         if not (h0 < 0.0 and det > 0.0):
-            if apart < _SETTLED:
+            if apart < _TOLERANCE:
                 break
             continue
         step0, step1 = (h01 * g1 - h1 * g0) / det, (h01 * g0 - h0 * g1) / det
-        if 0.5 * (g0 * step0 + g1 * step1) < _SETTLED:
+        if 0.5 * (g0 * step0 + g1 * step1) < _TOLERANCE:
             break
         for a in range(2):
             move = (step0 if a == 0 else step1) * apart / _FINER

@@ -29,16 +29,16 @@ from iscat_analysis._kernels.quintics import (
 FloatArray = NDArray[np.float64]
 
 ROWS = 15
-"""Rows that a row of pixels fills: s, its derivatives in (x, y, z, a), and the second ones."""
+"""Numbers for each pixel: s, its derivatives in (x, y, z, a), and its second derivatives."""
 
 PAIRS = ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3))
-"""Which of (x, y, z, a) the second derivatives from row 5 on are in."""
+"""Indices into (x, y, z, a) of the second derivatives, from row 5 on."""
 
 _CHANNELS = 4  # of the first order of a radial profile
 _FIELDS = 12  # rows of scratch: four channels, their slopes and second derivatives
 _DISTANCE = _FIELDS + DISTANCE  # after as many of ∂z, ∂zz and slopes of ∂z
 _DX, _DY, _SUMS = _DISTANCE + 1, _DISTANCE + 2, _DISTANCE + 3
-_STRIP = 64  # pixels: a fixed number, so that lines of scratch are known not to overlap
+_STRIP = 64  # pixels; with a fixed number the compiler knows that lines of scratch do not overlap
 _NEAR = 1e-6  # of a step: here DF is F″
 
 
@@ -81,7 +81,7 @@ def signal_hessian(
 def _place(
     inv_step: float, pixels: Pixels, first: int, x_p: float, y_p: float, f: FloatArray
 ) -> None:
-    """Fill distances and places of a strip that begins at pixel `first`; beyond the last with 0."""
+    """Fill distances and positions of a strip from pixel `first` on; beyond the last with 0."""
     dx, dy, nx = f[_DX], f[_DY], pixels.x.size
     row, column = first // nx, first % nx
     for j in range(_STRIP):
@@ -132,7 +132,7 @@ def _lattice_hessian(
 
 @kernel(fastmath=FAST)
 def _bend(lens: RoundLens, amplitude: float, weight: float, f: FloatArray) -> None:
-    """Add weight × all that needs no derivative in z; leave DF (4 to 7 in f) and (F″ − DF)/r²."""
+    """Add weight × all terms without a derivative in z; keep DF (4 to 7 in f) and (F″ − DF)/r²."""
     inv_step, rho, cos, sin = lens.inv_step, lens.rho, lens.cos_psi, lens.sin_psi
     co, cross, ring, a = lens.co, lens.cross, lens.ring, amplitude
     square = inv_step * inv_step

@@ -9,7 +9,7 @@ with a the amplitude and e the field per unit amplitude.  Positions are nm; (x, 
 (u, v) the frame of the polarisation, rotated by ψ.  Derivatives are with respect to the particle's
 (x, y, z, a).
 
-How a profile becomes a picture is the matter of `radial_rows`, `lattice_rows` and `stamp`.
+`radial_rows`, `lattice_rows` and `stamp` compute an image from a profile.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def signal_parts(
 ) -> None:
     """Fill `out` (2, ny·nx) with P and Q of the signal a P + a² Q.
 
-    `unit` is an amplitude at which neither drowns in the other.  Not for samples at one height,
-    which are P and Q themselves.
+    At the amplitude `unit` neither is lost in the rounding of the other.  Not for samples at one
+    height, which are P and Q themselves.
     """
     if len(lens) == ROUND:
         radial_parts(profile, lens, pixels, x_p, y_p, out)

@@ -38,15 +38,15 @@ LATTICE_STEP = 1.2
 """Step of the lattice times bandwidth: 4e-8 of the peak in the field, 1e-6 in its gradient."""
 
 TAPS = 8
-"""Nodes that take part in a value, along each axis."""
+"""Number of nodes that contribute to a value, along each axis."""
 
 DEGREE = 10
-"""Degree of the polynomials that stand for the window between two nodes."""
+"""Degree of the polynomials that approximate the window between two nodes."""
 
 _SHARPNESS = 20.0  # of the window, best for TAPS and LATTICE_STEP
 FILTER = 10
 """Half length of the filter that undoes the window."""
-_BLOCK = 128  # radial nodes whose Bessel functions are held at once
+_BLOCK = 128  # radial nodes whose Bessel functions are in memory at once
 
 
 @cache
@@ -138,7 +138,7 @@ def bessel_ladder(x: FloatArray, out: FloatArray) -> None:
 
 @kernel()
 def _climb(x: FloatArray, out: FloatArray) -> None:
-    """Fill rows 2, 3, … of `out` from rows 0 and 1; where that is unstable, all by `_descend`."""
+    """Fill rows 2, 3, … of `out` from rows 0 and 1; if that is unstable, all by `_descend`."""
     orders = out.shape[0]
     for k in range(x.size):
         if x[k] < orders:
@@ -184,7 +184,7 @@ def _descend(x: float, out: FloatArray) -> None:
 def _quintic(powers: FloatArray, t: float, out: FloatArray) -> None:
     """Fill `out` (n) with the polynomials of `powers` (6, n) at t.
 
-    Three rows at a time: against more that might overlap, the compiler gives up on vectors.
+    Three rows at a time: with more arrays that might overlap, the compiler uses no vectors.
     """
     a, b, c = powers[3], powers[4], powers[5]
     for j in range(out.size):
@@ -292,7 +292,7 @@ def undo_window(samples: FloatArray) -> FloatArray:
 
 @kernel(fastmath=FAST)
 def _filter(samples: FloatArray, undo: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with `samples`, filtered along both axes by a middle and one half of a filter."""
+    """Fill `out` with `samples`, filtered along both axes by a symmetric filter."""
     half, side = undo.size - 1, out.shape[1]
     line = np.empty(side + 2 * half)
     for k in range(len(out)):
@@ -314,5 +314,5 @@ def _filter(samples: FloatArray, undo: FloatArray, out: FloatArray) -> None:
 
 
 def reach_of_samples(reach_nm: float, step_nm: float) -> float:
-    """Distance of the farthest sample that matters to an image out to a distance [nm]."""
+    """Distance of the farthest sample that an image out to a distance needs [nm]."""
     return reach_nm + math.sqrt(2) * (TAPS / 2 + 1 + FILTER) * step_nm

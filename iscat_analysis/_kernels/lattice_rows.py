@@ -1,8 +1,8 @@
 """Rows of pixels of a particle whose field is tabulated on a lattice; see `lattice`.
 
-The work space of a row is an array (rows, nx): `FIELDS` rows hold the fields of the row at hand and
-their slopes, the rest the fields at the columns of pixels and the rows of nodes, made once for each
-image by `interpolate_columns`.
+The work space of a row is an array (rows, nx): `FIELDS` rows hold the fields of the current row and
+their slopes, the others the fields at the columns of pixels and the rows of nodes, which
+`interpolate_columns` computes once for each image.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ FIELDS = 16
 """Rows for a row of pixels: the fields (4), their ∂/∂z, slopes along x and slopes along y."""
 
 STRIP = 8
-"""Columns of pixels that are interpolated together: a line of the cache."""
+"""Columns of pixels that are interpolated together: one cache line."""
 
 BEFORE = TAPS // 2 - 1
-"""Nodes before the one at the floor of a position."""
+"""Number of nodes before the one at the floor of a position."""
 
 
 @kernel(fastmath=FAST)
@@ -47,7 +47,7 @@ def taps(weights: FloatArray, t: float, value: FloatArray, slope: FloatArray) ->
 
 @kernel()
 def _ends(values: FloatArray) -> tuple[float, float]:
-    """Smallest and largest value; those of arrays take Numba 30 ms to load."""
+    """Smallest and largest value; the methods of arrays take Numba 30 ms to load."""
     low = high = values[0]
     for value in values:
         low, high = min(low, value), max(high, value)
@@ -56,7 +56,7 @@ def _ends(values: FloatArray) -> tuple[float, float]:
 
 @kernel(_nrt=False)
 def _node(lens: LatticeLens, away: float) -> float:
-    """Place on the lattice at a distance from the particle, in nodes; all of its taps are there."""
+    """Position on the lattice at a distance from the particle [nodes], inside by all its taps."""
     last = 2 * lens.half + 1 - TAPS + BEFORE
     place: float = within(away * lens.inv_step + lens.half, float(BEFORE), float(last))
     return place
@@ -120,7 +120,7 @@ def _columns(
 ) -> None:
     """Interpolate one channel along x, `STRIP` columns of pixels at a time.
 
-    The strip is turned into rows of `out` (rows, nx) at once, so that each line of memory is
+    The strip is transposed into rows of `out` (rows, nx) at once, so that each cache line is
     written once.
     """
     rows, columns = out.shape

@@ -1,7 +1,7 @@
-"""What turns the profile of a particle into its signal: three kinds, each a type of its own.
+"""Constants that turn the profile of a particle into its signal: three kinds, each with its type.
 
-A kernel that takes a lens asks for its length.  Numba knows it from the type and leaves out, before
-it looks at them, the branches of other kinds: a movie has one kind of picture, and the others would
+A kernel tests the length of its lens.  Numba knows this length from the type and does not compile
+the branches of other kinds.  A movie has one kind of image, and the branches of the others would
 take half of the time of a first run.
 """
 
@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 
 
 class RoundLens(NamedTuple):
-    """Of a round pupil, whose fields are radial profiles."""
+    """Lens of a round pupil, whose fields are radial profiles."""
 
     inv_step: float
     rho: float
@@ -30,7 +30,7 @@ class RoundLens(NamedTuple):
 
 
 class LatticeLens(NamedTuple):
-    """Of any pupil, whose fields are on a lattice."""
+    """Lens of any pupil, whose fields are on a lattice."""
 
     inv_step: float
     rho: float
@@ -40,7 +40,7 @@ class LatticeLens(NamedTuple):
 
 
 class StampLens(NamedTuple):
-    """Of any pupil at one height, whose picture was sampled."""
+    """Lens of any pupil at one height, whose image was sampled."""
 
     inv_step: float
     half: int
@@ -51,20 +51,20 @@ class StampLens(NamedTuple):
 Lens: TypeAlias = RoundLens | LatticeLens | StampLens
 
 ROUND: Final = 7
-"""Fields of a round lens."""
+"""Number of fields of a round lens."""
 
 LATTICE: Final = 5
-"""Fields of the lens of a lattice."""
+"""Number of fields of the lens of a lattice."""
 
 STAMP: Final = 4
-"""Fields of the lens of a sampled picture."""
+"""Number of fields of the lens of a sampled image."""
 
 
 @kernel()
 def named_lens(fields: tuple[Any, ...]) -> Lens:
-    """Make a lens of its fields.
+    """Make a lens from its fields.
 
-    A plain tuple reaches a kernel in half of the time that one with names takes.
+    Python passes a plain tuple to a kernel in half of the time of a named tuple.
     """
     if len(fields) == ROUND:
         return RoundLens(*fields)

@@ -1,7 +1,7 @@
-"""What NumPy does with a line of numbers, written out.
+"""Simple NumPy operations on a line of numbers, written as loops.
 
-Each process would compile NumPy's again, and with an assignment of an array to a part of another
-the text of its error: a second or more.
+Each process would compile NumPy's versions again, and for the assignment of slices also the text of
+its error message: this takes a second or more.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def copy_line(values: FloatArray, out: FloatArray) -> None:
 
 @kernel(_nrt=False)
 def largest(values: FloatArray) -> int:
-    """Give the place of the largest of some numbers (n), the first of those that are equal."""
+    """Give the index of the largest of some numbers (n), the first if several are equal."""
     at = 0
     for i in range(1, values.size):
         if values[i] > values[at]:
@@ -33,7 +33,7 @@ def largest(values: FloatArray) -> int:
 
 @kernel()
 def marked(flags: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Give the places of the true ones among flags (n)."""
+    """Give the indices of the true flags (n)."""
     out, count = np.empty(flags.size, dtype=np.int64), 0
     for i in range(flags.size):
         if flags[i]:

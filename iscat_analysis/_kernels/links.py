@@ -1,4 +1,4 @@
-"""Positions in successive frames that are one particle because nothing else is in reach."""
+"""Link positions in successive frames if no other particle is within reach."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-_ROUNDING = 1e-9  # of the reach, within which another sum may find a distance on its other side
+_ROUNDING = 1e-9  # share of the reach by which rounding may change a distance
 
 
 @kernel()
@@ -21,9 +21,9 @@ def link_surely(
 ) -> int:  # fmt: skip
     """Link positions from frame to frame until there is a choice.
 
-    A particle waits at its last position until it is linked, at most `memory` frames longer than
-    one.  Where it has one new position in reach, and this has no other particle, they are linked; a
-    position without any begins a track.
+    A particle waits at its last position until it is linked, at most `memory` frames beyond the
+    next one.  If it has one new position within reach, and this position no other particle, the two
+    are linked.  A position without a particle within reach begins a track.
 
     Shapes: `places` (n, axes), `starts` (t + 1,), `track` (n,), `taken` (n,), `waiting` (n,),
     `state` (4,), `doubtful` (n,).

@@ -1,6 +1,6 @@
-"""Combinations of four arrays, in which interpolation spends its time.
+"""Linear combinations of four arrays, the innermost loop of interpolation.
 
-Against more arrays that might overlap, the compiler gives up on vectors.
+With more arrays that might overlap, the compiler uses no vector registers.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Mixture of normal distributions with an error of its own for each event: EM and likelihood.
+"""Mixture of normal distributions, in which each event has its own error: EM and likelihood.
 
-x_i ~ Σ_k w_k N(μ_k, τ_k² + σ_i²), seen where an estimate of it exceeds a threshold.
+x_i ~ Σ_k w_k N(μ_k, τ_k² + σ_i²); an event is detected if an estimate of it exceeds a threshold.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from iscat_analysis._kernels.lattice import FAST
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
-_CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
-_TINY = 1e-250  # a density below it is added up by logarithms
-_BLOCK = 128  # events whose numbers stay in the cache
+_CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: the probability is 1
+_TINY = 1e-250  # smaller densities are added by their logarithms
+_BLOCK = 128  # events whose numbers fit into the cache
 # Ln 2; the first has few digits
 _LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.90821492927058770002e-10
-_HALVES = np.exp2(-np.arange(1024.0))
-_LAST_HALF = np.uint32(_HALVES.size - 1)
+_POWERS_OF_HALF = np.exp2(-np.arange(1024.0))
+_LAST_INDEX = np.uint32(_POWERS_OF_HALF.size - 1)
 
 
 @njit(inline="always")
 def _exp_falling(x: float) -> float:
-    """Give exp x for −700 ≤ x ≤ 0, in a form of which processors do several at a time; to 2e-16."""
+    """Give exp x for −700 ≤ x ≤ 0 to 2e-16, in a form for vector registers."""
     halvings = np.int32(0.5 - x / _LN2_HIGH)
     r = (x + halvings * _LN2_HIGH) + halvings * _LN2_LOW
     value: float = 1.0 / 6227020800.0
@@ -45,7 +45,7 @@ def _exp_falling(x: float) -> float:
     value = value * r + 0.5
     value = value * r + 1.0
     value = value * r + 1.0
-    value *= _HALVES[np.uint32(halvings) & _LAST_HALF]  # inside the table whatever x is
+    value *= _POWERS_OF_HALF[np.uint32(halvings) & _LAST_INDEX]  # inside the table whatever x is
     return value
 
 
@@ -77,7 +77,7 @@ def _densities(
 def _by_logarithms(
     weight: FloatArray, share: FloatArray, slope: FloatArray, inverse: FloatArray, norm: FloatArray
 ) -> float:
-    """Do events that are far from every species anew; by how much their logarithms are larger."""
+    """Compute events far from every species again; return the change of their logarithms."""
     added = 0.0
     for i in range(norm.size):
         if norm[i] > _TINY:
@@ -107,7 +107,7 @@ def _expect(
     inverse: FloatArray,
     norm: FloatArray,
 ) -> float:
-    """Fill what each event may be, the reciprocal of the norm too; Σ log of √(2π) the density."""
+    """Fill the shares of each event and the reciprocal norms; return Σ log(√(2π) density)."""
     norm[:] = 0.0
     for j in range(weight.size):
         _densities(x, noise, weight[j], mean[j], variance[j], share[j], slope[j], inverse[j], norm)
@@ -138,7 +138,7 @@ def _moments(
 def mixture_sums(
     x: FloatArray, noise: FloatArray, weight: FloatArray, mean: FloatArray, variance: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Sum over events what steps and slopes are made of.
+    """Sum over events the terms from which EM steps and slopes are computed.
 
     Shapes: `x, noise` (n,), `weight, mean, variance` (k,), `sums` (k, 5).
     """
@@ -177,7 +177,7 @@ def mixture_em(
         _, sums = mixture_sums(x, noise, weight, mean, variance)
         for j in range(weight.size):
             size = sums[j, 0] + 1e-12
-            shift = variance[j] * sums[j, 1] / size  # from the old mean, against cancellation
+            shift = variance[j] * sums[j, 1] / size  # from the old mean, to avoid cancellation
             second = variance[j] * (variance[j] * sums[j, 2] + sums[j, 4])
             mean[j] += shift
             variance[j] = max(second / size - shift * shift, 0.0)
@@ -203,7 +203,7 @@ def mixture_score(
 
 @kernel()
 def _log_normal_cdf(a: float) -> float:
-    """Logarithm of Φ(a); the asymptotic series where erfc would vanish."""
+    """Logarithm of Φ(a); the asymptotic series if erfc would vanish."""
     if a > -20.0:
         return math.log(0.5 * math.erfc(-a * math.sqrt(0.5)))
     b = 1.0 / (a * a)
@@ -220,7 +220,7 @@ def detection_score(
     mean: FloatArray,
     variance: FloatArray,
 ) -> tuple[float, FloatArray]:
-    """Logarithm of the chance to see the events, and its gradient.
+    """Logarithm of the probability to detect the events, and its gradient.
 
     Shapes: `noise` (n,), `weight, mean, variance` (k,), `gradient` (3, k).
     """
@@ -241,7 +241,7 @@ def detection_score(
             total += part[j]
         if total > _TINY:
             value += math.log(total)
-        else:  # hardly ever seen: by logarithms
+        else:  # hardly ever detected: by logarithms
             top = -1e300
             for j in range(k):
                 part[j] = math.log(weight[j] + 1e-300) + _log_normal_cdf(at[j])

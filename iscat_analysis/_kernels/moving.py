@@ -1,11 +1,11 @@
-"""Particles that move over an unknown, constant background: every particle in every frame.
+"""Fits of particles that move over an unknown, constant background: each particle in each frame.
 
 The counts of pixel p in frame t are Poisson with w_t B_p (1 + C_tp), C the sum of the particles'
 signals, and read noise as in `iscat_analysis._kernels.noise`, whose fit this is.  A *row* is one
 particle in one frame, θ = (x, y, z, a, 0); rows are in the order of their frames, and those of
-frame t are starts[t] to starts[t + 1].  Within a frame they are fitted in turn, each with the
-others in its background, so that the result does not depend on how frames are shared out among
-threads.
+frame t are starts[t] to starts[t + 1].  Within a frame they are fitted one after the other, each
+with the others in its background, so that the result does not depend on the distribution of frames
+over threads.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ BoolArray = NDArray[np.bool_]
 
 
 DIVERGED = 4
-"""How a fit ended, besides the ways of `scoring`: its plain steps lead nowhere."""
+"""How a fit ended, in addition to the outcomes in `scoring`: plain scoring steps failed."""
 
 
 class Search(NamedTuple):
-    """What is fitted, and how."""
+    """Free parameters and settings of the fits."""
 
     free: BoolArray
     reach: FloatArray
@@ -61,7 +61,7 @@ class Search(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Where the kernels of rows keep what they need for a moment; none of them asks for memory."""
+    """Work space of the kernels of rows, which allocate no memory."""
 
     pixels: AnyFloatArray
     line: NDArray[np.float32]
@@ -94,10 +94,10 @@ def fit_frames(
     place: IntArray,
     room: Room,
 ) -> bool:
-    """Fit the rows of frames up to last − 1, each `sweeps` times, as far as plain steps lead.
+    """Fit the rows of frames up to last − 1, each `sweeps` times, with plain scoring steps.
 
-    A row that needs more care is left to the caller, with its place, its constants and a start in
-    its box; with its maximum in `theta`, `outcome` and `gain` the next call goes on.
+    If plain steps fail for a row, the kernel returns its position, its constants and a start inside
+    its box.  The caller puts its maximum into `theta`, `outcome` and `gain`, and calls again.
 
     Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,), `outcome` (rows,), `information`
     (rows, 4, 4), `gain` (rows,), `expected` (t,), `background` (y, x), `sums` (y, x), `place`
@@ -111,7 +111,9 @@ def fit_frames(
         t = place[0]
         total = canvas.total[t]
         if sweeps and place[4] == 0:
-            expected[t] = _look_over(light.counts[t])  # kept for a moment, or nothing would be read
+            expected[t] = _read_ahead(
+                light.counts[t]
+            )  # stored, or the compiler would drop the loop
         while place[1] < sweeps:
             for r in range(place[2], starts[t + 1]):
                 p, helped = theta[r], place[4] > 0
@@ -163,8 +165,8 @@ def fit_frames(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def _look_over(frame: Counts) -> float:
-    """Read a frame in its order, which brings it into the cache; each square would wait for it."""
+def _read_ahead(frame: Counts) -> float:
+    """Read a whole frame in order, so that it is in the cache when its squares are fitted."""
     total = np.float32(0.0)
     for i in range(frame.shape[0]):
         for j in range(frame.shape[1]):
@@ -179,11 +181,11 @@ def _climb(
 ) -> tuple[int, int, float]:  # fmt: skip
     """Fit one row from p, at which both[0] is drawn and its value, score and information known.
 
-    As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
-    are: every picture is drawn once.  Where they do not, the fit is `DIVERGED`.
+    Full steps of Fisher scoring are taken as long as they stay inside the box and increase the
+    likelihood, so that every image is drawn once.  Otherwise the fit is `DIVERGED`.
 
-    Returns how the fit ended, which of `both` holds the picture at the estimate minus the step, so
-    small at last that the gradient tells the rest, and the log-likelihood over that without the
+    Returns how the fit ended, which of `both` holds the image before the last step (which is so
+    small that the gradient gives the image after it), and the log-likelihood over that without the
     particle.
     """
     fisher, step, score, trial = room.small[:5], room.small[5], room.small[6], room.small[7]
@@ -216,9 +218,9 @@ def _step(
     search: Search, p: FloatArray, lower: FloatArray, upper: FloatArray, score: FloatArray,
     fisher: FloatArray, step: FloatArray, trial: FloatArray,
 ) -> float:  # fmt: skip
-    """Fill the step of Fisher scoring and where it leads; return the gain that it promises.
+    """Fill the step of Fisher scoring and its end point; return the expected gain.
 
-    It is infinite where the step is no good as it is: too long, out of the box, or undetermined.
+    The gain is infinite if the step cannot be taken: too long, out of the box, or undetermined.
     """
     if not scoring_step(score, fisher, search.free, 0.0, step):
         return np.inf
@@ -252,7 +254,7 @@ def _add_signals(
     total: NDArray[np.float32], background: NDArray[np.float32], power: float,
     sums: NDArray[np.float32],
 ) -> float:  # fmt: skip
-    """Add w C of a frame to `sums`; return Σ B C.  Single precision does, as both are small."""
+    """Add w C of a frame to `sums`; return Σ B C.  Both are small: single precision is enough."""
     amount, w = np.float32(0.0), np.float32(power)
     for i in range(sums.shape[0]):
         signal, light, out = total[i], background[i], sums[i]

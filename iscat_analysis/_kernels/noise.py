@@ -1,9 +1,9 @@
-"""What a pixel says under each noise model: the only kernels that know which one it is.
+"""Likelihood of a pixel under each noise model: only these kernels depend on the noise model.
 
 Parameters are θ = (x, y, z, a, g): position [nm], amplitude, and the logarithm of a common level
 that multiplies the expected counts.  `data` (4, …) holds, by noise model:
 
-CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts fell after landing, p = q/(1+q) with
+CONDITIONAL  (d, n, ρ, κ): d of the n = b + d counts came after landing, p = q/(1+q) with
              q = ρ e^g (1+s); the unknown background has dropped out (physics.md, section 4).
              ℓ = κ [d ln q − n ln(1+q)], κ ≤ 1 the share of the variance that is not read noise.
 POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v is read-noise variance, added to
@@ -12,8 +12,8 @@ POISSON      (d, α, β, v): λ = e^g (α + β s) + v, ℓ = d ln λ − λ; v i
 ℓ is relative to its value without a particle.  A masked pixel has all four entries zero, and the
 third is above zero in every other pixel.
 
-A new noise model is a number, and a branch in each of these functions.  The rest of the kernels
-take the number along; `iscat_analysis.inference.noise_models` gives it.
+A new noise model needs a number, and a branch in each of these functions.  The other kernels pass
+the number on; `iscat_analysis.inference.noise_models` defines it.
 """
 
 from __future__ import annotations
@@ -30,13 +30,12 @@ FloatArray = NDArray[np.float64]
 CONDITIONAL, POISSON = 0, 1
 
 SERIES = 0.2
-"""Largest |x| at which ln(1+x) is taken from its series."""
+"""Largest |x| for which ln(1+x) is computed from its series."""
 
 FLOOR = 1e-150
-"""Least expected count or intensity: keeps quotients, and their squares, finite where a dark fringe
+"""Smallest expected count or intensity: keeps quotients and their squares finite if a dark fringe
 or a masked pixel is exactly zero."""
-
-_DARK = 1e-100  # expected light below which a pixel knows nothing of relative changes
+_DARK = 1e-100  # expected light below which a pixel has no information on relative changes
 _LEAST_COUNT = 1e-9  # of a tail
 _WHOLE = 1e-9  # rounding of whole counts
 
@@ -56,7 +55,7 @@ def value_of_pixels(
     """Log-likelihood of some pixels of data (4, n); their signals are the first of s."""
     c0, c1 = data[0, first:last], data[1, first:last]
     c2, c3 = data[2, first:last], data[3, first:last]
-    total, beyond = 0.0, 0  # counted, because the largest would be found one after the other
+    total, beyond = 0.0, 0  # a count, since a maximum would prevent vector registers
     if kind == CONDITIONAL:
         for j in range(c0.size):
             beyond += abs(level * (1.0 + s[j]) - 1.0) >= SERIES
@@ -65,7 +64,7 @@ def value_of_pixels(
                 change = level * (1.0 + s[j]) - 1.0
                 part = change * c2[j]
                 one, other = 2.0 + change, 2.0 * (1.0 + c2[j]) + part
-                per = 1.0 / (one * other)  # of both quotients, as it takes longer than the rest
+                per = 1.0 / (one * other)  # one division for both quotients, since it is slow
                 now, later = twice_artanh(change * other * per), twice_artanh(part * one * per)
                 total += c3[j] * (c0[j] * now - c1[j] * later)
         else:
@@ -97,7 +96,7 @@ def value_of_pixels(
 def score_of_pixel(
     kind: int, c0: float, c1: float, c2: float, c3: float, level: float, s: float
 ) -> tuple[float, float, float]:
-    """Give ∂ℓ/∂s, the expected information about s, and what ∂/∂g is of ∂/∂s."""
+    """Give ∂ℓ/∂s, the expected information about s, and the ratio of ∂/∂g and ∂/∂s."""
     if kind == CONDITIONAL:
         bright = max(1.0 + s, FLOOR)
         part = 1.0 / (1.0 + c2 * level * bright)
@@ -187,7 +186,7 @@ def residuals_of_row(
     residual: FloatArray,
     t: FloatArray,
 ) -> None:
-    """Fill what each pixel expects, its residual in standard deviations, and t (4, nx).
+    """Fill the expected counts, the residuals in standard deviations, and t (4, nx).
 
     t holds the information about a relative change of the light, its score, ∂/∂s of the logarithm
     of the light, and the excess kurtosis of the counts.
@@ -204,7 +203,7 @@ def residuals_of_row(
             total = c1[j] if c1[j] > 0 else 1.0
             t[3, j] = c3[j] * (1.0 / max(rate[j] * part, 1.0) - 6.0 / total)
         else:
-            # A background of read noise alone may be measured below zero.
+            # With read noise, a measured background may be below zero.
             raw = level * (c1[j] + c2[j] * s[j])
             used = c2[j] > 0
             light = max(raw, FLOOR) if used else 0.0
@@ -223,7 +222,7 @@ def residuals_of_row(
 
 @njit(inline="always")
 def variance_of_pixel(kind: int, total: float, share: float, mean: float) -> float:
-    """Variance of a count that expects `mean`; `total` and `share` are the data's c1 and c3."""
+    """Variance of a count that expects `mean`; `total` and `share` are c1 and c3 of the data."""
     return share * mean * (1.0 - mean / total) if kind == CONDITIONAL else mean
 
 
@@ -231,12 +230,12 @@ def variance_of_pixel(kind: int, total: float, share: float, mean: float) -> flo
 def tail_of_pixel(
     kind: int, observed: float, total: float, share: float, mean: float, above: bool
 ) -> tuple[bool, float, float, float]:
-    """Give what the exact tail beyond a count is a function of, and whether there is one.
+    """Give the arguments of the exact tail probability beyond a count, and whether there is one.
 
-    `NoiseModel.tails` makes a probability of it.
+    `NoiseModel.tails` computes the probability.
     """
     if kind == CONDITIONAL:
-        # read noise takes its share of the variance, as if that share of the counts were lost
+        # read noise reduces the counts by its share of the variance, as if they were lost
         n, k, p = share * total, share * (observed if above else total - observed), mean / total
         a = min(max(k, _LEAST_COUNT), n)
         known, b, x = k > 0.0, n - a + 1.0, p if above else 1.0 - p

@@ -13,7 +13,7 @@ from iscat_analysis._kernels.vectors import LANES
 
 FloatArray = NDArray[np.float64]
 
-_NEAR = 0.9  # of the largest signal at the nodes, where the largest between them may be
+_NEAR = 0.9  # of the largest signal at nodes, above which an interval may contain the maximum
 
 
 @njit(inline="always")
@@ -66,9 +66,9 @@ def largest_signal(
 ) -> tuple[float, float]:
     """Parts of the signal of largest magnitude that are linear and quadratic in the amplitude.
 
-    The largest on a radial grid of `per_step` points in each interval of the profile, then that of
-    a parabola through its neighbours.  An interval is looked at closely if it begins or ends near
-    the largest of all beginnings: within one the signal rises by a twentieth at most.
+    The largest signal on a radial grid of `per_step` points in each interval of the profile is
+    refined by a parabola through its neighbours.  Only intervals that begin or end near the largest
+    signal at a node are searched: within an interval the signal rises by a twentieth at most.
     """
     intervals, extremes = profile.shape[0], 1 if circular else 3 if analyzer else 2
     rough, f = np.empty((extremes, padded(intervals))), np.empty((DISTANCE + 1, padded(intervals)))

@@ -1,16 +1,16 @@
 """Score, information and likelihood of a particle in a frame, in one pass over its square.
 
-The same as `image_score` and `image_value` of `iscat_analysis._kernels.scoring` say of a POISSON
-image at level 1, without what no fit of a frame asks for: the level and, of a picture at one
-height, z.  All three share the expected counts and one division per pixel.
+The results are those of `image_score` and `image_value` of `iscat_analysis._kernels.scoring` for a
+POISSON image at level 1, without the parameters that a fit of a frame does not need: the level and,
+for an image at one height, z.  All three share the expected counts and one division per pixel.
 
-With n counts where b are expected without the particle and δ more with it, w = δ/(2b + δ), the
-log-likelihood n ln(1 + δ/b) − δ is worked out as
+For n counts, of which b are expected without the particle and δ more with it, and w = δ/(2b + δ),
+the log-likelihood n ln(1 + δ/b) − δ is computed as
 
     (n − b) 2 artanh w + w² (2 b w (1/3 + w²/5 + …) − 2 b − δ),
 
-the artanh by its series.  No term of it is larger than what it tells, so that single precision,
-which the processor does twice as fast, is enough.
+with artanh from its series.  No term is much larger than the result, so that single precision is
+enough, which is twice as fast.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
 
 LEAST = 1e-15
-"""Least expected count, as `FLOOR` of `noise`, but its square is a number in single precision."""
+"""Smallest expected count, like `FLOOR` of `noise`; its square is above 0 in single precision."""
 
 
 @kernel(_nrt=False)
@@ -56,7 +56,7 @@ def place_score(
 
 @kernel(_nrt=False)
 def _bright_value(data: AnyFloatArray, here: AnyFloatArray) -> float:
-    """Log-likelihood in double precision, by the logarithm itself where the series is no good."""
+    """Log-likelihood in double precision, by the logarithm itself where its series fails."""
     total = 0.0
     for i in range(data.shape[1]):
         c0, c1, c2, c3, s = data[0, i], data[1, i], data[2, i], data[3, i], here[i, 0]
@@ -73,7 +73,7 @@ def _bright_value(data: AnyFloatArray, here: AnyFloatArray) -> float:
 def _flat_score(
     data: AnyFloatArray, here: AnyFloatArray, score: FloatArray, fisher: FloatArray
 ) -> tuple[float, float]:
-    """Do it without z; tell as well in how many pixels the series of the logarithm is no good."""
+    """Do it without z; also count the pixels in which the series of the logarithm fails."""
     zero, one, two = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(2.0)
     least, series = data.dtype.type(LEAST), data.dtype.type(SERIES)
     t3, t5, t7 = one / data.dtype.type(3.0), one / data.dtype.type(5.0), one / data.dtype.type(7.0)
@@ -85,7 +85,7 @@ def _flat_score(
         for j in range(s.size):
             base, change = max(c1[j] + c3[j], least), c2[j] * s[j]
             rate, middle = max(base + change, least), two * base + change
-            per = one / (rate * middle)  # of both quotients, as it takes longer than the rest
+            per = one / (rate * middle)  # one division for both quotients, since it is slow
             beyond += one if abs(change) >= series * base else zero
             w = change * (rate * per)
             w2 = w * w

@@ -1,8 +1,9 @@
 """The quintics of a radial profile at eight pixels at once, in vector registers.
 
 Every pixel lies in another interval of the profile, so that a loop over pixels reads its six powers
-one by one, and a compiler leaves it scalar.  Here a pixel evaluates all channels, which follow one
-another in a profile, in one register, and eight pixels are then exchanged for their channels.
+one by one, and the compiler uses no vector registers.  Here all channels of one pixel, which are
+next to each other in a profile, are evaluated in one register.  The registers of eight pixels are
+then transposed.
 """
 
 from __future__ import annotations
@@ -41,14 +42,14 @@ def evaluate(profile: FloatArray, f: FloatArray) -> None:
 
 @kernel()
 def evaluate_slopes(profile: FloatArray, f: FloatArray) -> None:
-    """Evaluate eight channels as `evaluate` four, and in rows 8 to 11 slopes of the first four."""
+    """Evaluate eight channels like `evaluate`, and in rows 8 to 11 slopes of the first four."""
     for j in range(0, f.shape[1], LANES):
         _with_slopes(profile, f, j)
 
 
 @kernel()
 def evaluate_last_slopes(profile: FloatArray, f: FloatArray) -> None:
-    """Evaluate the last eight of twelve channels as `evaluate_slopes` eight."""
+    """Evaluate the last eight of twelve channels like `evaluate_slopes`."""
     for j in range(0, f.shape[1], LANES):
         _with_last_slopes(profile, f, j)
 
@@ -61,7 +62,7 @@ def evaluate_bends(profile: FloatArray, f: FloatArray) -> None:
 
 
 def _places(code: Code) -> tuple[list[Any], Any]:
-    """Tell where the powers of eight pixels begin, and their places in their intervals."""
+    """Give where the powers of eight pixels begin, and their positions in their intervals."""
     intervals, t = code.parted(code.in_row(code.other, DISTANCE, code.first))
     size = code.times(code.index(POWERS), code.length(code.one, 2))
     return [code.times(interval, size) for interval in intervals], t

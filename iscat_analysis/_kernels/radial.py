@@ -10,9 +10,9 @@ at height z, so one pass over the precomputed Bessel matrices (`radial_profile`)
 Hermite coefficients at any z, evanescent waves included.  With step h the quintic errs by
 (h k NA)⁶/46080 of the peak.
 
-A fit asks for hundreds of heights in one range.  There the mean phase exp(iκz) is divided out, the
-profile and its first two derivatives along z are tabulated, and `profile_at` interpolates them by
-the same quintic, at a tenth of the cost and with the same error.
+A fit needs hundreds of heights in one range.  For these, the mean phase exp(iκz) is divided out and
+the profile and its first two derivatives along z are tabulated.  `profile_at` interpolates them by
+the same quintic, in a tenth of the time and with the same error.
 
 A *profile* has shape (intervals, 6, channels), the middle axis the powers of t ∈ [0, 1) in each
 interval; the channels are Re F0, Im F0, Re F2, Im F2, followed by the same four for ∂/∂z, and for
@@ -39,10 +39,10 @@ STEP = 0.3
 
 
 POWERS = 6
-"""Of a quintic."""
+"""Number of powers of a quintic."""
 
-_ROWS = 6  # of a table, of which one height between two is mixed
-_CHANNELS = 4  # of an order of a radial profile
+_ROWS = 6  # of a table, which are combined for a height between two nodes
+_CHANNELS = 4  # channels of one order of a radial profile
 
 
 class AxialTable(NamedTuple):
@@ -176,9 +176,9 @@ def radial_profile(
 
 
 def _mixed(code: Code, place: Any, orders: int) -> list[tuple[Any, Any]]:
-    """Write what mixes eight numbers of a channel and of the next with the carrier put back.
+    """Write the combination of eight numbers of a channel and of the next, times the carrier.
 
-    One pair, real and imaginary part, for each order.
+    The result has one pair, real and imaginary part, for each order.
     """
     *weights, cos, sin, kappa = code.factors
     width = code.length(code.one, 3)
@@ -269,7 +269,7 @@ def profile_at(axial: AxialTable, z_nm: float, start: int, stop: int, profile: F
     channels, width = heights.shape[2:]
     near, orders, last = heights[i : i + 2], profile.size // (channels * width), stop - LANES
     if profile.shape[1] == POWERS:
-        for j in range(start, stop, LANES):  # the last eight once more where fewer are left
+        for j in range(start, stop, LANES):  # the last eight again if fewer are left
             if orders == 1:
                 _radial_1(near, profile, min(j, last), factors)
             elif orders == 2:

@@ -1,8 +1,8 @@
 """From a radial profile to the image of a particle and its gradient, a strip of rows at a time.
 
-A strip is done in two loops over all of its pixels: the first evaluates the quintics, eight pixels
-at a time (`iscat_analysis._kernels.quintics`); the second combines them.  Both run in vector
-registers, over rows of scratch that the first cache holds.
+A strip needs two loops over all of its pixels: the first evaluates the quintics, eight pixels
+at a time (`iscat_analysis._kernels.quintics`); the second combines them.  Both use vector
+registers, and their rows of scratch fit into the first cache.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 _DX, _DY, _SUMS = DISTANCE + 1, DISTANCE + 2, DISTANCE + 3
-"""Rows of scratch after those of the quintics: dx, dy, and what is summed over the samples."""
+"""Rows of scratch after those of the quintics: dx, dy, and the sums over the samples."""
 
 _SCRATCH = _SUMS + 5
-_STRIP = 256  # pixels, or one row of more
+_STRIP = 256  # pixels, or one row if it has more
 
 
 @kernel()
@@ -50,7 +50,7 @@ def intervals_needed(lens: RoundLens, pixels: Pixels, x_p: float, y_p: float, mo
 def _place(
     inv_step: float, x: FloatArray, y: FloatArray, x_p: float, y_p: float, f: FloatArray
 ) -> None:
-    """Fill rows `_DX`, `_DY` and `DISTANCE` of f; where there are no pixels, with zeros."""
+    """Fill rows `_DX`, `_DY` and `DISTANCE` of f; with zeros if there are no pixels."""
     for i in range(y.size):
         for j in range(x.size):
             f[_DX, i * x.size + j] = x[j] - x_p
@@ -106,7 +106,7 @@ def _add_parts(
     rho: float, cos_psi: float, sin_psi: float, co: float, cross: float, ring: float,
     weight: float, f: FloatArray,
 ) -> None:  # fmt: skip
-    """Add weight × what multiplies a and a² in a strip of signals to its sums."""
+    """Add weight × the factors of a and a² in a strip of signals to its sums."""
     for j in range(f.shape[1]):
         dx, dy = f[_DX, j], f[_DY, j]
         u, v = cos_psi * dx + sin_psi * dy, cos_psi * dy - sin_psi * dx
@@ -129,9 +129,9 @@ def radial_strip(
     profile: FloatArray, lens: RoundLens, pixels: Pixels, first: int, last: int, x_p: float,
     y_p: float, amplitude: float, count: int, f: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Make rows `first` to `last` of signal and gradient (`count` 5) or of the parts (2).
+    """Compute rows `first` to `last` of signal and gradient (`count` 5) or of the parts (2).
 
-    Returns the lines of `f` that hold them, of all pixels one after the other; the parts do not
+    Returns the lines of `f` that hold them, with all pixels one after the other; the parts do not
     depend on the amplitude.
     """
     x, y, offsets, weights = pixels.x, pixels.y[first:last], pixels.offsets, pixels.weights

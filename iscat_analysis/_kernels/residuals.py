@@ -1,4 +1,4 @@
-"""Residuals of a fit: what every pixel expects, how far its count is from it, and the farthest.
+"""Residuals of a fit: expected counts, deviations from them, and the pixels that deviate most.
 
 Data are those of `iscat_analysis._kernels.noise`.
 """
@@ -45,7 +45,7 @@ def residuals(
     residual: FloatArray,
     terms: FloatArray,
 ) -> tuple[float, int, float, float, float]:
-    """Fill what every pixel expects and how far its count is from it.
+    """Fill the expected counts of all pixels and the deviations from them.
 
     Shapes: `rows` (ny, 5 or more, nx), `rate` (ny, nx), `residual` (ny, nx), `terms` (ny, 4, nx).
     """
@@ -63,7 +63,7 @@ def residuals(
 
 @kernel()
 def _farthest(residual: FloatArray, index: IntArray) -> None:
-    """Fill `index` (k) with the places of the residuals of largest size, largest first."""
+    """Fill `index` (k) with the indices of the residuals of largest size, largest first."""
     index[:] = 0
     size = np.full(index.size, -1.0)
     last = index.size - 1
@@ -82,7 +82,7 @@ def suspects(
     kind: int, data: FloatArray, rate: FloatArray, residual: FloatArray, many: float,
     tails: FloatArray,
 ) -> tuple[float, int]:  # fmt: skip
-    """Fill what the exact tails of the pixels farthest out are functions of.
+    """Fill the arguments of the exact tail probabilities of the pixels that deviate most.
 
     Shapes: `rate, residual` (ny, nx), `tails` (3, k).
     """

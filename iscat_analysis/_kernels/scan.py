@@ -1,7 +1,7 @@
 """Profile log-likelihood along z.
 
-At one place and height the signal is a P + a² Q: the two pictures are made once for each height,
-and the amplitude is fitted with them.
+At one position and height the signal is a P + a² Q.  The two images are computed once for each
+height, and the amplitude is fitted with them.
 """
 
 from __future__ import annotations
@@ -37,8 +37,9 @@ def scan_heights(
 ) -> None:
     """Profile log-likelihood along z at fixed (x, y): the amplitude takes two scoring steps.
 
-    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the rest and the start.  An
-    empty amplitude range holds the amplitude fixed.  The first three are as of `maximize`.
+    Fills `values` and `amplitudes`, shape (n,), for `heights`; θ gives the other parameters and the
+    start.  An empty amplitude range holds the amplitude fixed.  The first three arguments are those
+    of `maximize`.
     """
     axial, lens, pixels = AxialTable(*table), named_lens(optics), Pixels(*grid)
     profile = blank_profile(axial, lens, 1)

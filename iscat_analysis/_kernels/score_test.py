@@ -1,10 +1,10 @@
 """Rao's score test of a fit against modes, with the fitted directions projected out.
 
-A mode is a product H_i(x) H_j(y).  The information between two of them is therefore a sum over rows
-of pixels of H_j H_l Σ_x ω H_i H_k, ω the information of a pixel on the logarithm of its light: a
-few multiply-adds per pixel and pair of functions of y, and sums over x in the end.  With G the
-information of the fitted directions and the modes, G = L Lᵀ in this order and b the residual along
-them, the squares of L⁻¹b that belong to the modes add up to a χ².
+A mode is a product H_i(x) H_j(y).  The information between two modes is therefore a sum over rows
+of pixels of H_j H_l Σ_x ω H_i H_k, with ω the information of a pixel on the logarithm of its light.
+This needs a few multiply-adds per pixel and pair of functions of y, and sums over x at the end.
+Let G = L Lᵀ be the information of the fitted directions and the modes, in this order, and b the
+residual along them.  The squares of those components of L⁻¹b that belong to the modes add up to χ².
 
 `rows` are those of `iscat_analysis._kernels.image` or `iscat_analysis._kernels.hessian`: s and its
 derivatives in (x, y, z, a), each row of pixels; `terms` are those that
@@ -103,7 +103,7 @@ def _add_fitted(
     matrix: FloatArray,
     vector: FloatArray,
 ) -> None:
-    """Add one row's share of what concerns the fitted directions only; fill `heavy` (k + 1, nx)."""
+    """Add one row's share of the sums over fitted directions only; fill `heavy` (k + 1, nx)."""
     for j in range(weight.size):
         heavy[fitted, j] = pull[j]
     for f in range(fitted):
@@ -175,7 +175,7 @@ def _score_statistic(
             total = 0.0
             for i in range(j):
                 total += matrix[k, i] * matrix[j, i]
-            # nothing along what is left out
+            # zero along directions that are left out
             matrix[k, j] = (matrix[k, j] - total) / matrix[j, j] if used[j] else 0.0
             left -= matrix[k, j] ** 2
         if not (size > 0.0 and left > dependent * size):
@@ -218,9 +218,9 @@ def _leverages(
     used: BoolArray,
     out: FloatArray,
 ) -> None:
-    """Fill `out` (ny, nx) with each pixel's part in the statistic, after `_score_statistic`.
+    """Fill `out` (ny, nx) with each pixel's share of the statistic, after `_score_statistic`.
 
-    It is the sum of the squares of the pixel's components of the orthonormal modes.
+    The share is the sum of the squares of the pixel's components of the orthonormal modes.
     """
     index = marked(free)
     fitted, count = index.size, along.shape[0]
@@ -271,7 +271,7 @@ def mode_statistic(
     used = np.empty(size, dtype=np.bool_)
     _mode_information(rows, terms, free, along, across, matrix, vector)
     chi2, freedom = _score_statistic(matrix, vector, fitted, dependent, used)
-    # the leverages are at most 1 and their sum is `freedom`, so that this much is all they could do
+    # the leverages are at most 1 and their sum is `freedom`, which limits their effect
     if excess > negligible and freedom > 0:
         leverage = np.empty((y.size, x.size))
         _leverages(rows, terms, free, along, across, matrix, used, leverage)

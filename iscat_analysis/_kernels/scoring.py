@@ -1,7 +1,7 @@
-"""Log-likelihood, score and Fisher matrix in one pass over the pixels, and the fit built on it.
+"""Log-likelihood, score and Fisher matrix in one pass over the pixels, and the fit that uses them.
 
-Parameters and data are those of `iscat_analysis._kernels.noise`, which holds what the noise models
-differ in; `kind` is the number of one.
+Parameters and data are those of `iscat_analysis._kernels.noise`, which contains the differences of
+the noise models; `kind` is the number of a noise model.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 CONVERGED, STALLED, EXHAUSTED, ABANDONED = 0, 1, 2, 3
-"""How a fit ended: step below tolerance; no step improves; iterations used up; little to gain."""
+"""Outcome of a fit: step below tolerance; no step improves; iterations used up; little to gain."""
 
 LARGEST_GAIN_RATIO = 16.0
-"""Multiple of the expected gain in log-likelihood that a fit is trusted to make."""
+"""Largest gain in log-likelihood that a fit may still make, over the expected gain."""
 
 _TOGETHER = 256
-"""Pixels for which one series is tried: bright ones take the slow logarithm for these alone."""
+"""Pixels in one block: the slow logarithm is computed only for blocks with bright pixels."""
 
 
 @kernel()
@@ -160,7 +160,7 @@ def score_pass(
     """Fill score (5) and Fisher matrix (5, 5) at θ and return the log-likelihood."""
     level = np.exp(theta[4])
     ny, nx = pixels.y.size, pixels.x.size
-    if len(lens) == ROUND:  # strip by strip, as long as the first cache holds it
+    if len(lens) == ROUND:  # strip by strip, while the strip is in the first cache
         flat, sums, total = data.reshape(4, ny * nx), np.zeros(20), 0.0
         together, f = strip_scratch(pixels)
         for row in range(0, ny, together):
@@ -203,7 +203,7 @@ def value_pass(
 @kernel(_nrt=False)
 def span(lens: Lens, pixels: Pixels, theta: FloatArray, width: int) -> tuple[int, int]:
     """Range of the flattened profile, `width` long, that an image needs."""
-    zero = int(np.int64(0))  # a plain 0 is a type of its own, for which its callers are compiled
+    zero = int(np.int64(0))  # a literal 0 has its own type, for which callers are compiled again
     if len(lens) == STAMP:
         return zero, width
     if len(lens) == LATTICE:
@@ -233,7 +233,7 @@ def picture_at(
     stop: int,
     profile: FloatArray,
 ) -> FloatArray:
-    """Profile at a height, of which a range is filled; that of a stamp is the table's only one."""
+    """Profile at a height, filled over a range; a stamp has only one, in its table."""
     if len(lens) == STAMP:
         rows = 2 * lens.half + 1
         only: FloatArray = axial.heights[0, 0].reshape(2, rows, axial.heights.shape[3] // rows)
@@ -252,7 +252,7 @@ def value_batch(
     thetas: FloatArray,
     out: FloatArray,
 ) -> None:
-    """Fill `out` (n) with the log-likelihood at θ (n, 5); where z repeats, so does the profile."""
+    """Fill `out` (n) with the log-likelihood at θ (n, 5); equal z share a profile."""
     profile = blank_profile(axial, lens, 1)
     width = axial.heights.shape[3]
     z, first, last = np.nan, 0, 0
@@ -328,7 +328,7 @@ def maximize(
 ) -> tuple[float, int, int]:
     """Damped Fisher scoring inside a box, from θ, which is overwritten with the estimate.
 
-    `prior` is mean and information of a normal prior of z; without information there is none.
+    `prior` has mean and information of a normal prior of z; zero information means no prior.
 
     Shapes: `data` (4, ny, nx), `free` (5,), `lower, upper, max_step` (5,), `theta` (5,), `fisher`
     (5, 5).
@@ -367,7 +367,7 @@ def maximize(
         for i in range(5):
             trial[i] = min(max(theta[i] + shrink * step[i], lower[i]), upper[i])
             gain += 0.5 * score[i] * (trial[i] - theta[i])
-        if not np.isfinite(gain):  # an overflow: a place that is no number must not be looked up
+        if not np.isfinite(gain):  # an overflow: a NaN position must not become an index
             return value, passes, STALLED
         if damping == 0.0 and gain < tolerance:
             for i in range(5):
@@ -387,7 +387,7 @@ def maximize(
         passes += 1
         if trial_value >= value - 1e-3 * tolerance - 1e-13 * abs(value):
             value = trial_value
-            for i in range(5):  # assigning slices would compile the text of a message beside it
+            for i in range(5):  # a slice assignment would also compile its error message
                 theta[i], score[i] = trial[i], trial_score[i]
                 for j in range(5):
                     fisher[i, j] = trial_fisher[i, j]

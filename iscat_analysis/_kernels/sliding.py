@@ -1,4 +1,4 @@
-"""Sums over frames and peaks of a sliding statistic: one pass over the counts, no copies."""
+"""Sums over frames and peaks of a sliding statistic, in one pass over the counts without copies."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def block_sums(
 
 @kernel()
 def frame_totals(counts: NDArray[Any], zero: Any, out: NDArray[Any], same: BoolArray) -> None:
-    """Sum every frame, and see whether it repeats the one before it.
+    """Sum every frame, and tell whether it repeats the one before it.
 
     Shapes: `counts` (t, y, x), `out` (t,), `same` (t,).
     """
@@ -81,7 +81,7 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
 
 @kernel(fastmath={"reassoc", "nsz"})
 def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: MapArray) -> float:
-    """Weighted contrast of two sums over the field, with its weighted mean taken off.
+    """Weighted contrast of two sums over the field, minus its weighted mean.
 
     Shapes: `earlier, later` (k, y, x), `weight` (y, x), `out` (y, x).
     """
@@ -139,7 +139,7 @@ def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
     depth, rows, columns = maps.shape
     for k in range(depth):
         for i in range(rows):
-            above = False  # in most rows nothing is, which several numbers at a time tell
+            above = False  # most rows have no pixel above; vector registers find this fast
             for j in range(columns):
                 above |= abs(maps[k, i, j]) > threshold
             if not above:
@@ -165,7 +165,7 @@ def step_peaks(maps: MapArray, threshold: float) -> NDArray[np.int64]:
 
 
 @kernel()
-def in_shadow(
+def near_earlier_peaks(
     peaks: FloatArray,
     frames: tuple[int, int],
     distances: tuple[float, float, float],

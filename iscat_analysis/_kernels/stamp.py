@@ -1,21 +1,21 @@
-"""The image of a particle at one height, from samples of its picture.
+"""The image of a particle at one height, interpolated between samples.
 
 At one height the signal is a P(x, y) + a² Q(x, y), both averaged over a pixel and band-limited,
-P at k·NA and Q at twice that.  Sampled `fine` times per pixel they need no pupil, no fields and no
-samples inside the pixels any more.  As the samples lie on the pixels' own grid, all pixels of an
-image take the same `TAPS`² weights, those of `iscat_analysis.optics.stamp`, along y first and then
-along x.
+P at k·NA and Q at twice that.  With `fine` samples of P and Q per pixel, an image needs no pupil,
+no fields and no samples inside the pixels.  The samples lie on the grid of the pixels, so that all
+pixels of an image have the same `TAPS`² weights, those of `iscat_analysis.optics.stamp`.  They are
+applied along y first and then along x.
 
-A *profile* has shape (2, nodes along y, nodes along x): P and Q.  The nodes along x are in the
-order of their place in a pixel: all that are the first in theirs, all that are the second, …, so
-that what one weight multiplies for all columns of pixels follows one another in memory.
+A *profile* has shape (2, nodes along y, nodes along x): P and Q.  The nodes along x are ordered by
+their position in a pixel: first the first node of every pixel, then the second, and so on.  The
+nodes that one weight multiplies are then next to each other in memory.
 
-Everything is done in the precision of the profile: single precision, 1e-7 of the signal where the
-weights themselves err by 4e-6, takes half of the time.
+All numbers have the precision of the profile.  Single precision takes half of the time; its error
+is 1e-7 of the signal, while that of the weights is 4e-6.
 
-`STRIP` rows of pixels are made at once.  Their nodes are copied into lines of one length, so that
-what one weight multiplies for all of these pixels follows one another as well: every loop is then
-long, runs in vector registers, and finds its numbers in the first cache.
+`STRIP` rows of pixels are computed at once.  Their nodes are copied into lines of one length, so
+that the nodes that one weight multiplies are contiguous for all of these pixels: every loop is then
+long, uses vector registers, and reads from the first cache.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
 STRIP = 16
-"""Rows of pixels that are made at once."""
+"""Rows of pixels that are computed at once."""
 
-_WEIGHTS = 4 * TAPS + 3  # of x and y, their slopes, the first nodes, and the amplitude
+_WEIGHTS = 4 * TAPS + 3  # weights along x and y, their slopes, the first nodes, the amplitude
 
 
 @kernel()
 def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
-    """Length of a line, of a block of nodes, of what is made of them, and of a strip's pixels."""
+    """Length of a line, of a block of nodes, of their combinations, and of a strip's pixels."""
     more = (TAPS + lens.fine - 2) // lens.fine
     line = columns + more
     return line, (STRIP + more) * line, STRIP * line + more, STRIP * line
@@ -57,7 +57,7 @@ def sizes(lens: StampLens, columns: int) -> tuple[int, int, int, int]:
 def first_nodes(
     profile: AnyFloatArray, lens: StampLens, pixels: Pixels, x_p: float, y_p: float
 ) -> tuple[float, float]:
-    """Place of the first pixel among the nodes, in nodes; those of all pixels are there."""
+    """Position of the first pixel on the nodes [nodes]; the nodes of all pixels exist."""
     room = TAPS - BEFORE
     last_x = profile.shape[2] - room - lens.fine * (pixels.x.size - 1)
     last_y = profile.shape[1] - room - lens.fine * (pixels.y.size - 1)
@@ -97,8 +97,8 @@ def copy_nodes(
 ) -> None:  # fmt: skip
     """Fill lines of `signal` with P + a Q, of `slope` with P + 2a Q, from every `step`-th row.
 
-    A slope without room is left out.  Numba counts no references here and below (`_nrt`), as
-    nothing is allocated or handed back: counting took as long as a line of twenty nodes.
+    An empty `slope` is not filled.  Numba counts no references here and below (`_nrt`), since no
+    array is allocated or returned: counting took as long as a line of twenty nodes.
     """
     for m in range(signal.size // line):
         p, q = profile[0, row + step * m, first:last], profile[1, row + step * m, first:last]
@@ -116,7 +116,7 @@ def copy_nodes(
 
 @kernel(fastmath=FAST, _nrt=False)
 def mix_nodes(nodes: AnyFloatArray, at: IntArray, w: AnyFloatArray, out: AnyFloatArray) -> None:
-    """Fill `out` with the combination w of what begins at TAPS places of `nodes`."""
+    """Fill `out` with the combination w of the lines that begin at TAPS places of `nodes`."""
     n = out.size
     for k in range(0, TAPS, 4):
         a, b = nodes[at[k] : at[k] + n], nodes[at[k + 1] : at[k + 1] + n]
@@ -142,10 +142,10 @@ def _make_strip(
     profile: AnyFloatArray, lens: StampLens, row: int, rows: int, columns: int,
     images: int, at: IntArray, w: AnyFloatArray,
 ) -> int:  # fmt: skip
-    """Make a strip: P + a Q of its pixels, and if not 1 but 4 images ∂/∂x, ∂/∂y of it and P + 2a Q.
+    """Compute a strip: P + a Q of its pixels, and for 4 images also ∂/∂x, ∂/∂y and P + 2a Q.
 
-    `at` (TAPS) is work space too.  Returns where in the other it begins; each of its images is
-    `STRIP` lines long.
+    `at` (TAPS) is work space too.  Returns where the strip begins in the other work space; each of
+    its images is `STRIP` lines long.
     """
     fine = lens.fine
     line, block, made, strip = sizes(lens, columns)
@@ -211,7 +211,7 @@ def _fill_gradient(
         if row % STRIP == 0:
             begin = _make_strip(profile, lens, row, min(STRIP, rows - row), n, np.int64(4), at, f)
         here = out[row]
-        for k in range(3):  # one after the other: among ten arrays the compiler gives up on vectors
+        for k in range(3):  # one after the other: with ten arrays the compiler uses no vectors
             made, image = f[begin + k * strip : begin + k * strip + n], here[k]
             factor = out.dtype.type(-amplitude if k else amplitude)
             for j in range(n):
@@ -230,7 +230,7 @@ def stamp_strip(
 ) -> None:  # fmt: skip
     """Fill `out` (5, rows·columns or more) with signal and gradient of a strip of rows.
 
-    All of its pixels follow one another; ∂s/∂z, which is 0, is left alone.  `f` comes from
+    All of its pixels follow one another; ∂s/∂z is 0 and not written.  `f` comes from
     `begin_stamp`, `at` (TAPS) is work space.
     """
     line, _, _, strip = sizes(lens, columns)
@@ -271,7 +271,7 @@ def _put_signal(
     profile: AnyFloatArray, lens: StampLens, factor: float, adds: bool, at: IntArray,
     f: AnyFloatArray, out: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Write the signal into `out`, or add it to what is there."""
+    """Write the signal into `out`, or add it."""
     rows, n = out.shape
     line, by = sizes(lens, n)[0], out.dtype.type(factor)
     for row in range(rows):

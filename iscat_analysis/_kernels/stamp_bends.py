@@ -1,8 +1,8 @@
-"""Second derivatives of the image of a particle at one height, from samples of its picture.
+"""Second derivatives of the image of a particle at one height, interpolated between samples.
 
-As in `iscat_analysis._kernels.stamp`, with the second derivative of the window's weights beside its
-slope.  Along y the nodes of S = P + a Q are mixed to S, ∂yS and ∂yyS and those of D = P + 2a Q to D
-and ∂yD, and these along x to all that is wanted: s = a S, ∂s/∂a = D, ∂²s/∂a² = 2Q = 2 (D − S)/a.
+As in `iscat_analysis._kernels.stamp`, with the first and second derivatives of the weights.  Along
+y, the nodes of S = P + a Q are combined to S, ∂yS and ∂yyS, and those of D = P + 2a Q to D and ∂yD.
+Along x, these are combined to all derivatives: s = a S, ∂s/∂a = D, ∂²s/∂a² = 2Q = 2 (D − S)/a.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ if TYPE_CHECKING:
     from iscat_analysis._kernels.lens import StampLens
 
 BENDS = 10
-"""Rows that a row of pixels fills: s, ∂x, ∂y, ∂xx, ∂a, ∂xy, ∂yy, ∂xa, ∂ya, ∂aa of it.
+"""Numbers for each pixel: s and its derivatives ∂x, ∂y, ∂xx, ∂a, ∂xy, ∂yy, ∂xa, ∂ya, ∂aa.
 
-The first five are those of `signal_gradient`, with ∂xx in the place of ∂z, which is none.
+The first five are those of `signal_gradient`, with ∂xx in place of ∂z, which does not exist.
 """
 
 _SUMS = 5  # of nodes, mixed along y
@@ -83,7 +83,7 @@ def _mix_down(
     profile: AnyFloatArray, lens: StampLens, left: int, top: int, rows: int, columns: int,
     w: AnyFloatArray, at: IntArray, nodes: AnyFloatArray, sums: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Mix the nodes of a strip along y: S, ∂yS, ∂yyS, D and ∂yD, one after the other."""
+    """Combine the nodes of a strip along y: S, ∂yS, ∂yyS, D and ∂yD, one after the other."""
     fine = lens.fine
     line, block, made, _ = sizes(lens, columns)
     per_phase = profile.shape[2] // fine
@@ -113,7 +113,7 @@ def _mix_along(
     lens: StampLens, left: int, rows: int, columns: int, w: AnyFloatArray, at: IntArray,
     sums: AnyFloatArray, images: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Mix what `_mix_down` made along x: S, ∂x, ∂xx, ∂y, ∂xy and ∂yy of it, D, ∂xD, ∂yD."""
+    """Combine the results of `_mix_down` along x: S, its ∂x, ∂xx, ∂y, ∂xy, ∂yy, D, ∂xD, ∂yD."""
     fine = lens.fine
     line, _, made, strip = sizes(lens, columns)
     size, used = fine * made, rows * line - (line - columns)
@@ -139,7 +139,7 @@ def _mix_along(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _put(lens: StampLens, amplitude: float, images: AnyFloatArray, out: AnyFloatArray) -> None:
-    """Write a strip's images; the particle moves against the nodes."""
+    """Write a strip's images; a derivative along the particle is minus that along the nodes."""
     rows, n = out.shape[0], out.shape[2]
     line, _, _, strip = sizes(lens, n)
     one, a = out.dtype.type(1.0), out.dtype.type(amplitude)

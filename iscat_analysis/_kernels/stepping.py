@@ -1,4 +1,4 @@
-"""What is done with the frames of each step: sums of parts, neighbours, its frame, its repeats."""
+"""Kernels for the frames of a step: sums of parts, neighbours, its frame, its measured spread."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def add_image(total: FloatArray, corner: tuple[int, int], image: FloatArray, sca
 def times_change(
     ratio: FloatArray, here: Ends, image: FloatArray, inside: Ends, before: float, after: float
 ) -> None:  # fmt: skip
-    """Multiply a ratio with (1 + after·image)/(1 + before·image).
+    """Multiply a ratio by (1 + after·image)/(1 + before·image).
 
     Shapes: `ratio` (y, x), `image` (ny, nx).
     """
@@ -61,7 +61,7 @@ def times_change(
 def one_change(
     heights: FloatArray, weight: FloatArray, jump: FloatArray, gain: FloatArray
 ) -> tuple[float, int]:
-    """Compare what precedes each change of mean with what follows it.
+    """Compare the mean before each possible change with the mean after it.
 
     Shapes: `heights` (t,), `weight` (t,), `jump` (t − 1,), `gain` (t − 1,).
     """
@@ -120,7 +120,7 @@ def projector(
 def frame_scores(
     counts: NDArray[Any], lit: BoolArray, weights: FloatArray, out: FloatArray
 ) -> None:
-    """Weigh some frames in several ways at once.
+    """Sum frames with several sets of weights at once.
 
     Shapes: `counts` (t, p), `lit` (t,), `weights` (n, p), `out` (n, m).
     """
@@ -156,7 +156,7 @@ def spreads(
     values: FloatArray, power: FloatArray, shot: FloatArray, read: FloatArray, edges: IntArray,
     lengths: IntArray, out: FloatArray,
 ) -> None:  # fmt: skip
-    """Add up how parts of the frames of one window differ, over what is expected.
+    """Sum the squared differences between parts of a window's frames, over their expectation.
 
     Shapes: `values` (n, t), `power` (t,), `shot, read` (n,), `edges` (k + 1,), `lengths` (m,),
     `out` (1 + m, n + 1).
@@ -194,7 +194,7 @@ def ring_heights(
     snr: NDArray[Any], centre: tuple[float, float], place: tuple[float, float], ring: float,
     patch: float, others: FloatArray, highest: FloatArray,
 ) -> None:  # fmt: skip
-    """Find how high a map rises in each sector of a ring around a particle.
+    """Find the largest value of a map in each sector of a ring around a particle.
 
     Shapes: `snr` (y, x), `others` (n, 2), `highest` (sectors,).
     """
@@ -207,7 +207,7 @@ def ring_heights(
     left, right = whole(x0 - far, 0, columns), whole(np.ceil(x0 + far) + 1, 0, columns)
     sectors = highest.size
     highest[:] = -1.0
-    # closer in, a patch would cover a whole lobe of a misfit
+    # nearer to the particle, a patch would cover a whole lobe of a residual
     twice = distance > 2 * patch
     peak, peak_y, peak_x = -1.0, 0, 0
     for passed in range(2 if twice else 1):

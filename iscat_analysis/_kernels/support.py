@@ -1,4 +1,4 @@
-"""Where a model is known: heights of its tables, and pixels within its reach."""
+"""The domain of a model: heights of its tables, and pixels within its reach."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 SLACK_NM = 1e-6
-"""Rounding of coordinates near the edge of the support."""
+"""Tolerance for the rounding of coordinates at the edge of the support."""
 
 
 @kernel()
@@ -25,7 +25,7 @@ def supported(
     high: float,
     largest_level: float,
 ) -> BoolArray:
-    """Tell at which θ (n, 5) every pixel is within reach, the height known and all finite."""
+    """Tell for which θ (n, 5) all pixels are within reach, z is in the table and all is finite."""
     inside = np.empty(thetas.shape[0], dtype=np.bool_)
     for k in range(thetas.shape[0]):
         dx = max(abs(thetas[k, 0] - x[0]), abs(thetas[k, 0] - x[-1])) + half_pixel
@@ -53,7 +53,7 @@ def box_supported(
     high: float,
     largest_level: float,
 ) -> tuple[bool, bool]:
-    """Tell whether a box holds the start of what is free, and whether `supported` holds in it."""
+    """Tell whether a box contains the start of the free parameters, and is in the support."""
     inside = True
     corners = np.empty((4, 5))
     for i in range(5):

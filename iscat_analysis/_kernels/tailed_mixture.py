@@ -1,13 +1,14 @@
-"""Mixture of peaks with an exponential tail, on a background, seen through a window.
+"""Mixture of peaks with an exponential tail, on a background, truncated to a window.
 
-An event of a species is μ + e + n: e exponential of mean |t|, of the sign of t, and n normal of
-variance v = τ² + σ_i².  With N the density of n at d = x − μ, t > 0 and z = d − v/t,
+An event of a species is μ + e + n: e is exponential with mean |t| and the sign of t, n is normal
+with variance v = τ² + σ_i².  With N the density of n at d = x − μ, t > 0 and z = d − v/t,
 
     f = e^(v/2t² − d/t) Φ(z/√v) / t,      t ∂f/∂x = N − f,
     g = (z f + v N/t) / t,                t ∂f/∂t = g − f,
 
-g having the exponential twice (Grushka, Anal. Chem. 44, 1733, 1972).  All slopes follow; for t far
-below √v, where these differences cancel, f is the series Σ (t/√v)ⁿ Heₙ(d/√v) N.
+where g contains the exponential twice (Grushka, Anal. Chem. 44, 1733, 1972).  All slopes follow.
+For t far below √v these differences cancel; f is then computed from its series
+Σ (t/√v)ⁿ Heₙ(d/√v) N.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from iscat_analysis._kernels import kernel
 
 FloatArray = NDArray[np.float64]
 
-_SHORT = 0.05  # of √v: a shorter tail is a series
+_SHORT = 0.05  # of √v: for a shorter tail the series is used
 _ORDERS = 7
-_DEEP = 24.0  # beyond it the complementary error function vanishes
+_ERFC_LIMIT = 24.0  # beyond it the complementary error function vanishes
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 _TINY = 1e-290
 
@@ -33,7 +34,7 @@ _TINY = 1e-290
 def _over_normal(a: float) -> float:
     """Give Φ(a)/φ(a) for a ≤ 0."""
     y = -a * math.sqrt(0.5)
-    if y < _DEEP:
+    if y < _ERFC_LIMIT:
         return math.sqrt(0.5 * math.pi) * math.exp(y * y) * math.erfc(y)
     b = 1.0 / (a * a)
     return -(1.0 - b * (1.0 - 3.0 * b * (1.0 - 5.0 * b))) / a
@@ -93,8 +94,9 @@ def tailed_score(
 ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood of the events of a window, and its slopes.
 
-    An event's own chance to be seen is left out; that of a particle with the noise of each kind of
-    event is the sum over nodes of what is there, times `seen`, which holds their distances.
+    The probability to detect the event itself is left out.  The probability to detect a particle
+    with the noise of each kind of event is the sum over nodes of the density times `seen`, which
+    includes the distances of the nodes.
 
     Shapes: `x, noise` (n,), `background` (n, b), `size, kind_noise` (c,), `nodes` (g,),
     `node_background` (g, b), `seen` (c, g), `weight` (k + 1,), `mean, variance` (k,), `shape` (b,);

@@ -1,7 +1,7 @@
-"""What the rows of one track send to the pixels of their background, and feel of it.
+"""Products with the slopes G = w B ∂C of the rows of one track (see `background_response`).
 
-A row knows its pixels by its slopes G = w B ∂C (see `background_response`).  All is
-done row by row, for several images at once, so that the slopes are read from memory once.
+The slopes connect the parameters of a row with the pixels of its background.  The kernels go row by
+row, for several images at once, so that the slopes are read from memory once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ def own_shares(
     slopes: Slopes, rows: IntArray, squares: IntArray, weight: FloatArray, out: FloatArray,
     work: FloatArray, weighted: FloatArray,
 ) -> None:  # fmt: skip
-    """Give what the background takes from each row alone.
+    """Give Gᵀ diag(weight) G of each row: the information that the background takes from it.
 
     Shapes: `rows` (n,), `squares` (n, 4), `weight` (y, x), `out` (n, k, k), `work, weighted`
     (side²,).
@@ -44,7 +44,7 @@ def send(
     slopes: Slopes, rows: IntArray, squares: IntArray, by: FloatArray, out: FloatArray,
     work: FloatArray,
 ) -> None:  # fmt: skip
-    """Add to images what rows send to them.
+    """Add G times numbers of the rows to images.
 
     Shapes: `by` (n, b, k), `out` (b, y, x), `work` (side²,).
     """
@@ -59,12 +59,12 @@ def send(
 @kernel(fastmath=FAST, _nrt=False)
 def follow(
     slopes: Slopes, rows: IntArray, squares: IntArray, covariance: FloatArray,
-    images: FloatArray, felt: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
+    images: FloatArray, projections: FloatArray, out: FloatArray, work: FloatArray, by: FloatArray,
 ) -> None:  # fmt: skip
-    """Give what rows feel of images, and what they send back as they follow.
+    """Give Gᵀ times images for each row, and add G F⁻¹ Gᵀ times these images to `out`.
 
-    Shapes: `covariance` (n, k, k), `images` (b, y, x), `felt` (n, b, k), `out` (b, y, x), `work`
-    (side²,), `by` (k,).
+    Shapes: `covariance` (n, k, k), `images` (b, y, x), `projections` (n, b, k), `out` (b, y, x),
+    `work` (side²,), `by` (k,).
     """
     k = slopes.values.shape[1]
     for q in range(rows.size):
@@ -72,10 +72,10 @@ def follow(
         for v in range(images.shape[0]):
             size = gather(images[v], square, work)
             for a in range(k):
-                felt[q, v, a] = units[a] * product(values[a], work, size)
+                projections[q, v, a] = units[a] * product(values[a], work, size)
             for a in range(k):
                 by[a] = 0.0
                 for b in range(k):
-                    by[a] += covariance[q, a, b] * felt[q, v, b]
+                    by[a] += covariance[q, a, b] * projections[q, v, b]
             mix(values, units, by, size, work)
             put(work, square, out[v])

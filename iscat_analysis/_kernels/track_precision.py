@@ -1,4 +1,4 @@
-"""What the likelihood of a particle in a frame knows of it; see `fit_frames`."""
+"""Information, bias and goodness of the fit of a particle in a frame; see `fit_frames`."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 PART = 0.5
-"""Steps, in standard deviations, over which second derivatives are taken as differences."""
+"""Steps, in standard deviations, of the differences that give second derivatives."""
 
 _SINGULAR = 1e-9
-"""Pivot of a matrix with ones on its diagonal below which a parameter is not known."""
+"""Pivot of a matrix with ones on its diagonal below which a parameter is undetermined."""
 
 
 @kernel(fastmath=FAST, _nrt=False)
@@ -97,7 +97,7 @@ def _left_over(
     zero, one, four = data.dtype.type(0.0), data.dtype.type(1.0), data.dtype.type(4.0)
     least, a = data.dtype.type(LEAST), data.dtype.type(amplitude)
     chi2 = used = light = known = more = zero
-    # of each column: one for all would keep the loop from vectors
+    # one sum for each column: a single sum would prevent vector registers
     worst = np.zeros(data.shape[2], data.dtype)
     inverse = one / a if a != zero else zero
     for i in range(data.shape[1]):
@@ -141,7 +141,7 @@ def judge_frames(
     numbers: FloatArray,
     room: Room,
 ) -> None:
-    """Say of the rows of frames first…last − 1 what their likelihoods know, at θ.
+    """Fill information, bias and tests of the rows of frames first…last − 1, at θ.
 
     Shapes: `fisher` (rows, 4, 4), `turned, ways` (rows, 4, 4), `bias` (rows, 4), `numbers` (rows,
     6).
@@ -175,7 +175,7 @@ def judge_frames(
             for k in range(index.size):
                 for a in range(2):
                     farthest = max(farthest, abs(ways_here[a, k]))
-            if PART * farthest > field.pixel_nm:  # as good as singular
+            if PART * farthest > field.pixel_nm:  # practically singular
                 continue
             for k in range(index.size):
                 for a in range(4):
@@ -188,8 +188,8 @@ def judge_frames(
 
 @kernel(_nrt=False)
 def _rows_drawn(lens: Lens) -> int:
-    """How many rows `_draw` fills for a row of pixels."""
-    return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a constant is a type of its own
+    """Give how many numbers `_draw` fills for each pixel."""
+    return int(np.int64(BENDS if len(lens) == STAMP else 5))  # a literal has its own type
 
 
 @kernel(_nrt=False)
@@ -197,9 +197,9 @@ def _draw(
     near: Pictures, lens: Lens, group: int, p: FloatArray, pixels: Pixels, profile: FloatArray,
     here: AnyFloatArray,
 ) -> None:  # fmt: skip
-    """Draw signal and gradient of a row (ny, 5, nx), at one height what bends (ny, BENDS, nx).
+    """Draw signal and gradient of a row (ny, 5, nx); at one height also its second derivatives.
 
-    What a lens leaves out depends on its type.
+    These have shape (ny, BENDS, nx).  The type of the lens chooses the compiled branches.
     """
     if len(lens) == STAMP:
         stamp_bends(near.nodes, lens, pixels, p[0], p[1], p[3], here)
@@ -213,9 +213,9 @@ def _curve(
     here: AnyFloatArray, p: FloatArray, ways: FloatArray, room: Room, turned: FloatArray,
     bias: FloatArray,
 ) -> None:  # fmt: skip
-    """Fill O V of a row and add to its bias; what a lens leaves out depends on its type.
+    """Fill O V of a row and add to its bias; the type of the lens chooses the compiled branches.
 
-    A picture at one height has second derivatives; of others they are differences.
+    An image at one height has second derivatives; for others they are differences.
     """
     ny, nx = pixels.y.size, pixels.x.size
     if len(lens) == STAMP:
@@ -245,9 +245,9 @@ def _curve_at_one_height(
     data: AnyFloatArray, bends: AnyFloatArray, ways: FloatArray, turned: FloatArray,
     bias: FloatArray,
 ) -> None:  # fmt: skip
-    """Do it with the second derivatives of a picture at one height (ny, BENDS, nx)."""
+    """Do it with the second derivatives of an image at one height (ny, BENDS, nx)."""
     sums, spread, n = np.zeros(9), np.zeros((4, 4), bends.dtype), ways.shape[0]
-    for a in range(n):  # not 4: the compiler would write it out
+    for a in range(n):  # not 4: the compiler would unroll the loop
         for b in range(n):
             for k in range(ways.shape[1]):
                 spread[a, b] += ways[a, k] * ways[b, k]

@@ -1,4 +1,4 @@
-"""How the counts of pixels scatter, and those beside them along: frames as they are stored."""
+"""Variance of pixels' counts, and covariance with their neighbours, from frames as stored."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BoolArray = NDArray[np.bool_]
 def block_extremes(
     counts: NDArray[Any], summed: FloatArray, highest: NDArray[Any], still: BoolArray
 ) -> None:
-    """Sum frames, and see which pixels change.
+    """Sum frames, and tell which pixels change.
 
     Shapes: `counts` (t, y, x), `summed` (y, x), `highest` (y, x), `still` (y, x).
     """
@@ -65,7 +65,7 @@ def add_scatter(
     squares: FloatArray,
     products: FloatArray,
 ) -> None:
-    """Add what frames have beyond their mean, squared, and times what those beside have.
+    """Add squared deviations of frames from their mean, and products with those of neighbours.
 
     Shapes: `counts` (t, y, x), `gain, offset` (y, x), `powers` (t,), `mean` (y, x), `change` (y,
     x), `squares, products` (y, x) and (2, y, x).
@@ -89,7 +89,7 @@ def add_scatter(
 
 @kernel()
 def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> None:
-    """Add an image squared, and times the mean of the pixels on both sides.
+    """Add the square of an image, and its product with the mean of both neighbours.
 
     Shapes: `image` (y, x), `squares` (y, x), `products` (2, y, x).
     """
@@ -106,6 +106,6 @@ def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> N
 
 @kernel()
 def _neighbour_range(index: int, size: int) -> tuple[int, int]:
-    """Give the places on both sides, at the border twice the one inside, alone twice itself."""
+    """Give both neighbours of an index; at the border twice the inner one, alone twice itself."""
     last = size - 1
     return min(abs(index - 1), last), max(last - abs(last - 1 - index), 0)

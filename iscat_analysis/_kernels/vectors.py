@@ -1,7 +1,7 @@
-"""Registers of eight numbers, for loops that Numba leaves scalar.
+"""Vector registers of eight numbers, for loops in which Numba uses none.
 
-They are written as the instructions of LLVM, which a processor has for eight numbers or puts
-together from smaller registers.
+They are written as instructions of LLVM, which uses a register for eight numbers or several smaller
+ones, as the processor has them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _FLAGS = ("contract", "nsz")
 
 
 class Code:
-    """Writes the instructions of a function of two arrays and the first of eight places."""
+    """Write the instructions of a function of two arrays and the first of eight indices."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, arguments: Any) -> None:
         self._b = builder
@@ -72,7 +72,7 @@ class Code:
         self._b.store(register, self._b.bitcast(pointer, register.type.as_pointer()), align=8)
 
     def parted(self, pointer: Any) -> tuple[list[Any], Any]:
-        """Read eight numbers: their whole parts, and a register of the rests."""
+        """Read eight numbers: their integer parts, and a register of their fractional parts."""
         number = self.load(pointer)
         whole = self._b.fptosi(number, ir.VectorType(_INDEX, LANES))
         rest = self._b.fsub(number, self._b.sitofp(whole, number.type), flags=_FLAGS)
@@ -137,9 +137,9 @@ def _lanes(numbers: Any) -> Any:
 
 
 def instructions(write: Callable[[Code], None], *, factors: bool = False) -> Callable[..., None]:
-    """Make a function for kernels of what writes its instructions.
+    """Make a function for kernels from a function that writes its instructions.
 
-    It takes two arrays, a place, and with `factors` a tuple of numbers.
+    It takes two arrays, an index, and with `factors` a tuple of numbers.
     """
 
     def written(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

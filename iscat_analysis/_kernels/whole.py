@@ -1,7 +1,7 @@
-"""Numbers that become indices.
+"""Conversion of computed numbers to indices.
 
-Kernels read memory without asking whether it is theirs, and an integer made of a number that is too
-large, or of none, is any integer.  Whatever is computed from data becomes an index here alone.
+Kernels do not check array bounds, and the integer part of a number that is too large, or of NaN, is
+undefined.  Only these functions convert numbers that depend on data to indices.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from iscat_analysis._kernels import kernel
 
 @kernel(_nrt=False)
 def within(x: float, low: float, high: float) -> float:
-    """Clip a number to a range; `low` in place of one that is not a number."""
+    """Clip a number to a range; NaN becomes `low`."""
     if not x > low:
         return low
     if x > high:
@@ -21,5 +21,5 @@ def within(x: float, low: float, high: float) -> float:
 
 @kernel(_nrt=False)
 def whole(x: float, low: int, high: int) -> int:
-    """Give the integer part of a number, clipped to a range; `low` where it is not a number."""
+    """Give the integer part of a number, clipped to a range; NaN becomes `low`."""
     return int(within(x, float(low), float(high)))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 FIRST, LAST = 5, 37
-"""Noll's indices on offer: piston and tilts move nothing, defocus is the focus."""
+"""Noll's indices that can be set: piston and tilts have no effect, defocus is the focus."""
 
 
 def orders(j: int) -> tuple[int, int]:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.optics.forward import PEAK_REACH, ForwardModel
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import PARAMETERS, FloatArray
 
@@ -120,7 +120,7 @@ def peak_gradient(
     Shapes: `own` (4,), `shared` (len(names).
     """
     spot = model.optics.wavelength_nm / model.optics.na
-    x, y, half = 0.0, 0.0, min(PEAK_REACH * spot, model.reach_nm - spot) / math.sqrt(2)
+    x, y, half = 0.0, 0.0, min(PEAK_SEARCH_RADIUS * spot, model.reach_nm - spot) / math.sqrt(2)
     while half > _PEAK_NM:
         axis = np.linspace(-half, half, _PEAK_POINTS)
         grid = PixelGrid(x + axis, y + axis, _PEAK_NM)

@@ -1,1 +1,1 @@
-"""What is the instrument?  Its camera from the noise, its mass scale from standards."""
+"""Which mass belongs to a contrast?  The mass scale from standards."""

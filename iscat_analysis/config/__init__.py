@@ -1,10 +1,10 @@
-"""The configuration: what the keys are, how files are read, and how single keys are changed.
+"""The configuration: its keys, how files are read, and how single keys are changed.
 
-The sections and their keys stand in `instrument`, `analysis` and `synthetic`, `values` says what
-these may be, and `schema` has the whole.  `configure` is the one way to a `Config`: files,
-mappings, keyword arguments and ``--set`` all go through it, so that the same keys give the same
-configuration and a later value wins over an earlier one in the same way.  `files` reads and writes
-TOML, and `renamed` keeps old names working for one release.
+`instrument`, `analysis` and `synthetic` have the sections and their keys, `values` the allowed
+values, and `schema` the whole configuration.  Only `configure` makes a `Config`: files, mappings,
+keyword arguments and ``--set`` all go through it, so that the same keys give the same configuration
+and a later value always replaces an earlier one.  `files` reads and writes TOML, and `renamed`
+accepts old names for one release.
 """
 
 from __future__ import annotations

@@ -20,11 +20,11 @@ from iscat_analysis.config.values import (
     length,
 )
 
-THINNEST_MPA_S = 0.1
+LOWEST_VISCOSITY_MPA_S = 0.1
 """Half the viscosity of ether, the thinnest liquid near room temperature."""
 
 TEMPERATURES_C = (-100.0, 250.0)
-"""Of liquids in a microscope; the upper end lies below their temperatures in kelvin."""
+"""Temperatures of liquids in a microscope; the upper end is below their values in kelvin."""
 
 
 class BackgroundConfig(Section):
@@ -37,9 +37,9 @@ class BackgroundConfig(Section):
     )
     frames: FramesOrAll | None = Field(
         None,
-        description='pre-binding frames [start, stop); absent in landing movies | "all": in mode '
-        "track, all analysed frames, particles included: their median, or with method fixed their "
-        "mean",
+        description='frames before binding [start, stop); absent in landing movies | "all": in '
+        "mode track, the median of all analysed frames with their particles, or with method fixed "
+        "their mean",
     )
     window_frames: Annotated[int, Field(ge=4)] | None = Field(
         None,
@@ -50,23 +50,23 @@ class BackgroundConfig(Section):
     )
     power_normalization: bool = Field(
         True,
-        description="divide out the laser power, estimated with the particles excluded, and its "
-        "flicker along rows or columns where they show one",
+        description="divide out the laser power, estimated without the particles, and the flicker "
+        "of rows or columns if they flicker",
     )
     drift_correction: Literal["auto"] | bool = Field(
         "auto",
-        description="landing movies: divide out the motion of the fixed pattern; auto, where it is "
-        "seen to move",
+        description='landing movies: divide out the motion of the fixed pattern; "auto": if it '
+        "moves",
     )
 
     @property
     def follows_pattern(self) -> bool:
-        """Whether the motion of the fixed pattern is divided out; "auto" is settled by a movie."""
+        """Whether the motion of the fixed pattern is divided out; for "auto", a movie decides."""
         return self.drift_correction is True
 
     @property
     def recorded(self) -> tuple[int, int] | None:
-        """Frames that were recorded before the particles; None where there are none."""
+        """Frames that were recorded before the particles; None if there are none."""
         return None if isinstance(self.frames, str) else self.frames
 
     @model_validator(mode="after")
@@ -80,7 +80,7 @@ class BackgroundConfig(Section):
             raise ValueError('method = "known" needs level_e, the known background level')
         if self.method == "sliding" and self.frames is not None:
             raise ValueError(
-                'method = "sliding" takes every frame against its neighbours: leave frames out, '
+                'method = "sliding" compares every frame with its neighbours: leave frames out, '
                 'or set method = "fixed"'
             )
         if self.method == "tracks" and self.frames is not None:
@@ -92,7 +92,7 @@ class BackgroundConfig(Section):
 
 
 class Detection(Section):
-    """What counts as a particle."""
+    """The search for particles."""
 
     false_alarms_per_movie: Positive = Field(
         0.1, description="expected number of detections in a movie of pure noise"
@@ -104,7 +104,7 @@ class Detection(Section):
 
     @property
     def sign(self) -> int:
-        """Sign of the contrast that is reported; 0 where both are."""
+        """Sign of the contrast that is reported; 0 if both are."""
         return {"both": 0, "bright": 1, "dark": -1}[self.polarity]
 
 
@@ -128,7 +128,7 @@ class Fit(Section):
     z_range_nm: tuple[
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
-    ] = Field((0.0, 1000.0), description="bounds of z where it is free")
+    ] = Field((0.0, 1000.0), description="bounds of z if it is free")
 
     @model_validator(mode="after")
     def _range(self) -> Fit:
@@ -142,7 +142,7 @@ class Fit(Section):
 
 
 def _no_pascal_seconds(viscosity: float) -> float:
-    if viscosity < THINNEST_MPA_S:
+    if viscosity < LOWEST_VISCOSITY_MPA_S:
         raise ValueError(
             f"{viscosity:g} mPa·s is less than any liquid has; if {viscosity:g} is in Pa·s, write "
             f"{1e3 * viscosity:g}"
@@ -169,16 +169,16 @@ class TrackConfig(Section):
         description='fitted per frame: "mass" (x, y, mass: a membrane) | "joint" (x, y, z, mass)',
     )
     max_step_nm: Annotated[Positive, length(1.0, LARGEST_NM)] = Field(
-        600.0, description="farthest that a particle goes from one frame to the next"
+        600.0, description="largest distance of a particle from one frame to the next"
     )
     memory_frames: Annotated[int, Field(ge=0, le=1000)] = Field(
-        3, description="frames in which a particle may be missed without losing its track"
+        3, description="frames in which a particle may be missed without ending its track"
     )
     min_frames: Annotated[int, Field(ge=1)] = Field(10, description="shorter tracks are left out")
     block_frames: Literal["auto"] | Annotated[int, Field(ge=20)] = Field(
         "auto",
-        description="frames with a background of their own, at most, tracks going on from block to "
-        'block | "auto": as many as fit into the memory and drift of the stage allows',
+        description="longest block of frames with one background; tracks continue from block to "
+        'block | "auto": as long as memory and drift of the stage allow',
     )
     viscosity_mpa_s: Annotated[Positive, AfterValidator(_no_pascal_seconds)] = Field(
         0.89, description="of the medium, for hydrodynamic diameters; water at 25 °C: 0.89"
@@ -192,7 +192,7 @@ class PosteriorConfig(Section):
     """Sampling of the posterior with emcee."""
 
     enabled: Literal["auto"] | bool = Field(
-        "auto", description='true | false | "auto": where events are few, not in landing movies'
+        "auto", description='true | false | "auto": if there are few events, not in landing movies'
     )
     walkers: Annotated[int, Field(ge=10, le=10_000, multiple_of=2)] = Field(
         32, description="even number"
@@ -201,10 +201,10 @@ class PosteriorConfig(Section):
         2000, description="per walker, burn-in included"
     )
     prior_mass_kda: tuple[Positive, Positive] | None = Field(
-        None, description="[mean, standard deviation] of a normal prior, as of a species"
+        None, description="[mean, standard deviation] of a normal prior, for example of a species"
     )
     prior_z_nm: tuple[NonNegative, Positive] | None = Field(
-        None, description="[mean, standard deviation] of a normal prior, as above a membrane"
+        None, description="[mean, standard deviation] of a normal prior, for example of a membrane"
     )
 
     @property
@@ -215,7 +215,7 @@ class PosteriorConfig(Section):
 
 
 class Compute(Section):
-    """Resources, and the seed of what the analysis draws."""
+    """Resources, and the seed of random numbers in the analysis."""
 
     workers: Annotated[int, Field(ge=1, le=1024)] = Field(2, description="threads")
     memory_limit_mb: Annotated[int, Field(ge=64)] = Field(
@@ -223,5 +223,5 @@ class Compute(Section):
     )
     seed: Annotated[int, Field(ge=0)] = Field(
         1,
-        description="of what the analysis draws: posteriors, injected particles, resampled species",
+        description="of random numbers: posteriors, injected particles, resampled species",
     )

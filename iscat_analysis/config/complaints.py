@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, in words: the key, the value, and what to write instead."""
+"""Messages for errors of a configuration: the key, the value, and what to write instead."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import SIMULATED
 from iscat_analysis.config.values import Section
 
-_ALIKE = 0.7  # of two words, as difflib measures it
+_LEAST_SIMILARITY = 0.7  # of two words, as difflib measures it
 _DECIMAL_COMMA = re.compile(r"\s*([-+]?\d+),(\d+)\s*")
 
 
 def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
-    """Put one of pydantic's errors into words."""
+    """Write the message for one of pydantic's errors."""
     unknown = item["type"] == "extra_forbidden"
     named = len(item["loc"]) - 1 if unknown else len(item["loc"])  # an unknown key may be "str"
     location = [
@@ -45,7 +45,7 @@ def complaint(item: Mapping[str, Any], called: Mapping[str, str]) -> str:
 
 
 def complaints(items: Iterable[Mapping[str, Any]], called: Mapping[str, str]) -> Iterator[str]:
-    """Put pydantic's errors into words."""
+    """Write the messages for pydantic's errors."""
     items = tuple(items)
     for item in items:
         others = (other for other in items if other is not item)
@@ -56,7 +56,7 @@ def complaints(items: Iterable[Mapping[str, Any]], called: Mapping[str, str]) ->
 
 
 def _nearest(word: str, location: list[str]) -> str:
-    """Give the key that was meant: of this section, else by its full name; empty where none is."""
+    """Give the key that was probably meant: of this section, else with its section; or nothing."""
     known = {key.lower(): key for key in known_keys(location)}
     small = word.lower()
     begun = [key for key in known if key.startswith(small)]
@@ -64,7 +64,7 @@ def _nearest(word: str, location: list[str]) -> str:
         return known[small if small in known else begun[0]]
     if small in Config.model_fields:
         return f"section [{small}]"
-    # [uncertainty] has keys of other sections, and nobody who writes those means an error
+    # [uncertainty] has the same keys as other sections, and is never the section that was meant
     sections = [
         section
         for section in Config.model_fields
@@ -72,7 +72,7 @@ def _nearest(word: str, location: list[str]) -> str:
     ]
     if sections and len(location) < 2:
         return " or ".join(f"{section}.{small}" for section in sections)
-    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_ALIKE)
+    near = difflib.get_close_matches(small, list(known), n=1, cutoff=_LEAST_SIMILARITY)
     return known[near[0]] if near else ""
 
 

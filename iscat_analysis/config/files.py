@@ -22,7 +22,7 @@ from iscat_analysis.text import in_toml
 
 @dataclass(frozen=True)
 class OpticsFile:
-    """What ``iscat calibrate optics`` measured of a microscope."""
+    """Optics that ``iscat calibrate optics`` measured."""
 
     optics: dict[str, Any]
     uncertainty: dict[str, Any]
@@ -78,7 +78,7 @@ def _check_sum(path: Path, template: Path, checksum: str) -> None:
 
 
 def _explain(text: str, message: str) -> str:
-    """Say what is meant where the parser of TOML says what it expected."""
+    """Explain an error of the TOML parser."""
     place = re.search(r"\(at line (\d+)", message)
     lines = text.splitlines()
     number = int(place[1]) if place else 0
@@ -124,7 +124,7 @@ def config_to_toml(
         isinstance(sections, Iterable)
         and all(isinstance(name, str) and name in known for name in sections)
     ):
-        raise ConfigError(f"`sections`: names what is no section; they are {', '.join(known)}")
+        raise ConfigError(f"`sections`: has an unknown name; the sections are {', '.join(known)}")
     blocks = []
     for name, field in type(config).model_fields.items():
         if sections is not None and name not in sections:
@@ -156,7 +156,7 @@ def _table_toml(key: str, table: Section) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Write a value as TOML has it."""
+    """Write a value in TOML."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, str):
@@ -196,7 +196,7 @@ def _anchor_paths(values: dict[str, Any], folder: Path) -> None:
 
 
 def with_absolute_paths(config: Config) -> Config:
-    """Name files so that a process that runs in another folder finds them."""
+    """Make the paths absolute, for a process that runs in another folder."""
     changed: dict[str, Any] = {}
     for section, keys in _PATH_KEYS.items():
         name, _, inner = section.partition(".")

@@ -1,4 +1,4 @@
-"""Sections of the instrument and of what it looks at: optics, camera, particle, mass scale."""
+"""Sections of the instrument and of the sample: optics, camera, particle, mass scale."""
 
 from __future__ import annotations
 
@@ -24,36 +24,36 @@ from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
 
 Index = Annotated[Positive, AfterValidator(refractive_index)]
 
-MOST_WAVES = 0.5
+LARGEST_ABERRATION = 0.5
 """Largest Zernike term over the wavelength; ten times that of a poor objective."""
 
 LARGEST_SD_NM = 100.0
-"""Largest spread of heights around a mean, half a fringe: beyond it, mode joint fits heights."""
+"""Largest standard deviation of heights, half a fringe: for more, use mode joint."""
 
-MOST_PASSES = 3.0
-"""Largest attenuation: what passes of the reference against what passes of the scattered light."""
+LARGEST_ATTENUATION = 3.0
+"""Largest attenuation: transmitted amplitude of the reference over that of scattered light."""
 
-PER_KDA = (1e-7, 0.01)
-"""Magnitudes of a contrast per kDa: a protein has some 1e-5, and of the larger one 100 kDa would
-change all light."""
+CONTRAST_PER_KDA = (1e-7, 0.01)
+"""Range of contrast per kDa: a protein has some 1e-5; at the upper limit, the contrast of 100 kDa
+would be 1."""
 
 DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "protein": 1350.0}
-"""Densities of the kinds of particles; protein as mass photometry has it."""
+"""Densities of the kinds of particles; for protein, the usual value in mass photometry."""
 
 USUAL_HEIGHT_NM = 5.0
-"""Height of a protein on glass, at which masses are calibrated unless something else is said."""
+"""Height of a protein on glass, at which masses are calibrated by default."""
 
 UNKNOWN_SD_NM = 20.0
-"""Spread of heights before a movie has told them: a tenth of a fringe."""
+"""Standard deviation of heights before they are learned from a movie: a tenth of a fringe."""
 
 TYPICAL_DIAMETER_NM = 30.0
-"""Of a particle whose size is not given, unless it is a protein."""
+"""Diameter of a particle if none is given, unless it is a protein."""
 
 TYPICAL_PROTEIN_KDA = 150.0
-"""Mass of a protein where none is given."""
+"""Mass of a protein if none is given."""
 
 ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
-"""Zernike terms on offer, by Noll's index."""
+"""Zernike terms that can be set, by Noll's index."""
 
 MEASURABLE = (
     "focus_nm",
@@ -64,7 +64,7 @@ MEASURABLE = (
     "polarization_deg",
     *ABERRATIONS,
 )
-"""Parameters of the optics that pictures can tell, and that have a derivative."""
+"""Parameters of the optics that can be learned from images, and that have a derivative."""
 
 
 def _noll_names(terms: dict[str, float]) -> dict[str, float]:
@@ -80,7 +80,7 @@ def _noll_names(terms: dict[str, float]) -> dict[str, float]:
 
 
 class OpticsCovariance(Section):
-    """Errors of measured optics, as ``[covariance]`` of ``optics.toml`` has them."""
+    """Errors of measured optics, section ``[covariance]`` of ``optics.toml``."""
 
     names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
     matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
@@ -107,7 +107,7 @@ class Optics(Section):
     """The microscope (physics.md, section 1)."""
 
     file: str | None = Field(
-        None, description="of `iscat calibrate optics`; its values win over this section's"
+        None, description="of `iscat calibrate optics`; its values replace those of this section"
     )
     wavelength_nm: Annotated[Positive, length(*WAVELENGTH_NM)] = Field(
         525.0, description="vacuum wavelength"
@@ -153,17 +153,17 @@ class Optics(Section):
         "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'
     )
     axial: Literal["stage", "refocus"] = Field(
-        "stage", description='what a moving particle holds fixed: "stage" | "refocus"'
+        "stage", description='fixed in derivatives along z: "stage" | "refocus": the focus follows'
     )
     emission: Literal["reciprocal", "dong2021"] = Field(
         "reciprocal",
-        description='"reciprocal" (energy-conserving) | "dong2021" (the paper\'s own)',
+        description='"reciprocal" (conserves energy) | "dong2021" (as in the paper)',
     )
     psf: Literal["model", "measured"] = Field(
-        "model", description='"model" | "measured" (the picture in template; mode mass only)'
+        "model", description='"model" | "measured" (the image in template; mode mass only)'
     )
     template: str | None = Field(
-        None, description="of `iscat calibrate optics --measured`, whose optics.toml names it"
+        None, description="file of `iscat calibrate optics --measured`, named in its optics.toml"
     )
     calibrate: Literal["auto", "always", "never"] = Field(
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
@@ -188,10 +188,10 @@ class Optics(Section):
                 "whole pupil is attenuation without mask_na"
             )
         for name, size in self.aberrations_nm.items():
-            if abs(size) > MOST_WAVES * self.wavelength_nm:
+            if abs(size) > LARGEST_ABERRATION * self.wavelength_nm:
                 raise ValueError(
-                    f"aberrations_nm.{name} = {size:g} exceeds {MOST_WAVES:g} wavelengths rms: "
-                    "give nanometres of path, rms over the pupil"
+                    f"aberrations_nm.{name} = {size:g} exceeds {LARGEST_ABERRATION:g} wavelengths "
+                    "rms: give nanometres of path, rms over the pupil"
                 )
         if self.na >= self.n_immersion:
             raise ValueError(
@@ -210,17 +210,17 @@ class Optics(Section):
             )
         if self.psf == "measured" and self.scheme == "darkfield":
             raise ValueError(
-                'psf = "measured" needs an interferometric scheme: in dark field the picture is a '
-                "square of what the template holds"
+                'psf = "measured" needs an interferometric scheme: in dark field the image is the '
+                "square of the field, which the template does not have"
             )
         if self.scheme == "iscat" and self.n_glass == self.n_sample:
             raise ValueError(
                 "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
             )
-        if self.attenuation > MOST_PASSES:
+        if self.attenuation > LARGEST_ATTENUATION:
             raise ValueError(
-                f"attenuation = {self.attenuation:g} is more than {MOST_PASSES:g}: it is the part "
-                "of the reference's amplitude that passes, as 0.1 for a tenth"
+                f"attenuation = {self.attenuation:g} is more than {LARGEST_ATTENUATION:g}: it is "
+                "the part of the reference's amplitude that passes, as 0.1 for a tenth"
             )
         if self.scheme != "darkfield" and self.attenuation == 0:
             raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
@@ -228,17 +228,17 @@ class Optics(Section):
 
 
 AUTO = "auto"
-"""In place of a number of the camera: it is learned from the movie."""
+"""Replaces a number of the camera that is measured from the movie."""
 
 ASSUMED: Mapping[str, float] = {"gain_e_per_adu": 1.0, "offset_adu": 0.0, "read_noise_e": 0.0}
-"""What is taken where nothing tells: counts are photoelectrons, and there are none in the dark."""
+"""Values if nothing else is known: counts are photoelectrons, and there are none in the dark."""
 
 
 class CameraConfig(Section):
     """The detector, in the sample plane."""
 
     pixel_size_nm: Annotated[Positive, AfterValidator(plausible_pixel)] | None = Field(
-        None, description="in the sample plane; taken from the TIFF metadata where absent"
+        None, description="in the sample plane; absent: taken from the metadata"
     )
     gain_e_per_adu: Positive | str = Field(
         AUTO,
@@ -247,8 +247,8 @@ class CameraConfig(Section):
     )
     offset_adu: Finite | str = Field(
         AUTO,
-        description='counts in the dark: a number, a map, or "auto": of dark frames, or where the '
-        "light of the pixels ends",
+        description='counts in the dark: a number, a map, or "auto": from dark frames, or from '
+        "flicker and noise of the pixels",
     )
     read_noise_e: NonNegative | str = Field(
         AUTO,
@@ -256,46 +256,46 @@ class CameraConfig(Section):
     )
     response: str | None = Field(
         None,
-        description="CSV file of counts and photoelectrons, of a camera that is not linear",
+        description="CSV file of counts and photoelectrons, for a camera that is not linear",
     )
     well_depth_e: Positive | None = Field(
         None, description="full well: counts at or above it are flagged as saturated"
     )
-    exposure_ms: Positive | None = Field(None, description="taken from the metadata where absent")
-    frame_rate_hz: Positive | None = Field(None, description="taken from the metadata where absent")
+    exposure_ms: Positive | None = Field(None, description="absent: taken from the metadata")
+    frame_rate_hz: Positive | None = Field(None, description="absent: taken from the metadata")
     samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(
         1, description="per axis, to integrate over pixels; 1 = point sampling at pixel centres"
     )
 
     @property
     def assumed(self) -> CameraConfig:
-        """The camera where there is no movie to learn from: what is "auto" has a stated number."""
+        """The camera without a movie: "auto" is replaced by an assumed number."""
         numbers = {key: value for key, value in ASSUMED.items() if getattr(self, key) == AUTO}
         return self.model_copy(update=numbers) if numbers else self
 
 
 class Particle(Section):
-    """What scatters."""
+    """The particle that scatters."""
 
     kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = Field(
         "protein", description='"gold" | "silica" | "polystyrene" | "protein" | "custom"'
     )
     permittivity: tuple[float, float] | None = Field(
-        None, description="relative, [re, im]; overrides the kind's own"
+        None, description="relative, [re, im]; replaces that of the kind"
     )
     index: Positive | None = Field(None, description="refractive index, in place of permittivity")
-    density_kg_m3: Positive | None = Field(None, description="overrides the kind's own")
+    density_kg_m3: Positive | None = Field(None, description="replaces that of the kind")
     mass_kda: Positive | None = Field(
-        None, description="start value, and the truth of a simulation"
+        None, description="start value, and the true mass in a simulation"
     )
     diameter_nm: Annotated[Positive, length(0.1, 1e4)] | None = Field(
         None, description="in place of mass_kda"
     )
     height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         USUAL_HEIGHT_NM,
-        description='z where it is fixed; start value elsewhere | "contact": radius of particle + '
-        'linker_nm | "auto": 5 nm for optics and mass scale, and learned from the movie for the '
-        "particles, mean and spread",
+        description='z if it is fixed, else its start value | "contact": radius of the particle + '
+        'linker_nm | "auto": 5 nm for optics and mass scale; for the particles, mean and spread '
+        "are learned from the movie",
     )
     linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         0.0, description='between coverslip and particle, for height_nm = "contact"'
@@ -306,18 +306,18 @@ class Particle(Section):
     )
     wiggle_nm: Annotated[NonNegative, length(0.0, LARGEST_SD_NM)] = Field(
         0.0,
-        description="standard deviation along each axis of the places between which particles move "
-        "while they are seen, as on a tether",
+        description="standard deviation of a particle's position along each axis, if it wiggles "
+        "as on a tether",
     )
     learned_height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
         None,
-        description='mean of the heights that a movie showed, where height_nm = "auto" found it; '
-        "the optics and the mass scale stay those of height_nm",
+        description='mean height that height_nm = "auto" learned from a movie; optics and mass '
+        "scale stay those of height_nm",
     )
     photons_per_frame: Positive | None = Field(
         None,
         description="dark field: scattered photons collected per frame from a particle of this "
-        "mass, which is the scale of masses there",
+        "mass; it sets the mass scale",
     )
 
     @model_validator(mode="after")
@@ -333,7 +333,7 @@ class Particle(Section):
                 raise ValueError('kind = "custom" needs density_kg_m3')
         if self.linker_nm and self.height_nm != "contact":
             raise ValueError(
-                f"linker_nm = {self.linker_nm:g} is of heights of contact, and height_nm is "
+                f'linker_nm = {self.linker_nm:g} needs height_nm = "contact", and height_nm is '
                 f'{self.height_nm}: set height_nm = "contact", or leave linker_nm out'
             )
         if self.learned_height_nm is not None and self.height_nm != "auto":
@@ -345,12 +345,12 @@ class Particle(Section):
 
     @property
     def density(self) -> float:
-        """Its own density, or that of its kind [kg/m³]."""
+        """Density that is given, or that of the kind [kg/m³]."""
         return self.density_kg_m3 or DENSITIES_KG_M3.get(self.kind, 1000.0)
 
     @property
     def nominal_mass_kda(self) -> float:
-        """Mass that is given, by itself or by a diameter, else a typical one."""
+        """Mass that is given, as a mass or a diameter, else a typical one."""
         if self.mass_kda is not None:
             return self.mass_kda
         if self.diameter_nm is None and self.kind == "protein":
@@ -363,12 +363,12 @@ class Particle(Section):
         return self._seated_nm(self.nominal_mass_kda)
 
     def mean_height_nm(self, mass_kda: float) -> float:
-        """Height at which a particle is expected: as given, or of contact, or as it was learned.
+        """Height at which a particle is expected: given, of contact, or learned.
 
         Parameters
         ----------
         mass_kda : float
-            Its mass [kDa], which is its size for ``height_nm = "contact"``.
+            Its mass [kDa], which gives its radius for ``height_nm = "contact"``.
 
         Returns
         -------
@@ -385,7 +385,7 @@ class Particle(Section):
         return USUAL_HEIGHT_NM if self.height_nm == "auto" else self.height_nm
 
     def held_at(self, height_nm: float) -> Particle:
-        """Give a particle whose height is known.
+        """Give the same particle with a known height.
 
         Parameters
         ----------
@@ -410,7 +410,7 @@ class Particle(Section):
 
     @property
     def height_prior_sd_nm(self) -> float:
-        """Standard deviation of the prior of heights; wide before a movie has told them."""
+        """Standard deviation of the prior of heights; wide before they are learned from a movie."""
         return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
 
 
@@ -428,10 +428,10 @@ class StandardsCamera(Section):
 
 
 class Calibration(Section):
-    """Contrast against mass; present, it replaces the model's absolute scale.
+    """Contrast against mass; if present, it replaces the absolute scale of the model.
 
-    Signed peak contrast = gradient·mass + sign(mass)·offset, at the optics of the standards; at
-    other optics the model carries it over.
+    Signed peak contrast = gradient·mass + sign(mass)·offset, with the optics of the standards; for
+    other optics the model converts it.
     """
 
     gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
@@ -450,41 +450,41 @@ class Calibration(Section):
         None, description="keys of [optics] with which the standards were analysed"
     )
     covariance: OpticsCovariance | None = Field(
-        None, description="of these where they were learned, { names, matrix }"
+        None, description="of these if they were learned, { names, matrix }"
     )
     height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
         None, description="particle.height_nm with which the standards were analysed"
     )
     camera: StandardsCamera | None = Field(None, description="with which they were recorded")
     optics_assumed: bool = Field(
-        False, description="true: nobody recorded the optics; those configured are taken"
+        False, description="true: the optics are not known; those configured are assumed"
     )
 
     @model_validator(mode="after")
     def _usable(self) -> Calibration:
         if self.gradient_per_kda == 0:
             raise ValueError("gradient_per_kda = 0 says nothing about mass")
-        least, most = PER_KDA
+        least, most = CONTRAST_PER_KDA
         if not least <= abs(self.gradient_per_kda) <= most:
             raise ValueError(
-                f"gradient_per_kda = {self.gradient_per_kda:g} has not between {least:g} and "
-                f"{most:g} of all light per kDa: give contrast per kDa, as -3.1e-5, not in per "
-                "cent or ppm, nor per Da or MDa"
+                f"gradient_per_kda = {self.gradient_per_kda:g} is not between {least:g} and "
+                f"{most:g}: give contrast per kDa, as -3.1e-5, not in per cent or ppm, nor per "
+                "Da or MDa"
             )
         return self
 
 
 class Uncertainty(Section):
-    """Standard deviations of inputs that nobody measured; 0 turns one off.
+    """Standard deviations of inputs that were not measured; 0 turns one off.
 
-    Where standards were recorded with the same optics, they share these errors, which cancel.
+    If standards were recorded with the same optics, they have the same errors, which cancel.
     """
 
     wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
     n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
     n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
     height_nm: NonNegative = Field(
-        2.0, description="of the mean height of particles, where particle.height_nm is fixed"
+        2.0, description="of the mean height of particles, if particle.height_nm is fixed"
     )
     magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
         0.005, description="of camera.pixel_size_nm, as a share of it"

@@ -1,8 +1,8 @@
-"""The one way to a configuration.
+"""Make a configuration.
 
-A configuration starts from a file, a mapping, another configuration or the defaults, and keys are
-then changed one after another.  Whether a change comes from ``--set``, from an option, from
-``settings=`` or from a keyword argument makes no difference to what it does.
+A configuration starts from a file, a mapping, another configuration or the defaults; keys are then
+changed one after another.  A change from ``--set``, from an option, from ``settings=`` or from a
+keyword argument always has the same effect.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from iscat_analysis.config.values import ALL
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.reading import toml_of
 
-_RIVALS = {
+_EXCLUSIVE_KEYS = {
     ("particle", "mass_kda"): ("diameter_nm",),
     ("particle", "diameter_nm"): ("mass_kda",),
     ("particle", "index"): ("permittivity",),
@@ -31,7 +31,7 @@ _RIVALS = {
     ("simulation", "count"): ("events",),
     ("simulation", "events"): ("count", "leavings"),
 }
-"""Keys that say the same in two ways: the one that is given later removes the other."""
+"""Keys that exclude each other: the one that is given later removes the other."""
 
 
 def configure(
@@ -49,14 +49,14 @@ def configure(
         A TOML file, sections of keys as in ``{"optics": {"na": 1.3}}`` or
         ``{"optics.na": 1.3}``, or a configuration to change; without it, the defaults.
     settings : mapping of str to Any, or iterable of str, optional
-        Changes, which win over the source, in their order: ``{"optics.na": 1.3, "fit.frames":
-        (200, 400)}``, or text as in ``["optics.na=1.3"]``.  None as a value unsets a key.  Where
-        two keys exclude each other, as ``particle.mass_kda`` and ``particle.diameter_nm`` do, the
-        later one replaces the earlier.
+        Changes, which replace values of the source, in their order:
+        ``{"optics.na": 1.3, "fit.frames": (200, 400)}``, or text as in ``["optics.na=1.3"]``.
+        None as a value unsets a key.  If two keys exclude each other, as ``particle.mass_kda``
+        and ``particle.diameter_nm`` do, the later one replaces the earlier.
     arguments : mapping of str to Any, optional
-        Further changes, which win over `settings`.
+        Further changes, which replace `settings`.
     called : mapping of str to str, optional
-        What messages call a key that reached this function under another name, as in
+        Names in messages of keys that the caller has under another name, as in
         ``{"fit.mode": "mode"}``.
 
     Returns
@@ -155,7 +155,8 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
             texts = [settings]
         if not all(isinstance(text, str) for text in texts):
             raise ConfigError(
-                "`settings`: holds what is no text; give a mapping, or texts as optics.na=1.42"
+                "`settings`: has an item that is not text; give a mapping, or texts such as "
+                "optics.na=1.42"
             )
         return [_parsed(text) for text in texts]
     found = []
@@ -171,7 +172,7 @@ def _changes(settings: Mapping[str, Any] | Iterable[str] | None) -> list[Change]
 
 
 def _parsed(text: str) -> Change:
-    """Read ``section.key=value`` as ``--set`` has it."""
+    """Read ``section.key=value``, the argument of ``--set``."""
     name, equals, written = text.partition("=")
     section, dot, key = name.strip().partition(".")
     if not (equals and dot and section and key):
@@ -214,7 +215,7 @@ def _change(
         table.pop(key, None)
         return
     table[key] = value
-    for rival in _RIVALS.get((section, key), ()) if exclude else ():
+    for rival in _EXCLUSIVE_KEYS.get((section, key), ()) if exclude else ():
         table.pop(rival, None)
 
 
@@ -228,7 +229,7 @@ _WITHOUT_FRAMES = ("sliding", "tracks")
 
 
 def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> None:
-    """Let a change decide anew between a fixed and a sliding background.
+    """Choose again between a fixed and a sliding background after a change.
 
     A configuration that is changed names its method, which followed from the frames, the scheme and
     the mode that it had.  A method that is among the changes is taken as it is, and removes frames

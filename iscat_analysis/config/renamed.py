@@ -30,7 +30,7 @@ def rename(values: dict[str, Any]) -> None:
 
 
 def _name_all_frames(values: dict[str, Any]) -> None:
-    """Say of which frames a median is, which without frames meant all of them in mode track."""
+    """Name the frames of a median; without frames it meant all of them in mode track."""
     background, fit, optics = (values.get(name) for name in ("background", "fit", "optics"))
     if not (isinstance(background, dict) and isinstance(fit, dict)):
         return

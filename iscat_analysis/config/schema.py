@@ -1,4 +1,4 @@
-"""The whole configuration: its sections, and what one asks of another.
+"""The whole configuration: its sections, and conditions between them.
 
 Lengths are nm, masses kDa, counts photoelectrons; ranges are half-open ``[start, stop)`` frames;
 complex numbers are ``[re, im]``.  The description of each field is what `iscat config` prints
@@ -103,13 +103,13 @@ class Config(Section):
     def _template_suits_mode(self) -> Config:
         if self.optics.psf == "measured" and self.fit.mode != "mass":
             raise ValueError(
-                f'fit.mode = "{self.fit.mode}" needs the picture at every height, and optics.psf = '
+                f'fit.mode = "{self.fit.mode}" needs the image at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
             )
         spread = self.particle.height_prior_sd_nm
         if self.optics.psf == "measured" and spread:
             raise ValueError(
-                'optics.psf = "measured" has the picture at one height: with it set '
+                'optics.psf = "measured" has the image at one height: with it set '
                 "particle.height_sd_nm = 0 and particle.height_nm to a number"
             )
         if self.optics.psf == "measured" and self.particle.wiggle_nm:
@@ -149,7 +149,7 @@ class Config(Section):
 
     @property
     def samples_posterior(self) -> bool:
-        """Whether posteriors are sampled: as asked, else where events are few."""
+        """Whether posteriors are sampled: as configured, else if there are few events."""
         if self.fit.mode == "track":
             return False
         if self.posterior.enabled == "auto":

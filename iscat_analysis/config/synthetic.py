@@ -1,4 +1,4 @@
-"""Sections of what is not measured: a simulated movie, and the set-up of bounds."""
+"""Sections of simulations and bounds: a simulated movie, and the set-up of bounds."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from iscat_analysis.config.values import (
 )
 
 MOST_FRAMES = 10_000_000
-"""No movie that is simulated is longer; particles that move have places in all of its frames."""
+"""Longest simulated movie; particles that move have positions in all of its frames."""
 
-_MOST_PLACES = 100_000_000
+_MOST_POSITIONS = 100_000_000
 
 
 class SimulatedEvent(Section):
-    """One particle that appears, and may leave."""
+    """One particle that lands, and may leave."""
 
     frame: Annotated[int, Field(ge=0)] = Field(description="first frame with the particle")
     leave: Annotated[int, Field(ge=1)] | None = Field(
@@ -46,7 +46,7 @@ class SimulatedMover(Section):
     """Particles of one kind that diffuse."""
 
     count: Annotated[int, Field(ge=1, le=100_000)] = Field(
-        1, description="in the field in their first frame; as many enter as leave"
+        1, description="in the field in the first frame; as many enter as leave later"
     )
     d_um2_s: NonNegative = Field(description="diffusion coefficient along each axis, µm²/s")
     mass_kda: Positive | None = Field(None, description="default particle.mass_kda")
@@ -54,13 +54,13 @@ class SimulatedMover(Section):
         None, description="in place of mass_kda, of the material of [particle]"
     )
     space: Literal["membrane", "volume"] = Field(
-        "membrane", description='"membrane": z is fixed | "volume": above z = 0, which reflects'
+        "membrane", description='"membrane": z is fixed | "volume": above a wall at z = 0'
     )
     z_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="at first; default particle.height_nm, below a ceiling anywhere"
+        None, description="at first; default particle.height_nm, with a ceiling random below it"
     )
     ceiling_nm: Annotated[Positive, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="volume: a height that reflects too"
+        None, description="volume: height of a second wall that reflects"
     )
     drift_um_s: tuple[Finite, Finite] = Field(
         (0.0, 0.0), description="velocity along x and y, µm/s"
@@ -68,12 +68,12 @@ class SimulatedMover(Section):
     confinement_nm: Annotated[Positive, length(1.0, LARGEST_NM)] | None = Field(
         None, description="side of a square whose walls reflect, one for each particle"
     )
-    frame: Annotated[int, Field(ge=0)] = Field(0, description="first frame with them")
+    frame: Annotated[int, Field(ge=0)] = Field(0, description="first frame with the particles")
     leave: Annotated[int, Field(ge=1)] | None = Field(
         None, description="first frame without them again"
     )
     x_px: Finite | None = Field(
-        None, description="column at first, of a single particle; absent: anywhere"
+        None, description="column at first, of a single particle; absent: random"
     )
     y_px: Finite | None = Field(None, description="row at first, downwards")
 
@@ -87,8 +87,8 @@ class SimulatedMover(Section):
             raise ValueError("give x_px and y_px, or neither")
         if self.x_px is not None and self.count != 1:
             raise ValueError(
-                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the place "
-                "out, or give each a block of its own"
+                f"count = {self.count} particles cannot all begin at x_px, y_px: leave the "
+                "position out, or give each particle its own block"
             )
         if self.ceiling_nm is not None:
             if self.space == "membrane":
@@ -128,7 +128,7 @@ class Simulation(Section):
     events: tuple[SimulatedEvent, ...] = Field((), description="each particle, placed by hand")
     movers: tuple[SimulatedMover, ...] = Field((), description="particles that diffuse, by kind")
     count: Annotated[int, Field(ge=0, le=1_000_000)] | None = Field(
-        None, description="landings at random places and times, in place of events; 0: a blank"
+        None, description="landings at random positions and times, instead of events; 0: a blank"
     )
     leavings: Annotated[int, Field(ge=0)] = Field(
         0, description="how many of the count leave before the movie ends"
@@ -144,10 +144,10 @@ class Simulation(Section):
         if self.leavings and (self.count is None or self.leavings > self.count):
             raise ValueError(f"leavings = {self.leavings} needs a count at least as large")
         moving = sum(mover.count for mover in self.movers)
-        if moving * self.frames > _MOST_PLACES:
+        if moving * self.frames > _MOST_POSITIONS:
             raise ValueError(
-                f"{moving} movers in frames = {self.frames} have {moving * self.frames} places, "
-                f"more than {_MOST_PLACES}: simulate fewer, or a shorter movie"
+                f"{moving} movers in frames = {self.frames} have {moving * self.frames} positions, "
+                f"more than {_MOST_POSITIONS}: simulate fewer, or a shorter movie"
             )
         for number, event in enumerate(self.events):
             inside = (
@@ -189,11 +189,11 @@ class BoundsConfig(Section):
     photons_per_pixel: Positive = Field(
         1e4, description="background per frame; dark field: as in [simulation]"
     )
-    n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: the background is known")
+    n_before: Annotated[int, Field(ge=0)] = Field(200, description="0: known background")
     n_after: Annotated[int, Field(ge=1)] = Field(200, description="frames with the particle")
     false_alarm_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
-        1e-3, description="of the smallest mass that is detected: that noise is taken for it"
+        1e-3, description="for the smallest detected mass: that noise is taken for a particle"
     )
     miss_probability: Annotated[float, Field(gt=0, lt=0.5)] = Field(
-        0.05, description="of the smallest mass that is detected: that it is not found"
+        0.05, description="for the smallest detected mass: that the particle is not found"
     )

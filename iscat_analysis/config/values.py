@@ -1,4 +1,4 @@
-"""What values the keys of a configuration may have: modes, lengths, ranges of frames; `Section`."""
+"""Allowed values of the keys of a configuration: modes, lengths, ranges of frames; `Section`."""
 
 from __future__ import annotations
 
@@ -49,25 +49,25 @@ def _ordered(frames: tuple[int, int]) -> tuple[int, int]:
 
 
 ALL = "all"
-"""In place of a range of frames: all that are analysed."""
+"""Replaces a range of frames: all analysed frames."""
 
 WAVELENGTH_NM = (200.0, 3000.0)
-"""Vacuum wavelengths that a light microscope uses [nm]."""
+"""Range of vacuum wavelengths of a light microscope [nm]."""
 
 LARGEST_NM = 1e5
-"""No height, focus or fitted square is larger [nm]."""
+"""Largest height, focus or side of a fitted square [nm]."""
 
 PIXEL_NM = (1.0, 2000.0)
-"""Pixel sizes in the sample plane that a microscope can have [nm]; outside, the unit is wrong."""
+"""Range of pixel sizes in the sample plane [nm]; outside, the unit is wrong."""
 
 INDICES = (1.0, 4.5)
-"""Refractive indices of air, oils, glasses and transparent semiconductors."""
+"""Range of refractive indices: air, oils, glasses and transparent semiconductors."""
 
 _UNITS_NM = {"micrometres": 1e3, "millimetres": 1e6, "metres": 1e9, "ångström": 0.1}
 
 
 def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
-    """Say which unit an impossible length was probably written in."""
+    """Name the probable unit of a length outside its range."""
     for unit, nanometres in _UNITS_NM.items():
         converted = value * nanometres
         if low_nm <= abs(converted) <= high_nm:
@@ -76,7 +76,7 @@ def unit_guess(value: float, low_nm: float, high_nm: float) -> str:
 
 
 def plausible_pixel(size_nm: float) -> float:
-    """Return a pixel size, unless no microscope has it."""
+    """Return a pixel size; refuse one that no microscope has."""
     low, high = PIXEL_NM
     if not low <= size_nm <= high:
         raise ValueError(
@@ -87,7 +87,7 @@ def plausible_pixel(size_nm: float) -> float:
 
 
 def length(low_nm: float, high_nm: float) -> AfterValidator:
-    """Accept lengths whose magnitude lies in a range, and guess the unit of the others."""
+    """Accept lengths whose magnitude is in a range, and guess the unit of the others."""
 
     def check(value: float) -> float:
         if low_nm <= abs(value) <= high_nm:
@@ -100,7 +100,7 @@ def length(low_nm: float, high_nm: float) -> AfterValidator:
 
 
 def refractive_index(index: float) -> float:
-    """Return a refractive index, unless nothing that is transparent has it."""
+    """Return a refractive index; refuse one that no transparent material has."""
     low, high = INDICES
     if not low <= index <= high:
         raise ValueError(
@@ -125,7 +125,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class _Called(ModelMetaclass):
-    """What makes a section from keyword arguments: what is wrong is said in the program's words."""
+    """Make a section from keyword arguments, with the program's own messages for errors."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
         try:

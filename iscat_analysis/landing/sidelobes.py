@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from iscat_analysis._kernels.sliding import in_shadow
+from iscat_analysis._kernels.sliding import near_earlier_peaks
 from iscat_analysis.landing.neighbours import Step
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, RINGS, is_hidden, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
@@ -61,7 +61,7 @@ class SidelobeFilter:
         """
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
         reach, side = STRIDES * self.stride, self.roi_px
-        hidden: list[bool] = in_shadow(
+        hidden: list[bool] = near_earlier_peaks(
             table, (reach, reach + self.stride), (NEAR * side, side, LARGEST_IMAGE * side),
             (SIDELOBE, FAR_LOBE),
         ).tolist()  # fmt: skip

@@ -1,7 +1,7 @@
-"""What the microscope's pupil does to the scattered light (microscope.md, section 2).
+"""The pupil of the microscope and its effect on the scattered light (microscope.md, section 2).
 
-Polarisation, analyser, mask, aberrations and the phase of the reference, on a quadrature of polar
-angles θ and of azimuths φ; and the Fourier series along φ that the field is made of.
+Polarisation, analyser, mask, aberrations and the phase of the reference are evaluated on a
+quadrature of polar angles θ and azimuths φ; the field is computed from a Fourier series along φ.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 NEAR_CRITICAL = 0.98
-"""NA over n_sample from which the quadrature minds the critical angle."""
+"""NA over n_sample above which the quadrature treats the critical angle."""
 
 NEGLIGIBLE = 1e-8
 """Share of the pupil's light amplitude below which azimuthal harmonics are left out."""
@@ -77,7 +77,7 @@ class Aperture:
         return total
 
     def polarised(self, phi: FloatArray) -> ComplexArray:
-        """Wave without its aberrations: along the reference's polarisation, and across it.
+        """Wave without aberrations: components along the reference's polarisation and across it.
 
         Shapes: `phi` (m,), result (2, n, m).
         """
@@ -89,7 +89,7 @@ class Aperture:
         return np.stack([p * c**2 + s * d**2, (p - s) * (c * d)])
 
     def turning(self, phi: FloatArray) -> ComplexArray:
-        """Slope of `polarised` with the direction of linear light [1/rad], shape (2, n, m)."""
+        """Slope of `polarised` along the angle of linear polarisation [1/rad], shape (2, n, m)."""
         difference = (self.pupil.t_p_cos - self.pupil.t_s)[:, None]
         turned = 2 * (phi - math.radians(self.optics.polarization_deg))
         return np.stack([difference * np.sin(turned), -difference * np.cos(turned)])

@@ -1,4 +1,4 @@
-"""Light that a particle sends into the pupil: how much, and in photons (physics.md, section 1)."""
+"""Scattered light that the pupil collects, as an area and in photons (physics.md, section 1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures of several particles of one kind on the same pixels."""
+"""Images of several particles of one kind on the same pixels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 
 def signals_within(model: ForwardModel, grid: PixelGrid, theta: FloatArray) -> FloatArray:
-    """Draw particles, each by itself, that are within the reach of their model.
+    """Draw each particle alone, if it is within the reach of its model.
 
     Shapes: `theta` (n, 4), result (n, ny, nx).
     """

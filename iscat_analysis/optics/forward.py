@@ -1,7 +1,7 @@
 """From a configuration to its forward model: optics, particle and camera → `ForwardModel`.
 
-The amplitude of the scattered field over that of the reference is put together here, and the field
-is tabulated as the pupil's symmetry allows (D21, section II; physics.md, sections 1–3 and 8).
+This module computes the amplitude of the scattered field over that of the reference, and tabulates
+the field as the symmetry of the pupil allows (D21, section II; physics.md, sections 1–3 and 8).
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ __all__ = [
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-PEAK_REACH = 4.0
-"""Distance, over λ/NA, up to which the peak contrast that a calibration is about is looked for: out
-of focus it lies on a ring, and a model made for a few pixels must have the scale of any other."""
+PEAK_SEARCH_RADIUS = 4.0
+"""Largest distance, over λ/NA, at which the peak contrast of a calibration is searched: out of
+focus the peak lies on a ring, and the mass scale must not depend on the size of a model."""
 
 DONG2021_FIELD_NODES = 110
 """Nodes of the rectangle rule in D21's program for fields."""
 
-_STANDARDS_KEPT = 16  # optics of standards whose contrast per kDa is at hand
+_STANDARDS_KEPT = 16  # cached optics of standards, with their contrast per kDa
 
 
 def forward_model(
@@ -81,7 +81,7 @@ def forward_model(
     """Build the forward model of a configuration."""
     optics = config.optics
     if config.calibration is not None:
-        reach_nm = max(reach_nm, PEAK_REACH * optics.wavelength_nm / optics.na)
+        reach_nm = max(reach_nm, PEAK_SEARCH_RADIUS * optics.wavelength_nm / optics.na)
     height = config.particle.nominal_height_nm
     matter = material(config.particle, optics.wavelength_nm)
     k = 2 * math.pi / optics.wavelength_nm
@@ -146,7 +146,7 @@ def forward_model(
 
 
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
-    """Put a measured picture in the place of the computed one."""
+    """Replace the computed image by a measured one."""
     wave = MeasuredField(template, peak_per_amplitude(model), model.reach_nm)
     return replace(model, wave=wave, scale=MassScale())
 
@@ -168,7 +168,7 @@ def signed_peak(model: ForwardModel) -> float:
 def _pupil(
     optics: Optics, reach_nm: float, sample_nm: float, oil_nm: float, nodes: int | None
 ) -> Aperture:
-    """Pupil with as many nodes as its phase turns; optical paths in sample and oil [nm]."""
+    """Pupil with enough nodes for its phase; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
     k = 2 * math.pi / optics.wavelength_nm
     critical = critical_angle(optics)
@@ -219,7 +219,7 @@ def _wave(
 
 
 def _lowest_nm(config: Config) -> float:
-    """Give the lowest height that a normal prior lets a fit look at, below the coverslip too."""
+    """Give the lowest height of a fit with a normal prior, which may be below the coverslip."""
     particle = config.particle
     sd_nm = particle.height_prior_sd_nm
     if config.fit.mode != "mass" or not sd_nm:
@@ -228,7 +228,7 @@ def _lowest_nm(config: Config) -> float:
 
 
 def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> MassScale:
-    """Let the line say what amplitude a mass has, at the optics of its standards."""
+    """Make the map from mass to amplitude, from the line and the optics of its standards."""
     if not model.rho:
         raise ConfigError("[calibration] relates contrast to mass; dark field has no contrast")
     linear, quadratic = _peak_terms(model)
@@ -239,7 +239,7 @@ def _mass_scale(model: ForwardModel, line: Calibration, particle: Particle) -> M
         return MassScale(line, linear, quadratic)
     if measured or line.optics.psf == "measured":  # whose contrasts are measured, not computed
         same = _same_template(model.optics, line.optics)
-        refusal = "" if same else "they were measured with another picture of a particle"
+        refusal = "" if same else "they were measured with another image of a particle"
         return MassScale(line, linear, quadratic, linear, refusal)
     height = particle.nominal_height_nm if line.height_nm is None else line.height_nm
     there = particle.held_at(height)
@@ -270,7 +270,7 @@ def _peak_terms(model: ForwardModel) -> tuple[float, float]:
 
 
 def _same_template(here: Optics, there: Optics) -> bool:
-    """Tell whether two measured pictures are one."""
+    """Tell whether two measured images are the same."""
     if here.psf != "measured" or there.psf != "measured":
         return False
     if here.template == there.template:
@@ -289,7 +289,7 @@ def _standards_peak_terms(optics: str, particle: str) -> tuple[float, float]:
         optics=Optics.model_validate_json(optics), particle=Particle.model_validate_json(particle)
     )
     return _peak_terms(
-        forward_model(config, PEAK_REACH * config.optics.wavelength_nm / config.optics.na)
+        forward_model(config, PEAK_SEARCH_RADIUS * config.optics.wavelength_nm / config.optics.na)
     )
 
 

@@ -1,4 +1,4 @@
-"""Where images are evaluated: pixel centres, x along columns, y down the rows."""
+"""Grids of pixel centres on which images are evaluated; x along columns, y down the rows."""
 
 from __future__ import annotations
 

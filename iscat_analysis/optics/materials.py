@@ -3,7 +3,7 @@
 Gold: P. B. Johnson and R. W. Christy, Phys. Rev. B 6, 4370 (1972), n and k against photon energy,
 interpolated linearly in vacuum wavelength.  Silica: I. H. Malitson, J. Opt. Soc. Am. 55, 1205
 (1965).  Polystyrene: N. Sultanova, S. Kasarova and I. Nikolov, Acta Phys. Pol. A 116, 585 (2009).
-Protein: index 1.46, the value mass photometry works with.
+Protein: index 1.46, the usual value in mass photometry.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ _INDICES: dict[str, Callable[[float], complex]] = {
 
 @dataclass(frozen=True)
 class Material:
-    """What the scattering of a particle depends on."""
+    """Properties of a particle that determine its scattering."""
 
     permittivity: complex
     density_kg_m3: float

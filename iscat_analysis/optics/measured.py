@@ -1,11 +1,11 @@
-"""A picture that was measured, in place of one that was computed.
+"""A measured image of a particle, in place of a computed one.
 
-Whatever is wrong with a microscope, its light comes through its pupil: the interference of a faint
-particle, 2 Re e, has no detail finer than the largest wave vector that the glass carries, so that
-samples on a lattice say all of it, between the pixels too.  The lattice is that of any other pupil
-(`iscat_analysis._kernels.lattice`), with a field that is real: what is not seen in the interference
-is not known.  The scattered light itself, |e|², is then the least that such an interference can
-come with, (Re e)².
+In any microscope, the light comes through the pupil.  The interference of a faint particle, 2 Re e,
+is therefore band-limited at the largest wave vector in the glass, so that samples on a lattice
+determine it between the pixels too.  The lattice is that of any other pupil
+(`iscat_analysis._kernels.lattice`), with a real field: the imaginary part does not show in the
+interference and is not known.  For the scattered light itself, |e|², its lower limit (Re e)² is
+used.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 
 FloatArray = NDArray[np.float64]
 
-_MOST_LATTICES = 4  # lattices at hand, one for each number of orders
-_SLOW = 1e-3  # a rate [rad/nm] for tables along z, where nothing changes
+_MOST_LATTICES = 4  # cached lattices, one for each number of orders
+_AXIAL_RATE = 1e-3  # a rate [rad/nm] for tables along z, although nothing changes along z
 _STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
 _LARGEST_NUMBER = 1e9  # of its numbers
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
@@ -39,7 +39,7 @@ _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The contrast of a faint particle, measured."""
+    """The measured contrast of a faint particle."""
 
     contrast: FloatArray
     sigma: FloatArray
@@ -58,7 +58,7 @@ class Template:
 
     @classmethod
     def read(cls, path: Path) -> Template:
-        """Read what `to_bytes` gave."""
+        """Read a file that holds the bytes of `to_bytes`."""
         try:
             content = read_bytes(path, LARGEST_TEMPLATE_BYTES)
         except OSError as error:
@@ -66,7 +66,7 @@ class Template:
         return _parsed(str(path), content)
 
     def refuse_mismatch(self, pixel_nm: float | None, roi_nm: float) -> None:
-        """Refuse pixels or squares that the template was not measured with."""
+        """Refuse a pixel size or a square for which the template was not measured."""
         if pixel_nm is not None and abs(pixel_nm / self.pixel_nm - 1) > _SAME_PIXEL:
             raise ConfigError(
                 f"optics.template was measured with pixels of {self.pixel_nm:g} nm, and "
@@ -81,7 +81,7 @@ class Template:
 
 
 def sha256_of(content: bytes) -> str:
-    """Give the checksum that ``optics.toml`` names its template with."""
+    """Give the checksum of a template, which ``optics.toml`` stores."""
     return hashlib.sha256(content).hexdigest()
 
 
@@ -110,7 +110,7 @@ def _parsed(name: str, content: bytes) -> Template:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredField:
-    """Field of a measured picture, at all heights the same; beside `RadialField`."""
+    """Field of a measured image, the same at all heights; used like `RadialField`."""
 
     template: Template
     gain: float
@@ -118,8 +118,8 @@ class MeasuredField:
 
     @property
     def axial(self) -> NDArray[np.complex128]:
-        """Phases per height that tables along z go by; nothing changes there [rad/nm]."""
-        return np.array([-_SLOW, _SLOW], dtype=np.complex128)
+        """Phases per height, for tables along z; nothing changes along z [rad/nm]."""
+        return np.array([-_AXIAL_RATE, _AXIAL_RATE], dtype=np.complex128)
 
     @property
     def half(self) -> int:
@@ -156,7 +156,7 @@ class MeasuredField:
         return memoize(_MOST_LATTICES, with_orders)
 
     def _coefficients(self) -> FloatArray:
-        """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""
+        """Sample Re e on a lattice over the reach, and undo the smoothing of its window."""
         side = 2 * (self.half + FILTER) + 1
         samples = np.zeros((side, side))
         known = self.template.contrast.T * (self.gain / 2)
@@ -199,5 +199,5 @@ class MeasuredField:
 
 
 def lattice_step_nm(wavelength_nm: float, n_glass: float) -> float:
-    """Step of the lattice on which light of a wavelength is known, whatever the pupil."""
+    """Step of a lattice that resolves light of a wavelength from any pupil."""
     return LATTICE_STEP * wavelength_nm / (2 * math.pi * n_glass)

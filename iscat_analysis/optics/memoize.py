@@ -1,4 +1,4 @@
-"""Results that take long to make and are asked for again."""
+"""A cache for results that take long to compute and are needed again."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ T = TypeVar("T")
 def memoize(size: int, make: Callable[[*Key], T]) -> Callable[[*Key], T]:
     """Keep the last few results of a function.
 
-    Threads that ask for the same at the same time wait for the one that makes it; with
-    `functools.lru_cache` each would make its own.
+    If several threads need the same result at the same time, one computes it and the others wait;
+    with `functools.lru_cache` each would compute it.
     """
 
     @lru_cache(size)

@@ -1,6 +1,6 @@
 """Expected images of one particle, and their derivatives.
 
-One `ForwardModel` serves the simulator, the fits, the posterior and the bounds.  Its *signal* is
+Simulation, fits, posterior and bounds all use `ForwardModel`.  Its *signal* is
 the contrast C in the interferometric schemes and |E_sca|² for unit incident amplitude in dark field
 (D21, section II; physics.md, sections 1–3 and 8).
 """
@@ -39,7 +39,7 @@ from iscat_analysis.optics.waves import Field, RadialField, axial_table
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
-_TABLES_KEPT = 4  # heights whose derivatives or tables are at hand, some MB each
+_TABLES_KEPT = 4  # cached heights with their derivatives or tables, some MB each
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,12 @@ class ForwardModel:
 
     @property
     def is_measured(self) -> bool:
-        """Whether the picture was measured, so that nothing is known of the light in the pupil."""
+        """Whether the image was measured, so that the light in the pupil is not known."""
         return isinstance(self.wave, MeasuredField)
 
     @cached_property
     def lens(self) -> Lens:
-        """What turns a profile into a signal, as the kernels take it."""
+        """Constants with which the kernels turn a profile into a signal."""
         return self.wave.lens(self.rho)
 
     def pixels(self, grid: PixelGrid) -> Pixels:
@@ -109,7 +109,7 @@ class ForwardModel:
         return memoize(_TABLES_KEPT, lambda z_nm: axial_table(self.wave, (z_nm, z_nm)))
 
     def picture_table(self, pixel_nm: float, half_px: int) -> tuple[Lens, AxialTable]:
-        """Picture at `height_nm` on the pixels' own grid; the last few are kept."""
+        """Image at `height_nm` on the grid of the pixels; the last few are kept."""
         return self._picture_tables(pixel_nm, half_px)
 
     @cached_property
@@ -134,8 +134,8 @@ class ForwardModel:
     ) -> FloatArray:
         """Signal of one particle whose amplitude is known instead of its mass.
 
-        Below the offset of a calibration two amplitudes have one mass, so that what was fitted as
-        an amplitude must be drawn from it.
+        Below the offset of a calibration two amplitudes have the same mass, so that a fitted
+        amplitude must be drawn from the amplitude and not from the mass.
 
         Shapes: result (ny, nx).
         """

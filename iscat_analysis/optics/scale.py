@@ -1,7 +1,7 @@
 """Mass and the amplitude of the scattered field: by the absolute model, or by a calibration.
 
-A particle of mass m scatters a field of amplitude a, in any microscope.  The contrast that this
-amplitude has, C = L·a + Q·a², belongs to the optics: L and Q depend on focus, aperture, phase and
+A particle of mass m scatters a field of amplitude a, in any microscope.  The contrast of this
+amplitude, C = L·a + Q·a², depends on the optics: L and Q depend on focus, aperture, phase and
 height.  The line of a calibration was measured with the optics of its standards, so that
 
     gradient·m + sign(m)·offset = L_there·a + Q_there·a²
@@ -21,16 +21,16 @@ from iscat_analysis.config import Calibration, Optics
 
 FloatArray = NDArray[np.float64]
 
-MOST_CHANGE = 1 / 3
-"""Change of the contrast per kDa, from the optics of the standards to others, that the model still
-carries: beyond it, small errors of the optics are large ones of the mass."""
+LARGEST_SCALE_CHANGE = 1 / 3
+"""Largest change of the contrast per kDa, from the optics of the standards to others, for which the
+model converts the scale: beyond it, small errors of the optics are large errors of the mass."""
 
 SAME_WAVELENGTH_NM = 1.0
-"""Wavelengths of one line of a laser differ by less."""
+"""Two wavelengths that differ by less are of the same laser line."""
 
 
 def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
-    """Say why the model does not carry the scale of standards to other optics; else nothing."""
+    """Say why the model does not convert the scale of standards to other optics; else nothing."""
     for key in ("scheme", "polarization", "analyzer", "psf"):
         mine, theirs = getattr(here, key), getattr(there, key)
         if mine != theirs:
@@ -40,7 +40,7 @@ def carry_refusal(here: Optics, there: Optics, ratio: float) -> str:
             f"they were measured at {there.wavelength_nm:g} nm, and this is at "
             f"{here.wavelength_nm:g} nm"
         )
-    if not abs(ratio - 1) <= MOST_CHANGE:
+    if not abs(ratio - 1) <= LARGEST_SCALE_CHANGE:
         return (
             f"by the model the contrast per kDa is {ratio:.3g} of that with the standards' optics, "
             "a change of more than a third"
@@ -55,12 +55,12 @@ class MassScale:
     Without a calibration a is the mass in kDa.  With one, the signed peak contrast
     C = L·a + Q·a² of the model, at the optics and the height of the standards, equals
     gradient·m + sign(m)·offset, which replaces the model's absolute scale.  `here` is L at the
-    model's own optics; `refusal` says why these are beyond what the model carries.
+    optics of the model; `refusal` says why the scale cannot be converted to these optics.
 
-    The line goes through no contrast at the mass −offset/gradient.  Where that is positive, each
+    The line crosses zero contrast at the mass −offset/gradient.  If this mass is positive, each
     contrast up to the offset belongs to two masses of opposite sign, which differ by twice this
-    mass; `mass` gives the one whose sign the contrast has.  Where it is negative, contrasts below
-    the offset belong to none, and `mass` continues the line, below zero.
+    mass; `mass` gives the one with the sign of the contrast.  If it is negative, contrasts below
+    the offset belong to no mass, and `mass` continues the line below zero.
     """
 
     calibration: Calibration | None = None
@@ -106,10 +106,10 @@ class MassScale:
         return rise / self.calibration.gradient_per_kda
 
     def bend(self, mass_kda: FloatArray) -> FloatArray:
-        """Give how far a line of faint standards is from heavy particles.
+        """Give the relative error of a line of faint standards for heavy particles.
 
-        The scattered field is in proportion to the mass, and the contrast has its square: what a
-        line makes of C = L·a + Q·a² is too small by −Q·a/L, where the standards are faint.
+        The scattered field is proportional to the mass, but the contrast also contains its square.
+        If the standards are faint, the contrast of a line differs from C = L·a + Q·a² by −Q·a/L.
         """
         sizes = np.abs(np.asarray(mass_kda, dtype=float))
         if self.calibration is None:
@@ -128,7 +128,7 @@ class MassScale:
     def off_line(
         self, amplitude: FloatArray, sigma_kda: FloatArray, errors: float
     ) -> NDArray[np.bool_]:
-        """Tell whose contrasts are no single mass on the line of a calibration."""
+        """Tell which contrasts do not belong to a single mass on the line of a calibration."""
         amplitude, sigma_kda = np.asarray(amplitude, dtype=float), np.asarray(sigma_kda)
         if self.calibration is None or self.calibration.offset == 0.0:
             return np.zeros(amplitude.shape, dtype=np.bool_)

@@ -1,9 +1,9 @@
-"""How the picture of a particle changes with the microscope: analytic derivatives of the signal.
+"""Analytic derivatives of the signal with respect to the parameters of the microscope.
 
-Every parameter of the optics changes the light in the pupil, ray by ray.  The derivative of the
-field is the integral of that change: a factor inside the pupil, and where an edge moves (aperture,
-mask) the light on that edge.  Each is tabulated on the lattice of the field itself, once for each
-height, and combined with the field at the pixels.
+Every parameter of the optics changes the light of each ray in the pupil.  The derivative of the
+field is the integral of this change: a factor inside the pupil, and the light on an edge that moves
+(aperture, mask).  Each derivative is tabulated on the lattice of the field, once for each height,
+and combined with the field at the pixels.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
 """Factor of the field's integral, and phase per height, on any quadrature."""
 
 NEGLIGIBLE_CHANGE = 1e-6
-"""Share of a change of the light below which its azimuthal harmonics are left out."""
+"""Share of the change of light below which its azimuthal harmonics are left out."""
 
-COARSER = 2
-"""Radial step of these tables over that of the field's own: they are good to a part in 10⁶."""
+STEP_RATIO = 2
+"""Radial step of these tables over that of the field: their error is one part in 10⁶."""
 
 
 def check_names(optics: Optics, names: Sequence[str]) -> None:
-    """Refuse what has no derivative."""
+    """Refuse parameters that have no derivative."""
     unknown = [name for name in names if name not in MEASURABLE]
     if unknown:
         raise ConfigError(f"names = {unknown}: choose among {', '.join(MEASURABLE)}")
@@ -67,7 +67,7 @@ def sensitivity_lattices(
     """
     optics = opening.optics
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
-    # two more directions, of no weight but where an edge moves
+    # two more directions, with zero weight except where an edge moves
     theta = np.concatenate([opening.pupil.theta, [rim, edge]])
     whole = aperture_on(optics, theta, np.concatenate([opening.pupil.weight, [1.0, 1.0]]))
     weight, axial = weight_on(whole)
@@ -105,7 +105,7 @@ def sensitivity_lattices(
     series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
     count = len(field)
     lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
-    stack = lattice.lattices(series, whole.pupil.transverse, COARSER)
+    stack = lattice.lattices(series, whole.pupil.transverse, STEP_RATIO)
     return lattice.lens(rho), stack.reshape(2 + len(names), count, *stack.shape[1:])
 
 

@@ -1,15 +1,15 @@
-"""The picture of a particle at one height, sampled on the pixels' own grid, sharp or blurred.
+"""The image of a particle at one height, sampled on the grid of the pixels, sharp or blurred.
 
-What a pixel sees of a particle is band-limited, the interference at k·NA and the scattered light at
-twice that.  Between samples of it, `TAPS` of them along each axis give any place: the weights are
-those that err least, in the mean square over the band, against a wave moved to that place and
+The signal of a pixel is band-limited, the interference at k·NA and the scattered light at twice
+that.  Its value at any position follows from `TAPS` samples along each axis.  Their weights have
+the smallest mean-square error over the band, against a wave that is shifted to this position and
 dimmed by the blur,
 
     w(t) = argmin ∫ |Σ_l w_l e^{iu(l − 3)} − e^{iut} e^{−q u²/2}|² du,
 
-with u the wavenumber times the distance of the samples, t the place between two of them and q the
-variance of the blur in units of that distance squared.  One set of samples so serves every blur,
-of the interference and of the scattered light alike.
+with u the wavenumber times the distance of the samples, t the position between two samples and q
+the variance of the blur in units of that distance squared.  One set of samples is therefore enough
+for every blur, of the interference and of the scattered light.
 """
 
 from __future__ import annotations
@@ -30,32 +30,32 @@ if TYPE_CHECKING:
     from iscat_analysis.optics.model import ForwardModel
 
 BAND = 0.8
-"""Largest u of the interference: the sharp picture errs by 4e-6, its gradient by 1e-5."""
+"""Largest u of the interference: the error of the sharp image is 4e-6, of its gradient 1e-5."""
 
 RINGS = 1.6
-"""The same, of what is far from its particle: rings of the interference err by 1e-3 of themselves,
-and light that was scattered twice is as good as gone."""
+"""The same, far from the particle: the relative error of the rings of the interference is 1e-3, and
+the square of the scattered field is negligible."""
 
-_BEYOND = 1e-3  # weight of the band from there to twice that, where there is little light
+_OUTER_WEIGHT = 1e-3  # weight of the band from there to twice that, where there is little light
 _POINTS = 24  # of the quadrature over each band
 
 
 def samples_per_pixel(optics: Optics, pixel_nm: float, band: float = BAND) -> int:
-    """Give how many samples per pixel the picture needs along each axis."""
+    """Give how many samples per pixel the image needs along each axis."""
     bandwidth = 2 * math.pi / optics.wavelength_nm * optics.na
     bandwidth *= 2 if optics.scheme == "darkfield" else 1
     return max(1, math.ceil(bandwidth * pixel_nm / band))
 
 
 def margin_nm(optics: Optics, pixel_nm: float) -> float:
-    """Give how far beyond the pixels a model must reach to be known at all of them."""
+    """Give how far beyond the pixels a model must be sampled."""
     return pixel_nm + TAPS / 2 * pixel_nm / samples_per_pixel(optics, pixel_nm)
 
 
 def sample_picture(
     model: ForwardModel, pixel_nm: float, half_px: float, band: float = BAND
 ) -> tuple[StampLens, FloatArray]:
-    """Sample the picture of a particle at the model's height.
+    """Sample the image of a particle at the model's height.
 
     Shapes: `samples` (2, nodes, nodes).
     """
@@ -66,7 +66,7 @@ def sample_picture(
     offsets, weights = model.samples
     offsets = np.asarray(offsets * pixel_nm)
     profile = model.profile(model.height_nm, 1)
-    # as strong as the reference, so that neither P nor Q drowns in the rounding of the other
+    # as strong as the reference, so that neither P nor Q is lost in the rounding of the other
     z = 1 / math.sqrt(model.wave.peak(model.height_nm, 1.0, model.rho)[1])
     reach = model.reach_nm - math.sqrt(2) * pixel_nm
     both = np.zeros((2, nodes.size, nodes.size))
@@ -90,13 +90,13 @@ def sample_picture(
 
 @lru_cache(256)
 def weights_between(variance: float, band: float = BAND) -> FloatArray:
-    """Weights of the samples around a place, for a blur.
+    """Weights of the samples around a position, for a blur.
 
     Shapes: result (degree + 1, TAPS).
     """
     points, quadrature = np.polynomial.legendre.leggauss(_POINTS)
     u = band * np.concatenate([(points + 1) / 2, (points + 3) / 2])
-    root = np.sqrt(np.concatenate([quadrature, _BEYOND**2 * quadrature]))
+    root = np.sqrt(np.concatenate([quadrature, _OUTER_WEIGHT**2 * quadrature]))
     waves = np.exp(1j * np.outer(u, np.arange(TAPS) - (TAPS // 2 - 1))) * root[:, None]
     t = (1 - np.cos(np.pi * (np.arange(DEGREE + 1) + 0.5) / (DEGREE + 1))) / 2
     wanted = np.exp(1j * np.outer(u, t) - variance * u[:, None] ** 2 / 2) * root[:, None]

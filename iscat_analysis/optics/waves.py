@@ -1,8 +1,8 @@
 """The scattered field around one particle, per unit amplitude and over the reference.
 
-Two tables behind one interface.  A pupil that knows no direction but that of the polarisation has a
-`RadialField`: quintics along r.  Any other has a `LatticeField`.  Both give the kernels a profile
-at a height, a table of profiles along z, and the field at any point.
+Two tables have the same interface.  If only the polarisation gives the pupil a direction, it has a
+`RadialField`: quintics along r.  Any other pupil has a `LatticeField`.  Both give the kernels a
+profile at a height, a table of profiles along z, and the field at any point.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
 TABLE_LIMIT_MB = 400
-"""No table of the model is larger: a length in the wrong unit would fill the memory."""
+"""Largest table of the model: a length in the wrong unit would fill the memory."""
 
-_HEIGHTS_KEPT = 8  # profiles at hand; where z is fixed, every image asks for the same one
-_PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is looked for
+_HEIGHTS_KEPT = 8  # cached profiles; if z is fixed, every image needs the same one
+_PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is searched
 _PEAK_POINTS = 8  # the same, in each step of the radial table
 _NEWTON = 4  # steps from there
-_AT_ONCE = 16  # heights of the axial table made together
+_HEIGHTS_AT_ONCE = 16  # heights of the axial table made together
 
 
 def check_table(what: str, numbers: float) -> None:
@@ -66,7 +66,7 @@ def check_table(what: str, numbers: float) -> None:
 
 @dataclass(frozen=True)
 class RadialField:
-    """Field of a pupil whose only direction is the polarisation's."""
+    """Field of a pupil whose only direction is that of the polarisation."""
 
     source: ComplexArray
     axial: ComplexArray
@@ -198,8 +198,8 @@ class LatticeField:
     def profiles(self, heights_nm: FloatArray, kappa: float) -> FloatArray:
         """Profiles with ∂/∂z and ∂²/∂z² without exp(iκz), shape (n, 3, channels, width)."""
         parts = [
-            self._stack(heights_nm[i : i + _AT_ONCE], 3, kappa)
-            for i in range(0, heights_nm.size, _AT_ONCE)
+            self._stack(heights_nm[i : i + _HEIGHTS_AT_ONCE], 3, kappa)
+            for i in range(0, heights_nm.size, _HEIGHTS_AT_ONCE)
         ]
         return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * len(self.harmonics), -1)
 
@@ -251,8 +251,8 @@ class LatticeField:
     ) -> tuple[float, float]:
         """Parts of the signal of largest magnitude that are linear and quadratic in a.
 
-        The largest on a fine grid, then Newton's method; from a profile at that height where one is
-        given, else exactly.
+        The largest signal on a fine grid is the start of Newton's method; from a profile at that
+        height if one is given, else exactly.
         """
         exact = profile is None
         if profile is None:
@@ -288,7 +288,7 @@ class LatticeField:
 
     @cached_property
     def _grid(self) -> Pixels:
-        """Points on which the largest signal is looked for."""
+        """Points on which the largest signal is searched."""
         half = int(self.reach_nm / math.sqrt(2) / (self.step_nm * _PEAK_STEP))
         axis = self.step_nm * _PEAK_STEP * np.arange(-half, half + 1, dtype=np.float64)
         return Pixels(axis, axis, np.zeros(1), np.ones(1))

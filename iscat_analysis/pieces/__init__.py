@@ -1,4 +1,4 @@
-"""The pieces: what a physicist calls with arrays, without a movie, a folder or a file.
+"""Single steps of the analysis as functions of arrays, without a movie, a folder or a file.
 
 Each takes the microscope, the particle and the camera as `Optics`, `Particle` and `Camera`, the
 same sections that a configuration file has, and arrays otherwise:
@@ -10,7 +10,7 @@ same sections that a configuration file has, and arrays otherwise:
 `log_likelihood`
     the log-likelihood of one region and its gradient, for any sampler or optimiser;
 `crb`, `qcrb`
-    what no estimate can beat, given the camera or given the light, for arrays of set-ups.
+    bounds of any estimate, for this camera or for any measurement of the light; arrays of set-ups.
 
 Lengths are nm, masses kDa, counts photoelectrons; images have axes (y, x), and pixel (0, 0) of a
 region has its centre at (0, 0) nm.

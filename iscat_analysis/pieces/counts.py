@@ -22,7 +22,7 @@ from iscat_analysis.units import count
 FloatArray = NDArray[np.float64]
 
 LARGEST_RATIO = 1e9
-"""The light after is at most so many times that before, and at least its reciprocal."""
+"""Largest ratio of the light after and before, and of the light before and after."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def gather(
     masked: ArrayLike | None,
     saturated: ArrayLike | None = None,
 ) -> Counts:
-    """Check counts and what is said of them.
+    """Check the counts and the arguments that describe them.
 
     Shapes: `before, after` (n, y, x).
     """

@@ -29,11 +29,11 @@ class LogLikelihood:
     Attributes
     ----------
     names : tuple of str
-        What the columns of θ are: a subset of x_nm, y_nm, z_nm, mass_kda in this order, then
-        log_level where it is fitted.
+        Columns of θ: a subset of x_nm, y_nm, z_nm, mass_kda in this order, then log_level if it
+        is fitted.
     lower, upper : ndarray, shape (k,)
-        The support: the region's edges, the heights searched, the masses that can be told apart
-        (0 to ∞, or any where a particle of either sign is meant).
+        The support: the region's edges, the heights searched, the possible masses (0 to ∞, or any
+        mass if particles of either sign are possible).
     """
 
     names: tuple[str, ...]
@@ -135,7 +135,7 @@ class LogLikelihood:
         return points, inside & np.all(np.isfinite(points), axis=1)
 
     def _inner(self, points: FloatArray) -> FloatArray:
-        """Turn points into what the kernels take: amplitudes, and the parameters held fixed."""
+        """Turn points into parameters of the kernels: with amplitudes, and fixed parameters."""
         inner = np.tile(self._fixed, (len(points), 1))
         inner[:, self._index] = points
         if "mass_kda" in self.names:
@@ -180,7 +180,7 @@ def log_likelihood(
     mode : {"mass", "localize", "joint"}
         Which parameters are free.
     power_ratio : float, optional
-        Light after over light before; default the ratio of the frames, with `level` free.
+        Light after over light before; by default the ratio of the frames, with `level` free.
     level : bool, optional
         Whether the logarithm of a common level is a parameter too; default as in `fit_rois`.
     z_range_nm : (float, float)
@@ -205,9 +205,9 @@ def log_likelihood(
 
     Notes
     -----
-    Given the counts before and after together, those after are binomial, and the unknown
-    background drops out; where it is known they are Poissonian.  `fit_rois` maximises the same
-    function.
+    Given the sum of the counts before and after, those after are binomial, and the unknown
+    background drops out; if the background is known, they are Poissonian.  `fit_rois` maximises
+    the same function.
 
     Examples
     --------

@@ -41,7 +41,7 @@ def crb(
     focus_nm: ArrayLike | None = None,
     calibration: Calibration | None = None,
 ) -> dict[str, FloatArray]:
-    """Cramér–Rao bounds: the smallest spread of any unbiased estimate from such frames.
+    """Cramér–Rao bounds: the smallest standard deviations of unbiased estimates from such frames.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def crb(
     -------
     dict of str to ndarray
         Standard deviations [nm, kDa] of the free parameters, by name, each of the shape of the
-        broadcast arguments; NaN where the image does not tell.
+        broadcast arguments; NaN where the image does not determine the parameter.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def qcrb(
     focus_nm: ArrayLike | None = None,
     calibration: Calibration | None = None,
 ) -> dict[str, FloatArray]:
-    """Quantum Cramér–Rao bounds: what no measurement of the collected light can beat.
+    """Quantum Cramér–Rao bounds: the smallest standard deviations for any measurement of the light.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def qcrb(
     camera : Camera
         Its pixel size turns photons per pixel into light.
     photons_per_pixel : array_like
-        Background per pixel and frame [e]; in dark field without influence.
+        Background per pixel and frame [e]; it has no effect in dark field.
     n_after : array_like
         Frames with the particle.
     mode : {"mass", "localize", "joint"}
@@ -253,7 +253,7 @@ class _Setups:
         self._pixel_nm = float(config.camera.pixel_size_nm or 0.0)
         self.grid = PixelGrid.centred(pixels, self._pixel_nm)
         self._dark = config.optics.scheme == "darkfield"
-        # a calibration was measured at the focus of `optics`, whatever focus is asked about
+        # a calibration was measured at the focus of `optics`, not at the focus of the set-up
         nominal = forward_model(config, self._pixel_nm)
         self._scale = nominal.scale
         self._all = together(

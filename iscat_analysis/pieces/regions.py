@@ -38,10 +38,10 @@ from iscat_analysis.threads import threads
 FloatArray = NDArray[np.float64]
 
 SATURATION_NM = 500.0
-"""Saturated pixels nearer than this spoil a fit."""
+"""A fit is flagged if a saturated pixel is nearer than this."""
 
-_FEWEST = 0.5  # share of a region's pixels that must be usable
-_MARGIN = 0.15  # of the region's side at each edge, where a particle is not looked for
+_LEAST_USABLE_SHARE = 0.5  # share of a region's pixels that must be usable
+_EDGE_SHARE = 0.15  # of the region's side at each edge, where a particle is not looked for
 
 
 def fit_rois(
@@ -91,13 +91,13 @@ def fit_rois(
     z_range_nm : (float, float)
         Heights that are searched where z is free [nm].
     masked, saturated : array_like of bool, shape (n, y, x) or (y, x), optional
-        Pixels to leave out; saturated ones near a particle are remarked on.
+        Pixels to leave out; a fit near saturated pixels is flagged.
     corners_px : array_like, shape (n, 2), optional
         Row and column of each region's first pixel in the full frame, added to the positions.
     calibration : Calibration, optional
         Contrast against mass, in place of the model's absolute scale.
     workers : int
-        Threads; without influence on the result.
+        Number of threads; it has no effect on the result.
 
     Returns
     -------
@@ -115,8 +115,8 @@ def fit_rois(
 
     Notes
     -----
-    The same likelihood, estimator, bounds and remarks as `fit_movie` and `iscat-fit`; what they do
-    beyond it is to find the regions and to take neighbours into account.
+    Likelihood, estimator, bounds and flags are those of `fit_movie` and `iscat-fit`, which also
+    find the regions and take neighbours into account.
 
     Examples
     --------
@@ -173,7 +173,7 @@ def line_of(
     sign: int = 1,
     quantum: ComplexArray | None = None,
 ) -> dict[str, Any]:
-    """Put a fit and its bounds into a line of the table, which has no number yet.
+    """Put a fit and its bounds into a row of the table, which has no number yet.
 
     Shapes: `quantum` (4, 4).
     """
@@ -213,7 +213,7 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
     likelihood = counts.likelihood(index)
     config, model, pixel_nm = counts.config, counts.model, counts.grid.pixel_nm
     saturated = counts.saturated[index]
-    if likelihood.n_pixels < _FEWEST * saturated.size:
+    if likelihood.n_pixels < _LEAST_USABLE_SHARE * saturated.size:
         flags = [Status.NOT_CONVERGED, *([Status.SATURATED] if saturated.any() else [])]
         status, noticed = verdict(flags)
         return {
@@ -252,7 +252,7 @@ def saturated_near(
     *,
     corner: tuple[int, int] = (0, 0),
 ) -> bool:
-    """Tell whether saturated pixels spoil a fit.
+    """Tell whether a saturated pixel is near a fitted particle.
 
     Shapes: `saturated` (rows, columns).
     """
@@ -268,7 +268,7 @@ def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
     ranked = np.abs(snr) if templates.two_sided else snr
     rows, columns = likelihood.grid.shape
     inner = np.full(ranked.shape, -np.inf)
-    top, left = (int(_MARGIN * size) for size in (rows, columns))
+    top, left = (int(_EDGE_SHARE * size) for size in (rows, columns))
     inside = (slice(None), slice(top, rows - top), slice(left, columns - left))
     inner[inside] = ranked[inside]
     k, row, column = (int(i) for i in np.unravel_index(np.argmax(inner), inner.shape))

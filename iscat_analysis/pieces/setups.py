@@ -1,4 +1,4 @@
-"""What the pieces are given: microscope, particle and camera, and arrays that go together."""
+"""Arguments of the functions of arrays: microscope, particle, camera, and arrays to broadcast."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the stages hand to one another: frozen dataclasses, axes (t, y, x), units in the names."""
+"""Data between steps of the analysis: frozen dataclasses, axes (t, y, x), units in the names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a report is made of."""
+"""Data of a report."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from iscat_analysis.records.fits import PosteriorResult
 class Trace:
     """Contrast of one landing or leaving against frame.
 
-    Each frame is set against the mean of those without the particle, and projected onto the fitted
-    picture with the weights of the likelihood: where the picture is right, a frame with the
-    particle has the contrast of the event, and one without it has 0, but for noise.
+    Each frame is compared with the mean of the frames without the particle, and projected onto the
+    fitted image with the weights of the likelihood.  If the image is right, a frame with the
+    particle has the contrast of the event, and a frame without it has 0, apart from noise.
 
     Attributes
     ----------
@@ -29,11 +29,11 @@ class Trace:
     contrast : ndarray, shape (t,)
         Signed peak contrast of the particle in each frame; NaN where a frame was left out.
     sigma : float
-        Standard deviation of one frame that its photoelectrons and read noise make.
+        Standard deviation of one frame from its photoelectrons and read noise.
     frame : int
         First frame of the new state.
     half_width : int
-        `frame` ± `half_width` holds the step with a probability of 95 %.
+        `frame` ± `half_width` contains the step with a probability of 95 %.
     used : (int, int)
         Half-open range of frames within which the event was fitted.
     before, after : float
@@ -158,7 +158,7 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Analysis:
-    """Everything one run of the main job found; what the report is made of.
+    """All results of one run of the main job, from which the report is made.
 
     Attributes
     ----------

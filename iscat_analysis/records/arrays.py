@@ -1,4 +1,4 @@
-"""Kinds of arrays, and what is told how far a job has come."""
+"""Types of arrays, and the callback that reports progress."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Mapper = Callable[..., Iterable[Any]]
 
 
 class Progress(Protocol):
-    """Told how far a stage has come; the command line turns it into a bar on stderr."""
+    """Callback for the progress of a step; the command line draws a bar on stderr."""
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Report that `done` of `total` steps of `stage` are finished."""

@@ -25,7 +25,7 @@ FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
 
 
 def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
-    """Tell what was fitted: in mode ``track`` the height only where ``track.free`` asks for it."""
+    """Give the fitted parameters: mode ``track`` fits the height only if ``track.free`` says so."""
     names = FREE_PARAMETERS[mode]
     fitted = tuple(name for name in names if fits[f"sigma_{name}"].notna().any())
     return fitted if mode == "track" and fitted else names
@@ -35,8 +35,8 @@ def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
 class Column:
     """One column: its values, what they mean, and whether every table has it.
 
-    Where `meaning` has ``{}``, the unit is put.  A column without a heading is not in the report's
-    table.
+    The unit replaces ``{}`` in `meaning`.  A column without a heading is not in the table of the
+    report.
     """
 
     name: str
@@ -93,8 +93,8 @@ EVENTS = (
     Column("z_nm", "number", "Height above the coverslip [nm]", "z", "nm"),
     Column(
         "mass_kda", "number",
-        "Mass [kDa]; negative for a particle that leaves; on the model's own scale, which is no "
-        "mass, unless mass_scale is calibration",
+        "Mass [kDa]; negative for a particle that leaves; on the absolute scale of the model, "
+        "which is not a mass, unless mass_scale is calibration",
         "mass", "kDa",
     ),
     Column(
@@ -117,16 +117,16 @@ EVENTS = (
     Column("snr", "number", "Matched-filter signal over its noise", "SNR"),
     Column("chi2_reduced", "number", "Reduced χ² of the fitted pixels", "χ²"),
     Column("p_value", "share", "Probability of a worse fit if the model holds", "p"),
-    Column("status", "status", "The verdict: the worst of the remarks"),
-    Column("flags", "text", "Every remark, worst first, joined by semicolons"),
+    Column("status", "status", "The verdict: the worst of the flags"),
+    Column("flags", "text", "All flags, worst first, joined by semicolons"),
     *_of_each_parameter(
         "systematic",
-        "Error common to the movie, from calibrations of optics and mass; no part of σ [{}]",
+        "Error common to the movie, from calibrations of optics and mass; not part of σ [{}]",
         "systematic", optional=True,
     ),
     Column(
         "systematic_contrast", "number",
-        "Error of the contrast that is common to the movie; where no calibration makes it a mass",
+        "Error of the contrast that is common to the movie; if there is no mass calibration",
         optional=True,
     ),
     Column(
@@ -141,7 +141,7 @@ EVENTS = (
     ),
     *_of_each_parameter(
         "repeat",
-        "Standard error from eight disjoint parts of the event's own frames, itself to 19 %; in "
+        "Standard error from eight disjoint parts of the event's own frames, known to 19 %; in "
         "mode track, from the empty places of its frame [{}]",
         "repeats", optional=True,
     ),
@@ -156,8 +156,8 @@ FRAME_COLUMN = "frame_ci95"
 of ``frame`` [frames]."""
 
 REPEAT_COLUMNS = tuple(f"repeat_{name}" for name in PARAMETERS)
-"""Columns of ``fits.csv``: standard errors of an event as disjoint parts of its own frames show
-them; of a single frame, as the empty places of that frame do."""
+"""Columns of ``fits.csv``: standard errors of an event from disjoint parts of its own frames; of a
+single frame, from the empty places of that frame."""
 
 TRACKS = (
     Column("track", "count", "Number of the track, as in fits.csv"),
@@ -166,8 +166,8 @@ TRACKS = (
     Column("n_frames", "natural", "Frames in which it was fitted", "frames"),
     Column(
         "mass_kda", "number",
-        "Mass common to its frames that are ok [kDa]; on the model's own scale, which is no mass, "
-        "unless mass_scale is calibration", "mass [kDa]",
+        "Mass common to its frames that are ok [kDa]; on the absolute scale of the model, which "
+        "is not a mass, unless mass_scale is calibration", "mass [kDa]",
     ),
     Column("sigma_mass_kda", "positive", "Its standard error [kDa]", "σ [kDa]"),
     Column("crb_mass_kda", "positive", "Its Cramér–Rao bound [kDa]", "CRB [kDa]"),
@@ -182,56 +182,58 @@ TRACKS = (
     Column("crb_d_um2_s", "positive", "Its Cramér–Rao bound [µm²/s]", "CRB [µm²/s]"),
     Column(
         "diameter_nm", "positive",
-        "Hydrodynamic diameter [nm]; with track.free = \"joint\", where D is above zero within its "
-        "error and a sphere of that size fits between the particle and the coverslip",
+        "Hydrodynamic diameter [nm]; with track.free = \"joint\", if D is above zero within its "
+        "error and the sphere fits between the centre of the particle and the coverslip",
         "diameter [nm]",
     ),
     Column("sigma_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]"),
     Column(
         "refractive_index", "positive",
-        "Index of the sphere of that diameter that scatters like mass_kda of [particle]; null for "
-        "a material that absorbs", "index",
+        "Refractive index of a sphere of that diameter that scatters like mass_kda of [particle]; "
+        "null for a material that absorbs", "index",
     ),
     Column(
         "confinement_nm", "positive",
-        "Standard deviation of the place in a harmonic well [nm]; where p_confinement is at most "
+        "Standard deviation of the position in a harmonic well [nm]; if p_confinement is at most "
         "0.005", "well [nm]",
     ),
-    Column("status", "status", "The worst remark"),
+    Column("status", "status", "The worst flag"),
     Column("flags", "text",
-           "Every remark, worst first, joined by semicolons; crosses makes no verdict"),
-    Column("d_low_um2_s", "not_negative", "Lower end of the 95 % interval of D [µm²/s]; 0: open"),
+           "All flags, worst first, joined by semicolons; crosses is never a status"),
+    Column("d_low_um2_s", "not_negative",
+           "Lower end of the 95 % interval of D [µm²/s]; 0: no lower limit"),
     Column("d_high_um2_s", "positive", "Upper end [µm²/s]"),
     Column(
         "d_disagreement", "number",
-        "Covariance-based estimate of D minus this one, in standard errors; far from 0 the errors "
-        "of the places or the exposure are wrong, or motion is not free",
+        "Covariance-based estimate of D minus this one, in standard errors; far from 0 if the "
+        "errors of positions or the exposure are wrong, or the motion is not free",
     ),
     Column("p_confinement", "share",
-           "Chance of a free track that looks as confined; first 300 positions", "p, confined"),
+           "Probability that a free track looks as confined; first 300 positions", "p, confined"),
     Column("exponent", "number",
-           "Exponent of time in the mean-squared displacement; 1 where free", "exponent"),
+           "Exponent of time in the mean-squared displacement; 1 if free", "exponent"),
     Column("sigma_exponent", "positive", "Its standard error"),
-    Column("p_anomalous", "share", "Chance of a free track with an exponent as far from 1",
-           "p, anomalous"),
+    Column("p_anomalous", "share",
+           "Probability that a free track has an exponent as far from 1", "p, anomalous"),
     Column("p_steady", "share",
-           "Chance of one D in all stretches of the track that differ as much", "p, one D"),
+           "Probability that parts of a track with one D differ as much", "p, one D"),
     Column("sigma_refractive_index", "not_negative", "Standard error of the refractive index",
            "σ of index"),
     Column("contrast", "number",
            "Signed peak contrast of a particle of mass_kda; null in dark field"),
     Column("mass_scatter", "not_negative", "Scatter of the frames' masses over their σ",
            "scatter / σ"),
-    Column("p_mass", "share", "Chance of at least that scatter with one mass"),
+    Column("p_mass", "share", "Probability of at least that scatter with one mass"),
     Column("n_mass_frames", "count", "Frames that are ok, whose masses were combined"),
-    Column("n_d_frames", "count", "Frames whose places were used for D; 0 where these are too few"),
-    Column("x_nm", "number", "Mean place along x [nm]", "x [nm]"),
-    Column("y_nm", "number", "Mean place along y [nm]", "y [nm]"),
+    Column("n_d_frames", "count", "Frames whose positions were used for D; 0 if they are too few"),
+    Column("x_nm", "number", "Mean position along x [nm]", "x [nm]"),
+    Column("y_nm", "number", "Mean position along y [nm]", "y [nm]"),
     Column("z_nm", "number", "Mean height [nm]", "z [nm]"),
     Column("nearest_nm", "positive", "Smallest distance to another track in the same frame [nm]"),
     Column("begins", "end",
-           "movie: in the first frame; border: within a step of that of the field; inside: else"),
-    Column("ends", "end", "The same of the last frame"),
+           "movie: in the first frame; border: within a step of the field's border; inside: "
+           "elsewhere"),
+    Column("ends", "end", "The same for the last frame"),
     Column("systematic_mass_kda", "number", "Error common to the movie, from calibrations [kDa]",
            "systematic [kDa]", optional=True),
 )  # fmt: skip
@@ -242,7 +244,7 @@ TRACK_COLUMNS = tuple(column.name for column in TRACKS if not column.optional)
 
 
 BUDGET_COLUMNS = ("name", "kind", "common", "sigma_mass_kda", "sigma_rel", "dof", "remedy")
-"""What is said of each source of the error of a mass."""
+"""Columns of the error budget of a mass."""
 
 
 def track_numbers(fits: pd.DataFrame) -> pd.Series[int]:

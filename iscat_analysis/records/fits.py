@@ -10,7 +10,7 @@ from iscat_analysis.records.verdicts import Status
 
 @dataclass(frozen=True)
 class Candidate:
-    """A place where something seems to have landed.
+    """A place where the search finds a possible particle.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Candidate:
     snr : float
         Matched-filter signal over its noise.
     beside : float
-        Height of the ratio elsewhere at its distance from a known particle; the largest of them.
+        Largest ratio at other places with the same distance from a known particle.
     """
 
     x_px: float
@@ -76,17 +76,17 @@ class FitResult:
     x_nm, y_nm, z_nm, mass_kda : float
         Estimate in the full frame [nm, kDa]; a parameter that was not free holds its fixed value.
     theta : ndarray, shape (5,)
-        Where the likelihood has its maximum, as it takes its parameters.
+        Maximum of the likelihood, in the parameters of the likelihood.
     estimate : ndarray, shape (5,)
-        The same with the bias of order 1/N taken off; what the estimates above say.
+        The maximum minus the bias of order 1/N; the estimates above are computed from it.
     box : Box
-        Where it was searched.
+        Bounds of the search.
     free : tuple of str
         Names of the free parameters, a subset of `PARAMETERS` in that order.
     sigma : ndarray, shape (4,)
         Standard deviations from the observed information, in the order of `PARAMETERS`;
-        NaN where not free.  Those of places at few photons are the likelihood's three errors away,
-        if that is more; see `iscat_analysis.inference.reach`.
+        NaN where not free.  With few photons, those of positions follow from the likelihood three
+        errors away, if this is larger; see `iscat_analysis.inference.reach`.
     covariance : ndarray, shape (n_free, n_free)
         Inverse observed information, with these standard deviations.
     contrast : float
@@ -94,7 +94,7 @@ class FitResult:
     log_likelihood : float
         At its maximum, without terms that do not depend on the parameters.
     snr : float
-        √(2 Δℓ) against no particle, a level that is free being fitted in both.
+        √(2 Δℓ) against no particle; a free level is fitted in both.
     iterations : int
         Scoring steps taken by the best start.
     chi2_reduced, p_value : float
@@ -102,7 +102,7 @@ class FitResult:
     status : Status
         The verdict.
     flags : tuple of Status
-        Every condition that was noticed, worst first, the status among them unless it is ok.
+        All flags, worst first, including the status unless it is ok.
     alternatives : tuple of Alternative
         Other heights, best first.
     """

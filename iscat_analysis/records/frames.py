@@ -1,4 +1,4 @@
-"""What a movie is to those who read it, and sums of its frames."""
+"""The interface of a movie, and sums of its frames."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from iscat_analysis.records.arrays import BoolArray, FloatArray
 
 @dataclass(frozen=True)
 class StackMetadata:
-    """What a movie file says of itself; None where it is silent.
+    """Metadata of a movie file; None where the file has no value.
 
     Attributes
     ----------
@@ -25,12 +25,12 @@ class StackMetadata:
     frame_rate_hz : float or None
         Frames per second [Hz]; the camera's own, where frames are missing.
     ticks : tuple of int or None
-        Intervals of the camera from the first frame to each, shape (t,), where frames are missing;
-        None where each frame is one interval after the other, or nothing says so.
+        Number of camera intervals from the first frame to each frame, shape (t,), if frames are
+        missing; None if none is missing or this is not known.
     gain_e_per_adu : float or None
-        Photoelectrons per count, as the camera's driver has it.
+        Photoelectrons per count, from the camera's driver.
     offset_adu : float or None
-        Counts in the dark, as the driver has it.
+        Counts in the dark, from the camera's driver.
     wavelength_nm : float or None
         Of the illumination, in vacuum [nm].
     na : float or None
@@ -38,7 +38,7 @@ class StackMetadata:
     magnification : float or None
         Of the objective, as engraved.
     source : str
-        Which metadata spoke: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
+        Source of the metadata: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
     """
 
     pixel_size_nm: float | None = None
@@ -62,7 +62,7 @@ class FrameSource(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name in messages."""
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Frames ``[start, stop)`` as stored, shape (stop − start, y, x) [counts]."""
@@ -70,17 +70,16 @@ class FrameSource(Protocol):
 
 @dataclass(frozen=True)
 class InPlace:
-    """Frames where they lie in a file, which nobody may write to.
+    """Memory-mapped frames of a file, which are read-only.
 
     Attributes
     ----------
     counts : ndarray, shape (t, y, x)
-        The stored counts; they may be used while `check` is content.
+        The stored counts; they may be used as long as `check` does not raise.
     check : callable
-        Raises DataError where the file has become shorter: touching what was beyond ends the
-        process.
+        Raises DataError if the file has become shorter: reading beyond its end kills the process.
     let_go : callable
-        Gives back the memory of all of them, which comes from the file again where it is used.
+        Releases the memory of all frames; they are read from the file again when they are used.
     """
 
     counts: NDArray[Any]
@@ -98,7 +97,7 @@ class CountSource(FrameSource, Protocol):
 
 @runtime_checkable
 class PlacedSource(Protocol):
-    """A movie whose frames may lie in a file as they are used."""
+    """A movie whose frames can be memory-mapped."""
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
         """Frames ``[start, stop)`` without a copy; None where they have to be read."""

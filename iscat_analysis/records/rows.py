@@ -1,4 +1,4 @@
-"""The one maker of rows: what was computed of events, in the columns of ``fits.csv``."""
+"""Make the rows of ``fits.csv`` from the results of events."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ def make_rows(
     lines: pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any]],
     columns: Mapping[str, Any] = MappingProxyType({}),
 ) -> pd.DataFrame:
-    """Put lines below one another, in the order and with the types of the registry.
+    """Make a table of rows, with the order and the types of the registry of columns.
 
-    A line may lack what is not known of it, which stays empty.  Optional columns are there if a
-    line has them, and the number of an event once it is given.  `columns` are added to the lines.
+    Values that a row lacks stay empty.  The table has an optional column if a row has it, and the
+    number of the event once it is given.  `columns` are added to the rows.
     """
     whole = isinstance(lines, (pd.DataFrame, Mapping))
     table = pd.DataFrame(lines if whole else list(lines)).reset_index(drop=True)

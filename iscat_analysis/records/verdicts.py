@@ -31,30 +31,30 @@ class Status(StrEnum):
 
 _ADVICE = {
     Status.OK: "The fit converged, inside its bounds, and agrees with the data.",
-    Status.NOT_CONVERGED: "The fit did not settle: check the optics, or enlarge fit.roi_nm.",
-    Status.AT_BOUND: "The data pull a parameter beyond its bound: a height (widen fit.z_range_nm; "
-    "at the coverslip check optics.focus_nm and the indices), a place (no particle there, or "
-    "optics that do not fit), or a mass (below a calibration.offset).",
+    Status.NOT_CONVERGED: "The fit did not converge: check the optics, or enlarge fit.roi_nm.",
+    Status.AT_BOUND: "The best value of a parameter is beyond its bound: of a height (widen "
+    "fit.z_range_nm; at the coverslip check optics.focus_nm and the indices), of a position (no "
+    "particle there, or wrong optics), or of a mass (below a calibration.offset).",
     Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.z_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
     "neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
-    Status.SIDELOBE: "Not larger than what the model leaves over of a brighter particle beside it, "
-    "and not counted: check focus, NA and aberrations to tell whether it is a particle.",
-    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass is on a scale that was "
-    "measured with other optics: measure standards with these (iscat calibrate mass).",
+    Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "
+    "counted: check focus, NA and aberrations to tell whether it is a particle.",
+    Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass scale was measured with "
+    "other optics: measure standards with these optics (iscat calibrate mass).",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
-    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, so that neither their "
-    "noise nor their particles are as the camera gave them: analyse the camera's own frames.",
+    Status.PROCESSED: "The frames were interpolated, smoothed or sharpened, which changes their "
+    "noise and their particles: analyse the raw frames of the camera.",
     Status.NONLINEAR: "The counts of the whole movie are not in proportion to its light, so that "
     "all masses are wrong by the same factor: a line says by how much and why.",
-    Status.CHANGING: "The light of the particle goes on changing beside its step: it settles, "
-    "bleaches or blinks, moves on, or another one shares its place; the mass is that of the mean "
+    Status.CHANGING: "The light of the particle changes beside its step: the particle settles, "
+    "bleaches, blinks or moves, or another one is at the same place; the mass is that of the mean "
     "change.",
-    Status.EXTENDED: "The picture is wider than that of a point: the particle wiggles by more than "
-    "particle.wiggle_nm says, or has parts that are apart; its mass is too small.",
+    Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
+    "particle.wiggle_nm, or has separate parts; its mass is too small.",
 }
 
 
@@ -72,14 +72,14 @@ SEVERITY = (
     Status.NONLINEAR,
     Status.PROCESSED,
 )
-"""What is remarked on a fit, worst first: perhaps no particle; no estimate; none inside the bounds;
-a model that does not describe the data, their course or their width; one of several heights; a mass
-shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that are not
-in proportion to the light; frames that are not as the camera gave them."""
+"""Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; a
+model that does not describe the data, their change in time or their width; one of several heights;
+a mass shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that
+are not in proportion to the light; frames that were processed."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
-    """Put the remarks on a fit in order."""
+    """Sort the flags of a fit; the status is the worst one."""
     ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))
     return (ordered[0] if ordered else Status.OK), ordered
 
@@ -106,25 +106,25 @@ class TrackStatus(StrEnum):
 
 _TRACK_ADVICE = {
     TrackStatus.OK: "The frames agree on one mass, and the particle diffuses freely.",
-    TrackStatus.FEW_FRAMES: "Fewer of its positions than track.min_frames tell how it moves (of "
-    "those at the border of the field, too close to another particle or not settled, none does): "
-    "no diffusion coefficient.",
-    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass is that of a "
-    "selection: see the status of its rows in fits.csv.",
-    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or those of "
-    "all tracks do together: motion blurs the picture, particles met, the particle changed, or the "
-    "focus drifts.",
+    TrackStatus.FEW_FRAMES: "Fewer of its positions than track.min_frames can be used (those at "
+    "the border of the field, too close to another particle or not converged cannot): no "
+    "diffusion coefficient.",
+    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass comes from a "
+    "selection of frames: see the status of its rows in fits.csv.",
+    TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or the masses "
+    "of all tracks change together: motion blurs the image, particles met, the particle changed, "
+    "or the focus drifts.",
     TrackStatus.PARTLY_SEEN: "It is seen in some of the frames only, but moves too slowly to have "
-    "gone far in the others, in which the background learnt with it has it: its mass is too small; "
-    "record for longer, or give background frames without it.",
-    TrackStatus.SHORT_WAY: "It went so short a way that it can hardly be told from the background "
+    "gone far in the others: there the background contains it, and its mass is too small; record "
+    "for longer, or give background frames without it.",
+    TrackStatus.SHORT_WAY: "It moved so little that it can hardly be told from the background "
     "learnt with it: mass and D are wrong together, D as the mass to the power of -2; record for "
     "longer, or give background frames without it.",
     TrackStatus.NOT_FREE: "It does not diffuse freely: p_confinement, p_anomalous and p_steady "
-    "say which way, and D is that of free diffusion.",
+    "say in which way; D is that of free diffusion.",
     TrackStatus.STANDS_STILL: "Its D is not above zero within its error: take d_high_um2_s as an "
     "upper limit, or record for longer.",
-    TrackStatus.NEAR_WALL: "The coverslip, so near, slows it by more than 5 %: its diameter "
-    "is too large, its index too small.",
+    TrackStatus.NEAR_WALL: "The coverslip slows it by more than 5 %: its diameter is too large, "
+    "its index too small.",
     TrackStatus.UNCALIBRATED_OPTICS: Status.UNCALIBRATED_OPTICS.advice,
 }

@@ -41,7 +41,7 @@ _DOCUMENTS: Mapping[str, str] = {
     "summary": "fit.Summary",
     "template": "calibration.Template",
 }
-"""Model of each document; only what is asked for is imported, as each takes some milliseconds."""
+"""Model of each document; a model is imported when it is needed, which saves some milliseconds."""
 
 
 def _model(name: str) -> type[BaseModel]:
@@ -92,7 +92,7 @@ def to_json(name: str, values: Mapping[str, Any]) -> str:
 
 
 def jsonable(value: Any) -> Any:
-    """Turn a value into what strict JSON can hold."""
+    """Convert a value to strict JSON."""
     if value is None or isinstance(value, (str, bool, int)):
         return value.value if isinstance(value, Enum) else value
     if isinstance(value, float):

@@ -51,10 +51,10 @@ class UnbindingRate(Closed):
 
 
 class Kinetics(Closed):
-    """Rates of a table that has frames."""
+    """Rates of a table that has a column frame."""
 
     landing: LandingRate = key("Landings")
-    unbinding: UnbindingRate | None = key("Leavings; null where there are none, or no places")
+    unbinding: UnbindingRate | None = key("Leavings; null if there are none, or no positions")
     frame_rate_hz: float = key("Frames per second")
     frames: tuple[int, int] = key("In which events were looked for, [start, stop)")
     notes: list[str] = key("What the user should know, one line each")
@@ -90,8 +90,8 @@ class SampleComparison(Document):
     background_other: float = key("The same of this sample")
     species: list[dict[str, Any]] = key(
         "By rising mass: mass_kda and fraction of the first sample, *_other of this one, "
-        "shift_kda, shift_percent and difference (this one's less the first's) with 95 % "
-        "intervals *_low and *_high; null where a species is too rare to compare"
+        "shift_kda, shift_percent and difference (of this sample minus the first) with 95 % "
+        "intervals *_low and *_high; null if a species is too rare to compare"
     )
 
 
@@ -118,15 +118,17 @@ class Kd(Document):
     masses_kda: list[float] = key("Masses at which the species' peaks are highest [kDa], the complex last")
     width_kda: float = key("Width of the lightest species beside the events' own errors [kDa]")
     tail_kda: float = key("Mean of the peaks' exponential tail, negative towards light ones [kDa]")
-    limit_kda: Number = key("Mass detected every other time where the tables' edge tells [kDa]")
+    limit_kda: Number = key(
+        "Mass that is detected with probability 1/2, from the edge of the tables [kDa]"
+    )
     landing_power: float = key("p of landings ∝ concentration·mass^p")
     landing_power_se: float = key("Its standard error; 0 where it was given")
     chi2: float = key("Twice the gain of fractions that are free in every table")
     dof: int = key("Its degrees of freedom")
     p_value: Share = key("Chance of at least as much if the tables follow the equilibrium")
     samples: list[dict[str, Any]] = key(
-        "The rows of the samples, with events, complexes (fraction of the particles that came, "
-        "with 95 % interval), predicted (the same by the equilibrium), pull (their distance in "
+        "The rows of the samples, with events, complexes (fraction of the particles that landed, "
+        "with 95 % interval), predicted (the fraction at equilibrium), pull (their difference in "
         "standard errors) and background"
     )
     curve: dict[str, Any] = key("Model dimer: columns concentration_nm and complexes")

@@ -1,4 +1,4 @@
-"""What the models of the documents are made of."""
+"""Types and base classes of the models of documents."""
 
 from __future__ import annotations
 
@@ -39,18 +39,18 @@ def key(description: str) -> Any:
 
 
 def maybe(description: str) -> Any:
-    """Describe a key that is left out where there is nothing to say."""
+    """Describe a key that may be absent."""
     return Field(default=None, description=description)
 
 
 class Document(BaseModel):
-    """A document, or a part of one, that may hold further keys."""
+    """A document, or a part of one, that may have further keys."""
 
     model_config = ConfigDict(extra="allow", defer_build=True)  # a command needs one of them
 
 
 class Closed(BaseModel):
-    """A part that holds the keys named here and no other."""
+    """A part that has the keys named here and no other."""
 
     model_config = ConfigDict(extra="forbid", defer_build=True)
 

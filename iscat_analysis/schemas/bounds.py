@@ -94,7 +94,7 @@ class BoundsPlanned(Document):
 
 
 class Holevo(Closed):
-    """What one measurement of all free parameters can reach, for the planned frames."""
+    """Holevo bound of one measurement of all free parameters, for the planned frames."""
 
     weight: Literal["qfi"] = key("Every parameter weighs as much as the light knows of it")
     sum: Positive = key("Tr WV; the number of free parameters where no two are in conflict")
@@ -105,7 +105,7 @@ class Holevo(Closed):
 
 
 class Crosstalk(Document):
-    """The direction among the free parameters that is hidden worst."""
+    """The combination of free parameters that is determined worst."""
 
     inflation: Number
     direction: dict[str, Number]
@@ -139,11 +139,11 @@ class DetectionLimit(Closed):
 
     false_alarm: float = key("Probability that noise alone is taken for a particle")
     miss: float = key("Probability that the particle is not found")
-    threshold_known: float = key("Of the signal-to-noise ratio, where the place is known")
+    threshold_known: float = key("Of the signal-to-noise ratio, if the position is known")
     threshold_searched: float = key("The same where the field of [bounds] is searched")
-    snr_known: float = key("Signal-to-noise ratio that a particle needs, place known")
+    snr_known: float = key("Signal-to-noise ratio that a particle needs, position known")
     snr_searched: float = key("The same, field searched")
-    mass_known_kda: NotNegative = key("Its mass, place known [kDa]")
+    mass_known_kda: NotNegative = key("Its mass, position known [kDa]")
     mass_searched_kda: NotNegative = key("Its mass, field searched [kDa]")
     snr_per_amplitude: float = key("Square root of the empty field's Fisher information")
 
@@ -223,7 +223,7 @@ class Bounds(Document):
     holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")
     information_fraction_joint: dict[Parameter, Number] = key(
-        "Share of what one measurement of all free parameters can take: (Holevo / CRB joint)²"
+        "Share of the best measurement of all free parameters: (Holevo / CRB joint)²"
     )
     incompatible: dict[str, float] = key(
         "Pairs that no single measurement estimates best, and how strongly, from 0 to 1"
@@ -247,19 +247,19 @@ class OpticsParameter(Closed):
     value: float = key("As configured")
     sigma: Positive = key("Standard deviation, all fitted together; null where it would be held")
     prior_range: float = key("What is plausible")
-    determined: bool = key("Whether the pictures determine it within that")
+    determined: bool = key("Whether the images determine it within that range")
 
 
 class HiddenDirection(Closed):
-    """A parameter that would be held, and the direction that pictures do not show."""
+    """A parameter that would be held, and the combination that images do not determine."""
 
     name: str
-    others: list[str] = key("Parameters from which it is not told apart")
+    others: list[str] = key("Parameters from which it cannot be told apart")
     direction: dict[str, Number] = key("One standard deviation, each in its own unit")
 
 
 class EventsNeeded(Closed):
-    """Particles of one mass that the goals take; null where no number suffices."""
+    """Number of particles of one mass for each goal; null if no number is enough."""
 
     mass_kda: float
     snr: NotNegative = key("Signal-to-noise ratio of one picture")
@@ -269,7 +269,7 @@ class EventsNeeded(Closed):
 
 
 class OpticsBounds(Document):
-    """What iscat bounds --for optics prints: how well particles would tell the microscope."""
+    """What iscat bounds --for optics prints: how well particles would determine the optics."""
 
     at: dict[str, Number] = key("The experiment")
     events: Natural = key("Particles that are fitted together")
@@ -277,15 +277,17 @@ class OpticsBounds(Document):
     parameters: list[OpticsParameter]
     names: list[str] = key("Parameters that are determined, in the order of covariance")
     covariance: list[list[Number]] = key("Of these, fitted together")
-    unidentifiable: list[str] = key("What the pictures would not tell, one sentence each")
+    unidentifiable: list[str] = key(
+        "Parameters that the images would not determine, one sentence each"
+    )
     hidden: list[HiddenDirection] = key("The same in numbers")
     common: dict[str, dict[Parameter, Number]] = key(
-        "Mode: standard deviation that the microscope's error puts into all fits alike [nm, kDa]"
+        "Mode: standard deviation common to all fits, from the error of the optics [nm, kDa]"
     )
     single: dict[str, dict[Parameter, Number]] = key(
-        "Mode: Cramér–Rao bound of one particle where the optics are known [nm, kDa]"
+        "Mode: Cramér–Rao bound of one particle if the optics are known [nm, kDa]"
     )
-    goals: dict[str, float] = key("Precisions whose price is told")
+    goals: dict[str, float] = key("Precisions for which the number of particles is given")
     needed: list[EventsNeeded] = key("Their price, for several masses")
     warnings: list[str] = key("What the user should know, one line each")
 

@@ -78,7 +78,7 @@ class ContrastPeak(Closed):
 
 
 class Standard(Closed):
-    """A standard and what the line makes of its peak."""
+    """A standard, and the mass of its peak on the line."""
 
     mass_kda: float = key("Known mass [kDa]")
     mass_se: NotNegative = key("Its standard error [kDa]")
@@ -116,7 +116,7 @@ class StandardsCovariance(Closed):
 
 
 class Standards(Closed):
-    """With what the standards were recorded and analysed."""
+    """Optics and camera with which the standards were recorded and analysed."""
 
     optics: dict[str, Any] = key("Keys of [optics]")
     covariance: StandardsCovariance | None = key("Of these, where they were learned")
@@ -138,12 +138,14 @@ class MassCalibration(Document):
     covariance: tuple[tuple[float, float], tuple[float, float]] = key("Of gradient and offset")
     chi2: NotNegative = key("χ² of the standards about the line")
     dof: Count = key("Its degrees of freedom")
-    landing: Literal["dark", "bright"] = key("What landing does to its place")
+    landing: Literal["dark", "bright"] = key(
+        "Whether a landing particle makes its position darker or brighter"
+    )
     events: Count = key("Landing events that were used")
     standards: list[Standard] = key("The standards, lightest first")
     peaks: list[ContrastPeak] = key("Every peak that was found")
     notes: list[str] = key("What the user should know, one line each")
-    recorded: Standards | None = key("With what the standards were recorded, null where unknown")
+    recorded: Standards | None = key("Optics and camera of the standards, null if unknown")
     histogram: Histogram = maybe("In the file: sizes of the contrasts")
     out: str = maybe("The folder that was written; not in the file")
 
@@ -157,13 +159,13 @@ class OpticsParameter(Closed):
     crb: Number = key("Its Cramér–Rao bound, null where it was not measured")
     configured: float = key("What the configuration says")
     state: Literal["measured", "held", "dropped", "given"] = key(
-        "measured; held, because the pictures do not determine it; dropped, because it improves "
-        "nothing; or given, because it was not asked for"
+        "measured; held, because the images do not determine it; dropped, because it does not "
+        "improve the fits; or given, because it was not to be learned"
     )
 
 
 class HeldOut(Closed):
-    """How pictures that were not fitted agree with a microscope."""
+    """How well optics describe images that were held out."""
 
     p_values: list[float] = key("Of each picture")
     chi2_reduced: list[float] = key("Of each picture")
@@ -171,7 +173,7 @@ class HeldOut(Closed):
 
 
 class Twin(Closed):
-    """Another microscope that makes the same pictures."""
+    """Other optics that give the same images."""
 
     settings: dict[str, float | bool | str] = key("Its parameters")
     gap: float = key("Log-likelihood by which it is worse")
@@ -184,17 +186,17 @@ class Template(Document):
     refusals: list[str] = key("Why it may not, one line each")
     particles: Count = key("Pictures that made it")
     contaminated: Count = key("Pictures left out, because something else happened in them")
-    determined: float = key("Numbers of the picture that the data determine")
+    determined: float = key("Degrees of freedom of the image that the data determine")
     peak_se: float = key("Relative standard error of the peak, common to all contrasts")
     pixel_nm: float = key("Pixel side [nm]")
     roi_nm: float = key("Side of the square in which it is known [nm]")
     held_out: HeldOut = key("Pictures that were held out, by a template of the others")
-    source: dict[str, str] = key("Where the pictures came from")
+    source: dict[str, str] = key("Source of the images")
     out: str = maybe("When printed: the output folder")
 
 
 class OpticsPictures(Closed):
-    """What the page shows."""
+    """Data of the page."""
 
     measured: list[list[float]] = key("Average contrast of the particles")
     model: list[list[float]] = key("The same, by the microscope that was found")
@@ -219,15 +221,15 @@ class Optics(Document):
     covariance: list[list[float]] = key("Of the measured parameters")
     correlation: list[list[float]] = key("Of the measured parameters")
     settings: dict[str, float | bool | str] = key("Keys of [optics]; aberrations by name [nm]")
-    held: dict[str, str] = key("Parameters that the pictures do not determine, and why")
+    held: dict[str, str] = key("Parameters that the images do not determine, and why")
     dropped: list[str] = key("Aberrations that improve nothing")
-    undecided: list[str] = key("Discrete properties that the pictures do not tell")
+    undecided: list[str] = key("Discrete properties that the images do not determine")
     twin: Twin | None = key("A second microscope that is as likely")
     held_out: HeldOut = key("Pictures that were not fitted, in the measured microscope")
     held_out_as_configured: HeldOut = key("The same in the configured microscope")
     particles: Count = key("Pictures that were used")
     contaminated: Count = key("Pictures left out because something else happened in them")
     source: dict[str, str] = key("Movie, its hash, and the program's version")
-    pictures: OpticsPictures = maybe("In the file: what the page shows")
+    pictures: OpticsPictures = maybe("In the file: data of the page")
     notes: list[str] = key("What the user should know, one line each")
     out: str = maybe("The folder that was written; not in the file")

@@ -10,7 +10,7 @@ Text = str | None
 
 
 class DayMovie(Document):
-    """A row of movies.csv; of a part, its name and state. The user's own columns are keys too."""
+    """A row of movies.csv; with --only, its name and state. The user's columns are keys too."""
 
     movie: str = key("Its name, which its result has too")
     state: Literal["done", "failed", "missing"] = key("What became of it")
@@ -108,7 +108,7 @@ class DayKd(Closed):
 
 
 class NotDone(Closed):
-    """A movie, a calibration or a K_D that there is not."""
+    """A movie, a calibration or a K_D that failed."""
 
     name: str = key("Which")
     why: str = key("What went wrong, or that it is not analysed yet")

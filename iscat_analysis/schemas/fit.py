@@ -42,17 +42,17 @@ class Medians(Document):
     crb_median: Number = key("Cramér–Rao bound [nm or kDa]")
     qcrb_median: Number = key("Quantum Cramér–Rao bound [nm or kDa]")
     holevo_median: Number = maybe(
-        "Holevo bound of all free parameters at once, where height and mass are both free [nm, kDa]"
+        "Holevo bound of all free parameters at once, if height and mass are both free [nm, kDa]"
     )
     sigma_over_crb_median: Number = key("Near 1 by construction: σ and CRB are both from the model")
     information_fraction_median: Number = key(
-        "(QCRB/CRB)², or (Holevo/CRB)² where height and mass are both free: the share that is used "
-        "of what can be had of the light's information"
+        "(QCRB/CRB)², or (Holevo/CRB)² if height and mass are both free: the share of the light's "
+        "accessible information that is used"
     )
     systematic_median: Number = maybe("Error common to the movie, from calibrations [nm or kDa]")
     repeat_over_crb: Number = maybe(
         "Measured spread over the Cramér–Rao bound: from parts of the events' own frames and, at "
-        "full length, from places without a particle; in mode track from these alone"
+        "full length, from places without a particle; in mode track only from these places"
     )
     repeat_over_crb_ci95: tuple[Number, Number] = maybe("Its 95 % interval")
     repeat_significance: Number = maybe("Its difference from 1, in standard errors")
@@ -61,17 +61,17 @@ class Medians(Document):
         "Whether the noise was seen at the full length of the windows; otherwise in parts of them"
     )
     repeat_frames: list[Number] = maybe(
-        "Frames averaged; in mode track those from a frame to the middle of the background"
+        "Frames averaged; in mode track, frames from a frame to the middle of the background"
     )
     repeat_over_crb_by_frames: list[Number] = maybe(
-        "Spread of averages of so many of the events' own frames over their bound; in mode track "
-        "that of single frames so far from the background, where there is no particle"
+        "Spread of averages of this number of the events' own frames over their bound; in mode "
+        "track, spread of single frames at this distance from the background, without a particle"
     )
     repeat_over_crb_by_frames_se: list[Number] = maybe("Its standard errors")
     empty_over_crb: list[Number] = maybe(
         "The same without a particle: between eight parts of a window, neighbouring eighths, "
         "quarters, halves, and whole windows; in mode track between successive frames, and of all "
-        "against the background; empty where there is no room"
+        "against the background; empty if the field has no such places"
     )
 
 
@@ -104,7 +104,7 @@ class Spectrum(Closed):
 
 
 class Lines(Closed):
-    """What of the light flickered or changed over the field, and was divided out of each frame."""
+    """Flicker and changes of the light over the field, which were divided out of each frame."""
 
     row_share: NotNegative = key("Part of the noise variance that each row had in common")
     column_share: NotNegative = key("Part of the noise variance that each column had in common")
@@ -114,7 +114,7 @@ class Lines(Closed):
     fringe_rms: NotNegative = key("Relative rms of their changes between frames that are compared")
     seam_rows: list[Count] = key("First rows of parts of the field that had factors of their own")
     seam_columns: list[Count] = key("First columns of such parts")
-    haze: NotNegative = key("Range of what is added to all pixels, over the mean light; 0: none")
+    haze: NotNegative = key("Range of the light added to all pixels, over the mean light; 0: none")
 
 
 class Noise(Document):
@@ -123,16 +123,14 @@ class Noise(Document):
     noise_frames: list[Count] = key("Frames averaged")
     noise_variance_over_shot: list[Number] = key("Variance over that of the photoelectrons")
     shot_noise_limited_frames: int | None = key("Frames that may be averaged before other noise")
-    noise_spectrum: Spectrum | None = key(
-        "Between neighbouring frames; null where it is as expected"
-    )
+    noise_spectrum: Spectrum | None = key("Between neighbouring frames; null if it is as expected")
 
 
 class Background(Noise):
     """A movie with background frames: its noise, and its drift to the frames after."""
 
     drift_px: tuple[float, float] | None = key(
-        "Drift of the fixed pattern along y and x [px]; null where there is none to follow"
+        "Drift of the fixed pattern along y and x [px]; null if there is no pattern to follow"
     )
     drift_error_px: tuple[float, float] | None = key("Its standard errors [px]")
 
@@ -146,12 +144,12 @@ class Landing(Document):
     noise_frames: list[Count] = maybe("Frames averaged")
     noise_variance_over_shot: list[Number] = maybe("Variance over that of the photoelectrons")
     shot_noise_limited_frames: int | None = maybe("Frames that may be averaged before other noise")
-    noise_spectrum: Spectrum | None = maybe("Between neighbouring frames; null where as expected")
+    noise_spectrum: Spectrum | None = maybe("Between neighbouring frames; null if as expected")
     stride_frames: Natural = maybe("From one searched boundary to the next")
     boundaries_searched: Count = maybe("Boundaries that share the expected false alarms")
     searched_share: Share | None = maybe(
-        "Share of field and time in which a particle of searched_snr is found; what bright or "
-        "ill-described particles left over hides the rest"
+        "Share of field and time in which a particle of searched_snr is found; elsewhere residuals "
+        "of bright or badly described particles hide it"
     )
     searched_snr: NotNegative = maybe("Median signal-to-noise ratio of the events that are ok")
     partly_searched: list[tuple[Count, Count, Share]] = maybe(
@@ -171,13 +169,13 @@ class Injection(Closed):
     """Known particles added to the movie: how many were found again, and how well."""
 
     stay_frames: Count | None = maybe(
-        "Frames that every added particle stays at least; recall says nothing of briefer visitors"
+        "Least number of frames that an added particle stays; recall is not for shorter stays"
     )
     added: Count = key("Steps added: each particle lands, and leaves unless the movie ends first")
     recovered: Count = key("Steps found again")
     recall: Share = key("Their share")
     predicted: Share = maybe(
-        "Recall that the Fisher information makes of the masses added, in the share searched"
+        "Recall expected from the Fisher information of the masses added, in the share searched"
     )
     isolated: Count = key("Steps with no other one near in place and time")
     recall_isolated: Share = key("Share of these that was found")
@@ -208,15 +206,15 @@ class Repeats(Closed):
     """Whether the measured spread agrees with σ."""
 
     understated: bool = key("Whether σ is smaller than the measured spread; --strict fails then")
-    message: str = key("What the user is told; empty where they agree")
-    cause: str = key("What kind of noise it looks like")
+    message: str = key("Warning for the user; empty if they agree")
+    cause: str = key("The likely kind of noise")
 
 
 class CameraNumber(Closed):
     """A number of the camera."""
 
     value: Number = key("The number that was used; of a map the mean")
-    se: NotNegative = key("Its standard error; 0 where it is not known")
+    se: NotNegative = key("Its standard error; 0 if it is not known")
     from_: str = Field(
         alias="from",
         description="measured from the movie's light, dark frames, rounding, effective (of frames "
@@ -232,13 +230,13 @@ class CameraLaw(Closed):
         "not follow the laser"
     )
     value: Number = key(
-        "Its number: the exponent of gamma, how far pixels are filled, or a share of the light"
+        "Its parameter: the exponent of gamma, the filling of pixels, or a share of the light"
     )
     se: NotNegative = key("Its standard error")
     contrast: Number = key("Contrast that is measured, over the true one")
     contrast_se: NotNegative = key("Its standard error")
     alike: list[str] = key("Other laws that describe the pixels as well")
-    flickers: bool = key("Whether the laser's power changes enough to tell")
+    flickers: bool = key("Whether the laser's power changes enough to distinguish the laws")
 
 
 class CameraNumbers(Closed):
@@ -247,64 +245,66 @@ class CameraNumbers(Closed):
     gain_e_per_adu: CameraNumber = key("Photoelectrons per count [e]")
     offset_adu: CameraNumber = key("Counts in the dark [counts]")
     read_noise_e: CameraNumber = key("Read noise, standard deviation per frame [e]")
-    law: CameraLaw = maybe("Where the pixels differ in brightness: how counts grow with the light")
+    law: CameraLaw = maybe("If the pixels differ in brightness: how counts grow with the light")
 
 
 class Processed(Closed):
-    """What was done to the frames since the camera gave them."""
+    """Processing of the frames after the camera."""
 
     kind: Literal["interpolated", "smoothed", "sharpened"] = key("What it was")
-    finest: NotNegative = key("Noise of the finest patterns over that of coarser ones; 1 where raw")
-    uneven: NotNegative = key("By how much of itself it changes from frame to frame; 0 where raw")
+    finest: NotNegative = key("Noise of the finest patterns over that of coarser ones; 1 if raw")
+    uneven: NotNegative = key("Its relative change from frame to frame; 0 if raw")
 
 
 class Changes(Closed):
-    """What becomes of clear changes between averages of 20 frames, in the first 2000 at most."""
+    """Clear changes between averages of 20 frames, in the first 2000 frames at most."""
 
     number: Count = key("Changes above 12 standard deviations, away from each other")
-    staying: Share = key("Share that stay, with one picture: particles that land or leave")
-    moving: Share = key("Share around which there are three pictures or more: particles that move")
+    staying: Share = key("Share that stay, with one image: particles that land or leave")
+    moving: Share = key("Share around which there are three images or more: particles that move")
 
 
 class Blocks(Closed):
-    """Mode track without background frames: blocks of frames that have a background each."""
+    """Mode track without background frames: blocks of frames, each with its own background."""
 
     number: Count = key("How many")
     frames: Count = key("Frames of the longest")
     drift_px: tuple[float, float] | None = key(
-        "Shift of the fixed pattern from the first frames to the last (y, x) [px]; null where it "
-        "was not looked at, or there is none to follow"
+        "Shift of the fixed pattern from the first frames to the last (y, x) [px]; null if it was "
+        "not measured, or there is no pattern to follow"
     )
     drift_over_counting: Number = key(
-        "What that changes of a background within its block, over its counting noise: variances"
+        "Variance that this shift adds to a background within its block, over its counting noise"
     )
 
 
 class Heights(Closed):
     """Heights of the particles in mode mass, beyond the errors of each."""
 
-    mean_nm: Number = key("Mean [nm]; of heights that are held, one step of scoring from there")
+    mean_nm: Number = key("Mean [nm]; if heights are held, one scoring step from there")
     mean_se_nm: NotNegative = key("Its standard error [nm]")
     sd_nm: NotNegative = key("Standard deviation of the heights [nm]")
     sd_ci95_nm: tuple[NotNegative, NotNegative] = key("Its 95 % interval [nm]")
-    events: Count = key("Events that tell them")
+    events: Count = key("Events used")
     held: bool = key("Whether one height was held for all, so that no row has its own")
     mean_is_of_learned_optics: bool = key(
-        "Whether the optics were learned from the same particles: their focus and a common height "
-        "are then one number, and the mean is where the optics put it"
+        "Whether the optics were learned from the same particles: focus and common height cannot "
+        "be told apart then, and the mean is that of the learned optics"
     )
 
 
 class Extension(Closed):
-    """Width of the particles' pictures beyond that of the model's."""
+    """Width of the particles' images beyond that of the model."""
 
-    variance_nm2: Number = key("Mean variance of places along each axis [nm²]; null of few events")
+    variance_nm2: Number = key(
+        "Mean variance of positions along each axis [nm²]; null if few events"
+    )
     variance_se_nm2: Number = key("Its standard error [nm²]")
     flagged: Count = key("Rows that are flagged extended for it")
 
 
 class Fluctuation(Closed):
-    """Slow fluctuation of contrasts while particles are there, which sigma_mass_kda has."""
+    """Slow fluctuation of contrasts while particles are there, part of sigma_mass_kda."""
 
     relative: NotNegative = key("Standard deviation over the contrast")
     relative_se: NotNegative = key("Its standard error")
@@ -312,25 +312,25 @@ class Fluctuation(Closed):
 
 
 class Learned(Closed):
-    """What ``optics.calibrate`` did: the test of the optics, and what was learned of them."""
+    """The test of the optics by ``optics.calibrate``, and the learned optics."""
 
-    tested: Count = maybe("Bright particles that stand alone, or tracks")
-    median_p: Share = maybe("Median p-value of the brightest in the configured optics")
+    tested: Count = maybe("Bright isolated particles, or tracks")
+    median_p: Share = maybe("Median p-value of the brightest with the configured optics")
     left_over: Number = maybe(
-        "Of the pictures of tracks, what the configured optics leave over beyond the noise, over "
-        "the picture (root mean square)"
+        "Residual of the averaged images of tracks with the configured optics, beyond the noise, "
+        "over the image (root mean square)"
     )
     left_over_then: Number = maybe(
-        "The same of learned optics that are used though pictures that were not fitted reject them"
+        "The same with learned optics that are used although images that were held out reject them"
     )
     calibrated: bool = key("Whether the analysis used learned optics")
-    reason: str = maybe("Why it did not, where the test asked for it or could not be made")
-    accepted: bool = maybe("Whether what was learned could be used")
+    reason: str = maybe("Why not, if the test asked for it or was not possible")
+    accepted: bool = maybe("Whether the learned optics could be used")
     refusals: list[str] = maybe("Why not, one line each")
     parameters: list[OpticsParameter] = maybe("Every parameter")
-    names: list[str] = maybe("The measured ones, in the order of covariance")
+    names: list[str] = maybe("Measured parameters, in the order of covariance")
     covariance: list[list[float]] = maybe("Of the measured parameters")
-    twin: Twin | None = maybe("A second microscope that is as likely")
+    twin: Twin | None = maybe("Second optics that are as likely")
     notes: list[str] = maybe("What the user should know, one line each")
 
 
@@ -342,11 +342,11 @@ class Distribution(Document):
     species: list[dict[str, Any]] = key(
         "By rising mass [kDa]; *_low and *_high are 95 % intervals of a parametric bootstrap; "
         "width_kda is beyond measurement error; mass_systematic is the error of the mass scale, "
-        "which the mass's interval holds; efficiency is of particles that stay as long as the "
-        "window, and every other one that stays stay_frames is found; count is of the events "
-        "seen, count_corrected and fraction are of the particles that came; an outlier holds "
-        "fewer than three events, and has no fraction; one that is detected less than once in 20 "
-        "times is not determined, and count_corrected, fraction and interval are null"
+        "which the interval of the mass includes; efficiency is for particles that stay as long "
+        "as the window, and half of those that stay stay_frames are found; count is of the events "
+        "found, count_corrected and fraction are of the particles that landed; an outlier has "
+        "fewer than three events, and no fraction; a species that is detected less than once in "
+        "20 times is not determined, and count_corrected, fraction and interval are null"
     )
     selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
     support: Number = key("Share of simulated repetitions in which BIC chose the same number")
@@ -369,32 +369,32 @@ class BudgetEntry(Closed):
     name: str = key("What it is")
     kind: Literal["measured", "learned", "assumed"] = key("How its size is known")
     common: bool = key("Whether all rows share it; these add up to systematic_mass_kda")
-    sigma_mass_kda: Number = key("Its standard deviation [kDa]; null where nothing tells it")
+    sigma_mass_kda: Number = key("Its standard deviation [kDa]; null if it is not known")
     sigma_rel: Number = key("The same over the mass")
-    dof: Number = key("Degrees of freedom; null where there are many, or it was not measured")
-    remedy: str = key("What would shrink it")
+    dof: Number = key("Degrees of freedom; null if there are many, or it was not measured")
+    remedy: str = key("What would reduce it")
 
 
 class Scale(Closed):
-    """How far the scale of masses was carried from the optics of its standards."""
+    """The conversion of the mass scale from the optics of the standards to those of the movie."""
 
     carried: Number = key("Contrast per kDa with these optics over that with the standards'")
     optics: Literal["recorded", "configured"] = key(
-        "Where the standards' are from: their record, or the configuration for want of one"
+        "Source of the standards' optics: stored with the calibration, or else the configuration"
     )
-    refusal: str | None = key("Why the model does not carry the scale so far; rows are flagged")
+    refusal: str | None = key("Why the model cannot convert the scale; rows are flagged")
 
 
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
     events: Count = key("How many events there are, side lobes left out")
-    mode: Mode = key("What was free")
+    mode: Mode = key("Mode: which parameters were free")
     scheme: Scheme = key("Optical scheme")
     emission: Emission = key("Emission model")
     convention: Convention = key("Formulas")
     mass_scale: str = key("Where the mass scale comes from: a calibration, or the model")
-    scale: Scale = maybe("With a calibration: how far it was carried")
+    scale: Scale = maybe("With a calibration: its conversion to the optics of the movie")
     status: dict[str, Count] = key("Events by status")
     frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")
     frames_after: tuple[Count, Count] | None = key("Fitted frames [start, stop)")
@@ -414,25 +414,25 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
-    processing: Processed = maybe("Where the frames are not as the camera gave them")
+    processing: Processed = maybe("If the frames were processed after the camera")
     changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
-    blocks: Blocks = maybe("Mode track: blocks of frames that have a background each")
+    blocks: Blocks = maybe("Mode track: blocks of frames, each with its own background")
     tracks: Count = maybe("Mode track: tracks found")
-    motion: Motion = maybe("Mode track: what the tracks come to")
-    budget: list[BudgetEntry] = maybe("Where masses are fitted: what their error is made of")
+    motion: Motion = maybe("Mode track: medians and counts of the tracks")
+    budget: list[BudgetEntry] = maybe("If masses are fitted: the sources of their error")
     across_particles: list[Across] = maybe(
-        "Width of each species beyond σ; where the model is rejected, poor fits are counted too"
+        "Width of each species beyond σ; if the model is rejected, poor fits are counted too"
     )
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
-    extension: Extension = maybe("Mode mass: width of the pictures beyond that of the model's")
-    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, where it is seen")
+    extension: Extension = maybe("Mode mass: width of the images beyond that of the model")
+    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, if it is seen")
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
-        "Where rows, columns or a smooth part of the light changed, and were corrected"
+        "If rows, columns or a smooth part of the light changed, and were corrected"
     )
-    optics: Learned = maybe("Where the optics were tested: the test, and what was learned")
+    optics: Learned = maybe("If the optics were tested: the test, and the learned optics")
     distribution: Distribution | None = maybe(
-        "Species; null where masses are not fitted once per event"
+        "Species; null if masses are not fitted once per event"
     )
 
 

@@ -21,11 +21,11 @@ class SetupValue(Document):
 
 
 class Look(Document):
-    """What the search saw at some places of the movie."""
+    """What the search found in some parts of the movie."""
 
     frames: list[Count] = key("The frames at which it looked")
     window: Natural = key("Frames in each of its windows")
-    candidates: list[Count] = key("How many candidates there were at each place")
+    candidates: list[Count] = key("Number of candidates in each part")
     threshold_snr: Number = key("Signal-to-noise ratio above which something is a candidate")
     strongest_snr: Number = key("That of the strongest candidate")
     noise_contrast: Number = key("Standard deviation of a pixel of the contrast that is searched")

@@ -21,7 +21,7 @@ else:
 
 
 class Motion(Document):
-    """What the tracks of a movie come to; medians are over those that are ok."""
+    """Medians and counts of the tracks of a movie; medians are over those that are ok."""
 
     frame_rate_hz: Number = key("Frames per second; null: there is no D")
     exposure_ms: Number = key("Time over which motion is averaged; null: all of it")

@@ -27,7 +27,7 @@ import pandas as pd
 
 from iscat_analysis.bounds import peak_gradient
 from iscat_analysis.config import Config
-from iscat_analysis.optics.forward import PEAK_REACH, PixelGrid, forward_model, signed_peak
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, PixelGrid, forward_model, signed_peak
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.response import Response, at_standards, response_of
 
@@ -145,7 +145,7 @@ def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> 
 
     def peak(sign: float) -> float:
         moved = _moved(key, config, sign * _STEP * sigma)
-        reach_nm = PEAK_REACH * moved.optics.wavelength_nm / moved.optics.na
+        reach_nm = PEAK_SEARCH_RADIUS * moved.optics.wavelength_nm / moved.optics.na
         return signed_peak(forward_model(moved, reach_nm))
 
     shift = 0.0

@@ -85,7 +85,7 @@ def test_every_complaint_is_in_the_one_line() -> None:
 
 IMPOSSIBLE = [
     (["optics.na=1.6"], "na = 1.6 must be below n_immersion"),
-    (["calibration.gradient_per_kda=-3.1"], "gradient_per_kda = -3.1 has not between 1e-07 and"),
+    (["calibration.gradient_per_kda=-3.1"], "gradient_per_kda = -3.1 is not between 1e-07 and"),
     (["calibration.gradient_per_kda=-3.1e-8"], "as -3.1e-5, not in per cent or ppm, nor per Da"),
     (["optics.n_sample=133"], "n_sample: a refractive index of 133 is not between 1 and 4.5"),
     (["optics.attenuation=10"], "attenuation = 10 is more than 3: it is the part"),

@@ -168,7 +168,7 @@ def test_an_optics_file_brings_its_template(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"fit.mode": "joint"}, r'"joint" needs the picture at every height'),
+        ({"fit.mode": "joint"}, r'"joint" needs the image at every height'),
         ({"optics.scheme": "darkfield"}, "needs an interferometric scheme"),
         ({"camera.pixel_size_nm": 84.0}, "measured with pixels of 100 nm"),
         ({"fit.roi_nm": 2500.0}, "known in a square of 1500 nm"),

@@ -1,16 +1,16 @@
 """Contrast becomes mass: a line through standards, with errors in both coordinates.
 
-The calibration is odd-symmetric, so that a particle that leaves weighs what it weighed when it
-landed: a landing particle of mass m has the contrast c = s·m + o, a leaving one −c.  Where landing
-darkens (s < 0) that is m = sign(−c)·(−|c| − o)/s, as Refeyn's programs have it.  A plain line
-through both branches is wrong by 2|o/s| on one of them.
+The calibration is odd-symmetric, so that a particle has the same mass when it lands and when it
+leaves: a landing particle of mass m has the contrast c = s·m + o, a leaving one −c.  If landing
+darkens (s < 0), this is m = sign(−c)·(−|c| − o)/s, as in Refeyn's programs.  A straight line
+through both branches is wrong by 2|o/s| for one of them.
 
 Peaks are fitted to events, not to bins: a normal distribution on a flat background, by maximum
 likelihood inside the peak's own window.  The line through the peaks is that of York et al., Am. J.
 Phys. 72, 367 (2004).
 
-`calibrate` is the whole of it: `peaks` finds them, `matching` says which belongs to which standard,
-`line` fits, and `result` converts.  `standards` keeps with what optics all that was measured.
+`calibrate` runs all steps: `peaks` finds the peaks, `matching` assigns them to standards, `line`
+fits the line, and `result` converts contrasts.  `standards` stores the optics of the measurement.
 """
 
 from __future__ import annotations

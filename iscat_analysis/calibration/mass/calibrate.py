@@ -18,17 +18,17 @@ from iscat_analysis.errors import ConfigError, DataError, SignError
 from iscat_analysis.records import FloatArray
 
 STANDARD_ERROR = 0.01
-"""Relative uncertainty of a standard's mass, where none is given: sequence, glycans, density."""
+"""Relative uncertainty of a standard's mass if none is given: sequence, glycans, density."""
 
 LEAST_EVENTS = 30
-"""Fewer events make no histogram."""
+"""Fewest events for a histogram."""
 
 _LANDING_SHARE = 0.4
-_PER_KDA = (3e-7, 1.5e-3)
-# Contrast per kDa of any microscope: 3e-5 at visible light, and up to 30 times as much where a mask
-# dims the reference; less of dense metals, and of a reference that is not dimmed, far into the red.
-_LIGHT_KDA = 10.0  # lighter than any standard that is seen
-_DETAILS = (1.0, 2.0, 4.0, 0.5)
+_CONTRAST_PER_KDA = (3e-7, 1.5e-3)
+# Contrast per kDa of any microscope: 3e-5 in visible light, up to 30 times as much if a mask dims
+# the reference; less for dense metals, and at long wavelengths if the reference is not dimmed.
+_LIGHTEST_KDA = 10.0  # lighter than any standard that can be detected
+_KERNEL_WIDTHS = (1.0, 2.0, 4.0, 0.5)
 
 
 def calibrate_mass(
@@ -63,13 +63,13 @@ def calibrate_mass(
         raise DataError(
             f"{name}: holds {size.size} landing events; a calibration needs {LEAST_EVENTS} or more"
         )
-    # The kernel's width follows the spread of the whole histogram, which is too wide where few
-    # events lie in narrow peaks far apart: finer ones are for those.  A dozen events in a peak
-    # stand out by three standard errors only under a kernel as wide as the peak: the coarser one.
-    # Standards chosen at random hardly pass more often for it (3 in 100 of them did, with twelve
-    # events each), since a line through other peaks must meet the same limits.
+    # The kernel's width follows the spread of the whole histogram.  It is too wide for few events
+    # in narrow peaks far apart, which need finer kernels.  A dozen events in a peak exceed three
+    # standard errors only with a kernel as wide as the peak, the coarser one.  Trying several
+    # kernels hardly accepts more wrong standards (3 in 100 random ones, with twelve events each),
+    # since a line through other peaks must meet the same limits.
     refusals: list[tuple[int, DataError]] = []
-    for detail in _DETAILS:
+    for detail in _KERNEL_WIDTHS:
         peaks = find_contrast_peaks(size, size_errors, detail=detail)
         try:
             chosen = match(peaks, masses, name)
@@ -132,8 +132,8 @@ def _standards(
 
 
 def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str) -> None:
-    """Refuse a line that no microscope has: numbers of another unit."""
-    low, high = _PER_KDA
+    """Refuse a line that no microscope can have, which shows that a unit is wrong."""
+    low, high = _CONTRAST_PER_KDA
     if low <= abs(slope) <= high:
         return
     shown = ",".join(f"{m:g}" for m in masses)
@@ -145,7 +145,7 @@ def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
         )
-    if masses.max() < _LIGHT_KDA:
+    if masses.max() < _LIGHTEST_KDA:
         raise DataError(
             f"{problem}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
         )

@@ -1,4 +1,4 @@
-"""Which peak belongs to which standard, and whether any do."""
+"""Assign peaks to standards, or say why no assignment fits."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
 
 LEAST_PROBABILITY = 1e-4
-"""A line whose χ² is less probable than this does not go through its standards."""
+"""A line whose χ² is less probable than this does not fit its standards."""
 
 OFFSET_SHARE = 0.35
-"""Of the lightest peak's contrast, the share that the contrast of zero mass may be."""
+"""Largest contrast at zero mass, over the contrast of the lightest peak."""
 
-_FITS = 0.05  # relative distance within which a standard is said to fit, when others do not
-_MOST_STANDARDS = 8  # of more, no subsets are tried for a message
+_FITTING_DISTANCE = 0.05  # largest relative distance of a standard that a message says to fit
+_MOST_STANDARDS = 8  # with more, no subsets are tried for a message
 
 
 def match(peaks: Sequence[ContrastPeak], masses: FloatArray, name: str) -> list[ContrastPeak]:
-    """Choose the peaks that a line with a small offset puts nearest the standards.
+    """Choose the peaks that are nearest to the standards on a line with a small offset.
 
     Shapes: `masses` (n,).
     """
@@ -45,7 +45,7 @@ def check_match(
     masses: FloatArray,
     name: str,
 ) -> None:
-    """Refuse a line that misses its standards by its χ², or does not begin near zero.
+    """Refuse a line whose χ² is too large, or whose offset is too far from zero.
 
     Shapes: `masses` (n,).
     """
@@ -68,7 +68,7 @@ def check_match(
 
 
 def _nearest(peaks: Sequence[ContrastPeak], masses: FloatArray) -> tuple[list[ContrastPeak], float]:
-    """Choose peaks for the standards, and say how far off they are altogether."""
+    """Choose peaks for the standards, and give their total distance from the line."""
     most = max(peak.count for peak in peaks)
     best, least = list(peaks[: masses.size]), math.inf
     for chosen in combinations(peaks, int(masses.size)):
@@ -104,7 +104,7 @@ def _fitting(peaks: Sequence[ContrastPeak], masses: FloatArray) -> FloatArray | 
             contrast = np.array([peak.contrast for peak in chosen])
             slope, offset = np.polyfit(some, contrast, 1, w=1 / contrast)
             off = np.abs((contrast - offset) / slope / some - 1).max() if slope > 0 else math.inf
-            if off < _FITS and abs(offset) < OFFSET_SHARE * contrast[0]:
+            if off < _FITTING_DISTANCE and abs(offset) < OFFSET_SHARE * contrast[0]:
                 fits.append((cost, some))
         if fits:
             return min(fits, key=lambda fit: fit[0])[1]

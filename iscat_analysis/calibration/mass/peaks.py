@@ -1,4 +1,4 @@
-"""The peaks of |contrast|: found in a kernel density, fitted to the events themselves."""
+"""The peaks of |contrast|: found in a kernel density, then fitted to the events."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from iscat_analysis.records import FloatArray
 
 _PROMINENCE_SIGMAS = 3.0
 _MOST_PEAKS = 10
-_CORE_SIGMAS = 2.5  # standard deviations of a peak that are fitted: its tails are other things
+_CORE_SIGMAS = 2.5  # half-width of the fitted core of a peak: its tails contain other events
 _WINDOWS = 8
 _LEAST_IN_PEAK = 5
 _GRID = 4096
@@ -84,7 +84,7 @@ def find_contrast_peaks(
 def _settled_peak(
     x: FloatArray, sigma: FloatArray, limits: tuple[float, float], centre: float, width: float
 ) -> ContrastPeak | None:
-    """Fit a peak, then again within the window that its own width asks for, until it stays."""
+    """Fit a peak, then again within the window of the fitted width, until it converges."""
     peak = None
     noise = float(np.sqrt(np.mean(sigma**2)))
     for _ in range(_WINDOWS):

@@ -1,4 +1,4 @@
-"""The line between contrast and mass, and what it makes of a contrast."""
+"""The line between contrast and mass, and the conversion of contrasts."""
 
 from __future__ import annotations
 
@@ -90,9 +90,9 @@ class MassCalibration:
     def to_toml(self) -> str:
         """Write the section ``[calibration]`` to paste into a configuration.
 
-        The standard errors of the line and their correlation are part of it, so that analyses can
-        say what the calibration contributes to the error of each mass; and so are the optics of
-        the standards, where they are known.
+        The section contains the standard errors of the line and their correlation, from which an
+        analysis computes the contribution of the calibration to the error of each mass.  It also
+        contains the optics of the standards if they are known.
         """
         s_se, o_se = (math.sqrt(self.covariance[k, k]) for k in (0, 1))
         return (

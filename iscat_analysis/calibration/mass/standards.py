@@ -1,7 +1,7 @@
-"""The microscope of the standards: what a calibration of masses keeps of it.
+"""The optics of the standards, which a mass calibration stores.
 
-Contrast per mass belongs to the optics with which it was measured.  A calibration that knows them
-serves movies of other optics too, because the model carries it over (`optics.scale`).
+Contrast per mass depends on the optics with which it was measured.  A calibration that stores them
+can be used for movies with other optics too, because the model converts it (`optics.scale`).
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from iscat_analysis.config import (
     StandardsCamera,
     toml_value,
 )
-from iscat_analysis.optics.forward import PEAK_REACH, forward_model
+from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 
 _OF_A_MOVIE = {
     "file": None, "covariance": None, "calibrate": "auto", "focus_drift_nm": 0.0, "focus_frame": 0,
 }  # fmt: skip
-"""Keys of [optics] that say nothing of the contrast of standards, and what they are set to."""
+"""Keys of [optics] that do not change the contrast of standards, and their neutral values."""
 
 
 @dataclass(frozen=True)
 class Standards:
-    """With what the standards of a calibration were recorded and analysed."""
+    """Optics and camera with which the standards of a calibration were recorded and analysed."""
 
     optics: Optics
     covariance: OpticsCovariance | None
@@ -50,7 +50,7 @@ class Standards:
         return "\n".join([*lines, ""])
 
     def to_dict(self) -> dict[str, Any]:
-        """Give what ``calibration.json`` says of them."""
+        """Give the entries of ``calibration.json``."""
         return {
             "optics": _optics_keys(self.optics),
             "covariance": None if self.covariance is None else self.covariance.model_dump(),
@@ -77,7 +77,7 @@ def standards_of(config: Config) -> Standards:
 
 
 def with_standards(config: Config) -> Config:
-    """Take a gradient that came without a record as measured at the configured optics."""
+    """Assume that a gradient without stored optics was measured with the configured optics."""
     line = config.calibration
     if line is None or line.optics is not None:
         return config
@@ -90,7 +90,7 @@ def with_standards(config: Config) -> Config:
 
 
 def as_given(config: Config) -> Config:
-    """Take back what `with_standards` assumed, where the optics are still those configured."""
+    """Undo `with_standards` if the optics are still those configured."""
     line = config.calibration
     if line is None or not line.optics_assumed or standards_of(config).optics != line.optics:
         return config
@@ -99,9 +99,9 @@ def as_given(config: Config) -> Config:
 
 
 def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
-    """Give the contrast per mass over that of standards, and why the model does not carry it."""
+    """Give the contrast per mass over that of standards, and why it cannot be converted."""
     config = config.model_copy(update={"calibration": None})
-    reach_nm = PEAK_REACH * config.optics.wavelength_nm / config.optics.na
+    reach_nm = PEAK_SEARCH_RADIUS * config.optics.wavelength_nm / config.optics.na
     rises = (
         forward_model(config, reach_nm).peak_contrast(config.particle.nominal_height_nm, 1e-3) > 0
     )

@@ -32,7 +32,7 @@ from iscat_analysis._kernels.canvas import (
     Light,
     Pictures,
     add_squares,
-    leave_over,
+    subtract_expected,
 )
 from iscat_analysis._kernels.moving import Search
 from iscat_analysis._kernels.scoring import CONVERGED
@@ -291,7 +291,7 @@ class MovingField:
         else:
             signal = self._signal(rows, first, last)
         left = np.empty_like(signal)
-        leave_over(self._light(ground), signal, first, left)
+        subtract_expected(self._light(ground), signal, first, left)
         return left
 
     def add_squares(
