@@ -120,7 +120,7 @@ def fit_equilibrium(
     predicted = _share(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
     reach = _SIGMAS * errors
     constants = equilibrium.constants(found.theta)
-    constant_errors = equilibrium.constants(np.sqrt(np.diag(found.covariance())))
+    constant_errors = equilibrium.constants(found.errors())
     return EquilibriumFit(
         kd_nm=math.exp(constants["ln_kd"]),
         kd_low=low,
@@ -319,7 +319,7 @@ def _interval(
             branch[ln_kd] = maximise(held, start, nearest.curvature)
         return 2 * max(found.value - max(branch[ln_kd].value for branch in branches), 0.0)
 
-    first = _SIGMAS * math.sqrt(float(found.covariance()[at, at]))
+    first = _SIGMAS * float(found.errors()[at])
     low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])

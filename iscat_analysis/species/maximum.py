@@ -61,6 +61,11 @@ class Maximum:
         found[inside] = np.linalg.pinv(self.curvature[inside], hermitian=True)
         return found
 
+    def errors(self) -> FloatArray:
+        """Give standard errors (p,), infinite where the function does not fall to both sides."""
+        variances = np.diag(self.covariance())
+        return np.sqrt(np.where(variances < 0, np.inf, variances))
+
 
 def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None) -> Maximum:
     """Climb from a start to a maximum; `near` are second derivatives from close by, which are kept.
