@@ -127,7 +127,7 @@ def watch(
         notify=warn,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, warn), _Folder(place, results, warn)
+    run, seen = _Run(analyse, standards, warn), WatchedFolder(place, results, warn)
     ended = stop or threading.Event()
     done: Look | None = None
     try:
@@ -172,7 +172,7 @@ class _ParticleImage:
         return self.looks >= PATIENCE or (self.looks > 0 and self.readable)
 
 
-class _Folder:
+class WatchedFolder:
     """Looks at a folder."""
 
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:

@@ -98,7 +98,7 @@ def species_of(
     """Describe the species of all events, of which so large a share could be seen."""
     good = table[table["status"] == Status.OK]
     distribution = _distribution(context, good, searched or 1.0)
-    across = _across(context, table, distribution)
+    across = precision_across(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
 
@@ -152,7 +152,7 @@ def _distribution(
     return found.to_dict()
 
 
-def _across(
+def precision_across(
     context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""

@@ -163,7 +163,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
     table = counted(table)
     values, sigma, label = _main_values(analysis, table)
     finite, good = np.isfinite(values), _is_ok(table)
-    bins = _bins(float(np.ptp(values[finite])), sigma[good & np.isfinite(sigma)])
+    bins = histogram_bins(float(np.ptp(values[finite])), sigma[good & np.isfinite(sigma)])
     edges = np.histogram_bin_edges(values[finite], bins=bins)
     figure = new_figure(6.2, 3.2)
     axes = figure.add_subplot()
@@ -279,7 +279,7 @@ def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
     return figure
 
 
-def _bins(extent: float, spread: FloatArray) -> int:
+def histogram_bins(extent: float, spread: FloatArray) -> int:
     """Count bins of two standard deviations, which do not blur neighbouring species."""
     width = 2 * float(np.median(spread)) if spread.size else 0.0
     return int(np.clip(extent / width, 10, 90)) if width > 0 else 10

@@ -128,7 +128,7 @@ def plan_blocks(
         return Plan(_spans(first, last, count))
     shift = way.at(np.arange(first, last, dtype=float))
     moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * _unrest(way.shift_px)))
+    unrest = float(np.sum(stiffness * unrest_of(way.shift_px)))
 
     def cost_of(count: int) -> float:
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
@@ -214,7 +214,7 @@ def _stiffness(
     return total / len(means_e)
 
 
-def _unrest(shift_px: FloatArray) -> FloatArray:
+def unrest_of(shift_px: FloatArray) -> FloatArray:
     """Covariance (2, 2) of what pulls at single shifts, as bright particles do.
 
     It is that of second differences, over 6, in which a steady drift does not show.

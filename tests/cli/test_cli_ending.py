@@ -46,8 +46,15 @@ sys.exit(iscat_cli.main())
 """
 
 
-@pytest.mark.parametrize("where", ["compiled", "in_a_thread"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [
+        ("compiled", signal.SIGINT),
+        ("in_a_thread", signal.SIGTERM),
+        pytest.param("compiled", signal.SIGTERM, marks=pytest.mark.large),
+        pytest.param("in_a_thread", signal.SIGINT, marks=pytest.mark.large),
+    ],
+)
 def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Signals) -> None:
     code = BUSY.replace("{where}", where)
     process = subprocess.Popen(

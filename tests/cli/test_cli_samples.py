@@ -127,7 +127,6 @@ def test_results_are_not_overwritten_unasked(movies, sample_configs, capsys) -> 
     assert captured.out == ""
     (line,) = captured.err.splitlines()
     assert "--overwrite" in line
-    assert main_fit([*arguments, "--quiet", "--overwrite"]) == 0
 
 
 @pytest.mark.parametrize("content", [None, b"", b"not a movie", b"II*\0\x08\0\0\0"])

@@ -21,7 +21,7 @@ from tiff_files import write_ome_set
 import iscat_analysis as ia
 import iscat_analysis.day as day_module
 from iscat_analysis.day import run
-from iscat_analysis.day.watch import PATIENCE, Look, _Folder
+from iscat_analysis.day.watch import PATIENCE, Look, WatchedFolder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
@@ -44,8 +44,8 @@ def _names(look: Look | None) -> list[str] | None:
     return None if look is None else [row.path.name for row in look[0].rows]
 
 
-def _looks(folder: Path, told: list[str] | None = None) -> _Folder:
-    return _Folder(folder, folder / "batch", (told if told is not None else []).append)
+def _looks(folder: Path, told: list[str] | None = None) -> WatchedFolder:
+    return WatchedFolder(folder, folder / "batch", (told if told is not None else []).append)
 
 
 # ---- looks -----------------------------------------------------------------------------------
@@ -133,7 +133,7 @@ def test_results_in_the_folder_are_no_movies(folder: Path) -> None:
     (out / "movies").mkdir(parents=True)
     (folder / "a.iscat").mkdir()
     np.save(folder / "a.npy", COUNTS)
-    seen = _Folder(folder, out, [].append)
+    seen = WatchedFolder(folder, out, [].append)
     seen.look()
     assert _names(seen.look()) == ["a.npy"]
 
@@ -297,7 +297,7 @@ def test_without_movies_too_one_object_is_printed(folder: Path, monkeypatch, cap
     def interrupt(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_Folder, "look", interrupt)
+    monkeypatch.setattr(WatchedFolder, "look", interrupt)
     assert main(["watch", str(folder), "--json", "--quiet"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["out"] == str(folder / "batch")

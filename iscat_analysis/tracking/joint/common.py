@@ -39,12 +39,12 @@ IntArray = NDArray[np.int64]
 
 _SINGULAR = 1e-9
 _IMAGES = 4  # that are sent through E at a time
-_LEFT = 3e-4  # of the variance of a row, that may be left out
+MOST_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
 _SEED = 1  # of the images to begin with
 _ROUNDS = 3  # of a mean and of the weights there
 _UNLIKE = 2.0  # amplitude over the mean, beyond which weights stay
 _UNSOLVED = 1e-6  # of the information on a mass, that a step of the conjugate gradients adds
-_MOST_STEPS = 400
+MOST_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
     inner = turned @ coupling.own() @ root
     most = float(np.linalg.eigvalsh(inner)[:, -1].max())
     # as no eigenvalue is larger than their sum
-    if _left(most, float(np.einsum("nii->", inner))) > _LEFT:
+    if _left(most, float(np.einsum("nii->", inner))) > MOST_LEFT_OUT:
         more = _beyond(coupling, root, most)
         if more is None:
             return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
@@ -108,7 +108,7 @@ def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | N
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
-    while len(basis) < rank and _left(most, largest) > _LEFT:
+    while len(basis) < rank and _left(most, largest) > MOST_LEFT_OUT:
         added = _orthonormal(images, basis)[: rank - len(basis)]
         seen, images = coupling.followed(covariance, added)
         seen = seen @ root
@@ -238,7 +238,7 @@ def _answer(
     answer, taken = np.zeros_like(image), 0.0
     left, way = image.copy(), image.copy()
     size = float(left @ left)
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         turned = way - coupling.followed(covariance, way[None])[1][0]
         bend = float(way @ turned)
         if not bend > _SINGULAR * float(way @ way):
