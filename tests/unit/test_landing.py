@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from scenes import Stack
 
 from iscat_analysis import pipeline as pipeline_module
 from iscat_analysis.camera.counts import Camera
@@ -72,20 +73,17 @@ def _config(*settings: str, **sections: Any) -> Config:
     return config.model_copy(update={"simulation": simulation})
 
 
-class Memory:
-    """A movie in memory."""
+class Memory(Stack):
+    """A movie in memory that notes which frames are read."""
 
     def __init__(self, counts: np.ndarray) -> None:
-        self.counts = counts
-        self.shape = counts.shape
-        self.dtype = counts.dtype
-        self.name = "movie"
+        super().__init__(counts)
         self.reads: list[tuple[int, int]] = []
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Frames [start, stop)."""
         self.reads.append((start, stop))
-        return self.counts[start:stop].copy()
+        return super().read(start, stop).copy()
 
 
 @pytest.fixture(scope="module")

@@ -10,12 +10,11 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from small_movies import SETUP, simulate
+from small_movies import SETUP, analysed, put_in_place_of_fits
 from tiff_files import write_ome_set
 
 import iscat_analysis as ia
@@ -158,27 +157,13 @@ def test_a_folder_that_cannot_be_read_is_waited_for(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """Make a movie and its result."""
-    place = tmp_path_factory.mktemp("made")
-    simulate(place / "movie.tif", seed=1)
-    ia.fit_stack(place / "movie.tif", ia.configure(SETUP), out=place / "movie.iscat")
-    return place
+    return analysed(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
 def fits(made: Path, monkeypatch) -> list[str]:
     """Put the finished result in the place of every fit, and note the movies that it is of."""
-    done: list[str] = []
-
-    def fit_stack(movie: Path, _: object, *, out: Path, **__: object) -> SimpleNamespace:
-        done.append(movie.name)
-        with ia.open_stack(movie) as stack:
-            sha256 = stack.sha256()
-        shutil.copytree(made / "movie.iscat", out, dirs_exist_ok=True)
-        summary = json.loads((out / "summary.json").read_text())
-        return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
-
-    monkeypatch.setattr(run, "fit_stack", fit_stack)
-    return done
+    return put_in_place_of_fits(made, monkeypatch)
 
 
 class Day:
