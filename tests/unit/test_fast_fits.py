@@ -272,7 +272,9 @@ def _every_start(
 
 
 @pytest.mark.parametrize("mass", [150.0, 1200.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.large) for n in (1, 2, 3))]
+)
 def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None:
     """The best optimum and all that come near it, as if every start had been followed."""
     model = forward_model(make_config(optics={"focus_nm": -500.0}), 2500.0)
@@ -360,11 +362,22 @@ def _through_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Likelihood, "is_pictured", lambda *_: False)
 
 
-@pytest.mark.parametrize("optics", [
+PICTURES: list[dict[str, object]] = [
     {}, {"polarization_deg": 30.0, "analyzer": True}, {"scheme": "darkfield"},
     {"aberrations_nm": {"z7": 15.0, "z5": 10.0}},
-])  # fmt: skip
-@pytest.mark.parametrize("level", [False, True])
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("optics", "level"),
+    [
+        *((optics, bool(k % 2)) for k, optics in enumerate(PICTURES)),
+        *(
+            pytest.param(optics, not k % 2, marks=pytest.mark.large)
+            for k, optics in enumerate(PICTURES)
+        ),
+    ],
+)
 def test_a_picture_gives_the_fit_of_the_field(
     optics: dict[str, object], level: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
