@@ -751,12 +751,8 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     pd.testing.assert_frame_equal(result.fits, plain[0].fits)
 
 
-@pytest.mark.usefixtures("sketched")
-def test_an_interrupted_injection_keeps_what_the_movie_gave(
-    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = _config("posterior.enabled=false")
-    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+def _interrupted_at_the_second_chunk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Interrupt the second chunk that is begun; the list grows with every one."""
     real, calls = landing_module.analyse_chunk, []
 
     def stopping(*arguments: Any) -> Any:
@@ -766,6 +762,16 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
         return real(*arguments)
 
     monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    return calls
+
+
+@pytest.mark.usefixtures("sketched")
+def test_an_interrupted_injection_keeps_what_the_movie_gave(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config("posterior.enabled=false")
+    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    calls = _interrupted_at_the_second_chunk(monkeypatch)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
         fit_stack(movie, config, out=out, inject=3)
@@ -793,16 +799,8 @@ def test_a_corrected_run_resumes_to_the_same_result(
 ) -> None:
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     config = _config(CORRECTED, "compute.workers=1")
-    real, calls = landing_module.analyse_chunk, []
     whole, _ = _run(drifting, config)
-
-    def stopping(*arguments: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    calls = _interrupted_at_the_second_chunk(monkeypatch)
     _run(drifting, config, partial=tmp_path, identity="movie")
     resumed, _ = _run(drifting, config, partial=tmp_path, identity="movie")
     assert len(calls) == 1 + whole.summary["chunks"]
