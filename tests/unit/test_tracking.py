@@ -170,6 +170,7 @@ def test_nothing_to_track_is_an_empty_table(tmp_path: Path) -> None:
     assert not found.views
 
 
+@pytest.mark.large  # a recorded movie of test_uneven is refused in the same words
 def test_a_pattern_under_a_known_level_is_not_followed() -> None:
     """It took 24 s to follow 390 rows of 30 frames, none of which was a particle."""
     movie = wander((30, 64, 64), seed=1, speckle=0.02, species=((400.0, 0.4, 2),))
