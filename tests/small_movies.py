@@ -24,20 +24,6 @@ SMALL = [
 ]
 """Changes of a sample configuration that keep a job short without changing what it shows."""
 
-BOUND = {
-    "simulation.frames": 120,
-    "simulation.shape": [64, 64],
-    "simulation.events": [
-        {"frame": 60, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
-        {"frame": 60, "x_px": 45.9, "y_px": 41.1, "mass_kda": 1500.0},
-    ],
-    "background.frames": (0, 60),
-    "fit.frames": (60, 120),
-    "posterior.enabled": False,
-    "optics.calibrate": "never",
-}
-"""Settings of a sample configuration: two particles that bound after recorded frames."""
-
 LANDING = """
 [optics]
 na = 1.3

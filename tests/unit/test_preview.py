@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
-from small_movies import BOUND
 
 import iscat_analysis as ia
 from iscat_analysis.camera.background import measure_windows
@@ -25,6 +24,18 @@ LANDING = {
         {"frame": LANDS, "leave": LEAVES, "x_px": 20.3, "y_px": 40.8, "mass_kda": 700.0}
     ],
     "background.window_frames": WINDOW,
+    "optics.calibrate": "never",
+}
+BOUND = {
+    "simulation.frames": 120,
+    "simulation.shape": [64, 64],
+    "simulation.events": [
+        {"frame": 60, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+        {"frame": 60, "x_px": 45.9, "y_px": 41.1, "mass_kda": 1500.0},
+    ],
+    "background.frames": (0, 60),
+    "fit.frames": (60, 120),
+    "posterior.enabled": False,
     "optics.calibrate": "never",
 }
 MOVING = {

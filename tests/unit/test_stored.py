@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from small_movies import BOUND
 
 import iscat_analysis as ia
 
@@ -30,6 +29,18 @@ LANDING = {
         {"frame": 140, "x_px": 45.0, "y_px": 15.0, "mass_kda": 900.0},
     ],
     "background.window_frames": 24,
+    "optics.calibrate": "never",
+}
+BOUND = {
+    "simulation.frames": 100,
+    "simulation.shape": [64, 64],
+    "simulation.events": [
+        {"frame": 50, "x_px": 20.2, "y_px": 22.8, "mass_kda": 900.0},
+        {"frame": 50, "x_px": 35.9, "y_px": 31.1, "mass_kda": 1500.0},
+    ],
+    "background.frames": (0, 50),
+    "fit.frames": (50, 100),
+    "posterior.enabled": False,
     "optics.calibrate": "never",
 }
 
