@@ -41,7 +41,9 @@ def init(
     *,
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="Ask nothing: what is not known and not given is the default."),
+        typer.Option(
+            "--yes", help="Ask no questions: use defaults for what is neither known nor given."
+        ),
     ] = False,
     out: Annotated[
         Path | None,
@@ -49,11 +51,11 @@ def init(
     ] = None,
     pixel_size_nm: Annotated[
         float | None,
-        typer.Option("--pixel-size-nm", metavar="NM", help="Of a pixel, in the sample plane."),
+        typer.Option("--pixel-size-nm", metavar="NM", help="Side of a pixel in the sample plane."),
     ] = None,
     wavelength_nm: Annotated[
         float | None,
-        typer.Option("--wavelength-nm", metavar="NM", help="Of the light, in vacuum."),
+        typer.Option("--wavelength-nm", metavar="NM", help="Wavelength of the light in vacuum."),
     ] = None,
     na: Annotated[
         float | None, typer.Option("--na", metavar="NA", help="Numerical aperture.")
@@ -74,7 +76,7 @@ def init(
     sees in some frames.  Without a terminal nothing is asked, as with --yes.
     """
     with failures(messages):
-        from iscat_analysis.pipeline.setup import preview_said, write_setup
+        from iscat_analysis.pipeline.setup import preview_lines, write_setup
 
         given = {
             "camera.pixel_size_nm": pixel_size_nm,
@@ -99,7 +101,7 @@ def init(
         for note in found.notes:
             messages.notify(note)
         print_result(shown)
-        for line in preview_said(found):
+        for line in preview_lines(found):
             print_result(line)
         print_result(f"written: {found.out}")
 

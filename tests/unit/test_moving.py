@@ -174,7 +174,7 @@ def test_particles_that_hardly_move_end_at_the_maximum(
     assert min(ends) > log_likelihood(field, ground, truth)
     rows, found, _ = ascend(field, ground, truth, follow_power=True)
     assert abs(log_likelihood(field, found, rows) - ends[1]) < 2
-    monkeypatch.setattr(settling, "AMPLIFIED", np.inf)
+    monkeypatch.setattr(settling, "MOST_STEP_RATIO", np.inf)
     assert min(height(by) for by in starts) < min(ends) - 5
 
 
@@ -283,13 +283,13 @@ def test_rows_that_plain_steps_do_not_fit_are_fitted(
     pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts, ground, truth = _movie(_paths(30.0), noise=True)
-    field, asked, search = _field(counts, pool), [], frame_fits.climb
+    field, asked, search = _field(counts, pool), [], frame_fits.fit_with_search
 
     def climbed(*given: Any) -> tuple[float, int]:
         asked.append(given)
         return search(*given)
 
-    monkeypatch.setattr(frame_fits, "climb", climbed)
+    monkeypatch.setattr(frame_fits, "fit_with_search", climbed)
     near, _, done = field.fit(ground, truth, sweeps=4)
     assert done.all()
     assert not asked
