@@ -13,13 +13,12 @@ from iscat_cli.console import Messages, failures, print_json, print_result, shor
 from iscat_cli.kd import Reaction, upper_end
 from iscat_cli.options import (
     ConfigOption,
-    DebugOption,
     JsonOption,
-    QuietOption,
     SchedulerFileOption,
     SchedulerOption,
     SetOption,
     WorkersOption,
+    command,
     with_workers,
 )
 from iscat_cli.tables import numbers
@@ -78,8 +77,9 @@ command goes on.
 """
 
 
+@command
 def batch(
-    context: typer.Context,
+    messages: Messages,
     samples: Annotated[
         Path,
         typer.Argument(
@@ -115,8 +115,6 @@ def batch(
     scheduler: SchedulerOption = "threads",
     scheduler_file: SchedulerFileOption = None,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Analyse the movies of a day and set them side by side.
 
@@ -124,8 +122,7 @@ def batch(
     batch.html, movies.csv, species.csv, shifts.csv, events.parquet and figures to the folder, with
     the result of each movie in movies. What is finished and has not changed is left alone.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         part = _part(only, merge=merge)
 
         from iscat_analysis.day import batch as run
@@ -145,7 +142,7 @@ def batch(
                 scheduler_file=scheduler_file,
                 progress=progress,
                 notify=messages.notify,
-                command=context.obj,
+                command=messages.command,
             )
         if as_json:
             print_json("batch", found.to_dict())

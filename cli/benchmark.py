@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result, short, table
-from iscat_cli.options import (
-    DebugOption,
-    JsonOption,
-    OverwriteOption,
-    QuietOption,
-    SetOption,
-    WorkersOption,
-)
+from iscat_cli.options import JsonOption, OverwriteOption, SetOption, WorkersOption, command
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -29,8 +22,9 @@ EXAMPLE = """Example: a thousand repetitions of one experiment.
 MODES = ("mass", "localize", "joint")
 
 
+@command
 def benchmark(
-    context: typer.Context,
+    messages: Messages,
     *,
     config: Annotated[
         Path,
@@ -58,16 +52,13 @@ def benchmark(
     workers: WorkersOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Measure spread, bias and coverage of the fits against CRB and QCRB.
 
     Draws synthetic shot noise, fits it in modes mass, localize and joint, and writes
     benchmark.json, benchmark.html and figures to the output folder.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.config import load_config
 
         resolved = load_config(config, settings or ())
@@ -86,7 +77,7 @@ def benchmark(
                 seed=seed,
                 workers=workers,
                 posterior=posterior,
-                command=context.obj,
+                command=messages.command,
                 progress=progress,
             )
         write_benchmark(study, out, overwrite=overwrite)

@@ -12,12 +12,11 @@ from iscat_cli.bounds_tables import print_bounds
 from iscat_cli.console import Messages, failures, print_json, print_result, short, table
 from iscat_cli.options import (
     ConfigOption,
-    DebugOption,
     JsonOption,
     ModeOption,
     OverwriteOption,
-    QuietOption,
     SetOption,
+    command,
 )
 
 if TYPE_CHECKING:
@@ -63,8 +62,9 @@ OPTICS = "optics"
 """What --for takes beside names of parameters."""
 
 
+@command
 def bounds(
-    context: typer.Context,
+    messages: Messages,
     *,
     config: ConfigOption = None,
     mode: ModeOption = None,
@@ -148,15 +148,12 @@ def bounds(
     settings: SetOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Print the classical and quantum Cramér–Rao bounds of one particle.
 
     Per photon: one scattered photon on the camera (CRB) or collected (QCRB).
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import ConfigError
 

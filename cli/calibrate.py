@@ -9,14 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result, table
-from iscat_cli.options import (
-    ConfigOption,
-    DebugOption,
-    JsonOption,
-    OverwriteOption,
-    QuietOption,
-    SetOption,
-)
+from iscat_cli.options import ConfigOption, JsonOption, OverwriteOption, SetOption, command
 
 if TYPE_CHECKING:
     from iscat_analysis.calibration.mass import MassCalibration
@@ -49,8 +42,9 @@ class LandingSign(StrEnum):
     BRIGHT = "bright"
 
 
+@command
 def camera(
-    context: typer.Context,
+    messages: Messages,
     stacks: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -78,15 +72,12 @@ def camera(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Measure gain, offset and read noise, and how far averaging lowers the noise.
 
     Writes camera.json, camera.toml (a section to paste), camera.html and, with --maps, TIFF maps.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.answers.calibrations import camera_calibration
         from iscat_analysis.errors import ConfigError
         from iscat_analysis.movie.addresses import path_beside
@@ -115,8 +106,9 @@ def camera(
         messages.notify(f"wrote {folder}; open {folder / 'camera.html'}")
 
 
+@command
 def mass(
-    context: typer.Context,
+    messages: Messages,
     events: Annotated[
         Path,
         typer.Argument(
@@ -152,8 +144,6 @@ def mass(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Fit the line between contrast and mass through the peaks of standards.
 
@@ -161,8 +151,7 @@ def mass(
     folder of an analysis the section keeps the optics with which the standards were measured, so
     that it serves movies at another focus too.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         masses, errors = _standards(standards)
 
         from iscat_analysis.answers.calibrations import mass_calibration
@@ -185,8 +174,9 @@ def mass(
         messages.notify(f"wrote {folder}; open {folder / 'calibration.html'}")
 
 
+@command
 def optics(
-    context: typer.Context,
+    messages: Messages,
     movie: Annotated[
         Path,
         typer.Argument(
@@ -233,16 +223,13 @@ def optics(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Learn focus, aperture, phase, mask, aberrations and polarisation from a movie.
 
     Writes optics.toml (name it as optics.file in a configuration), optics.json and optics.html;
     with --measured template.npz, template.json and template.html beside optics.toml.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         if measured:
             _measure(
                 movie, config, settings, free, focus_step, out, messages,

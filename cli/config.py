@@ -23,7 +23,7 @@ def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOptio
 
     A key without a value is unset; take the # away and fill it in.
     """
-    with failures(Messages(context.command_path), debug=debug):
+    with failures(Messages(context.command_path, debug=debug)):
         from iscat_analysis.config import config_to_toml, load_config
 
         text = config_to_toml(load_config(None, [f"fit.mode={mode.value}"] if mode else ()))

@@ -49,12 +49,17 @@ class _Console(Console):
 class Messages:
     """Progress, notes and errors of one command, on stderr.
 
-    `quiet` drops progress and notes; errors are always shown, and begin with `name`.
+    `quiet` drops progress and notes; errors are always shown, and begin with `name`.  `debug` adds
+    tracebacks.  `command` is the whole command line.
     """
 
-    def __init__(self, name: str, *, quiet: bool = False) -> None:
+    def __init__(
+        self, name: str, *, quiet: bool = False, debug: bool = False, command: str = ""
+    ) -> None:
         self.name = name
         self.quiet = quiet
+        self.debug = debug
+        self.command = command
         self.writing = False
         self._terminal = _Console(stderr=True, highlight=False, markup=False, emoji=False)
 
@@ -172,8 +177,9 @@ def _ignore(stage: str, done: int, total: int) -> None:
 
 
 @contextmanager
-def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
-    """Turn whatever a command raises into one line and an exit status; `debug` shows it all."""
+def failures(messages: Messages) -> Iterator[None]:
+    """Turn whatever a command raises into one line and an exit status."""
+    debug = messages.debug
 
     def show(
         message: Warning | str,

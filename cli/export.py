@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import DebugOption, OverwriteOption, QuietOption
+from iscat_cli.options import OverwriteOption, command
 
 EXAMPLE = """Example: tracks for trackpy, and landings for PhotoMol.
 
@@ -28,8 +28,9 @@ class Program(StrEnum):
     PICASSO = "picasso"
 
 
+@command
 def export(
-    context: typer.Context,
+    messages: Messages,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of iscat fit.")],
     *,
     to: Annotated[
@@ -49,8 +50,6 @@ def export(
         ),
     ] = None,
     overwrite: OverwriteOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Write the events or tracks of an analysis as other programs read them.
 
@@ -59,8 +58,7 @@ def export(
     viewer.add_points, takes. photomol: columns contrasts and masses_kDa, which iscat species reads
     back with errors. picasso: locs with frame, x, y, photons, lpx, lpy, and mass_kda beside them.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.report.exchange import export_result
 
         written = export_result(folder, to.value, out=out, overwrite=overwrite)

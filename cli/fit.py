@@ -12,16 +12,15 @@ import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result
 from iscat_cli.options import (
-    DebugOption,
     JsonOption,
     Mode,
     ModeOption,
     OverwriteOption,
-    QuietOption,
     SchedulerFileOption,
     SchedulerOption,
     SetOption,
     WorkersOption,
+    command,
     frame_range,
 )
 
@@ -45,8 +44,9 @@ Exit status: 0 done; 1 the data cannot be analysed; 2 usage or configuration;
 """
 
 
+@command
 def fit(
-    context: typer.Context,
+    messages: Messages,
     stacks: Annotated[
         list[Path],
         typer.Argument(
@@ -113,8 +113,6 @@ def fit(
         ),
     ] = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Fit the particles of a movie and set each spread beside its Cramér–Rao bounds.
 
@@ -122,8 +120,7 @@ def fit(
     output folder; in mode track also tracks.csv and tracks.parquet: mass and diffusion
     coefficient of every particle.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.errors import ConfigError
 
         if len(stacks) > 1:
@@ -166,7 +163,7 @@ def fit(
                 overwrite=overwrite,
                 progress=progress,
                 notify=messages.notify,
-                command=context.obj,
+                command=messages.command,
                 inject=inject or 0,
                 executor=executor,
             )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result, table
-from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOption
+from iscat_cli.options import JsonOption, OverwriteOption, command
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,8 +34,9 @@ class Sample(StrEnum):
     POLYSTYRENE = "polystyrene"
 
 
+@command
 def init(
-    context: typer.Context,
+    messages: Messages,
     movie: Annotated[Path, typer.Argument(metavar="MOVIE", help="The movie, as for iscat fit.")],
     *,
     yes: Annotated[
@@ -67,8 +68,6 @@ def init(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Look at a movie, ask what only you can know, and write iscat.toml for it.
 
@@ -76,8 +75,7 @@ def init(
     NA, kind of sample), writes every value with where it comes from, and shows what the search
     sees in some frames.  Without a terminal nothing is asked, as with --yes.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.pipeline.setup import preview_lines, write_setup
 
         given = {

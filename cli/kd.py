@@ -17,7 +17,7 @@ from iscat_cli.console import (
     table,
     with_options,
 )
-from iscat_cli.options import DebugOption, JsonOption, OverwriteOption, QuietOption
+from iscat_cli.options import JsonOption, OverwriteOption, command
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair
 
 if TYPE_CHECKING:
@@ -36,8 +36,9 @@ class Reaction(StrEnum):
     AB = "ab"
 
 
+@command
 def kd(
-    context: typer.Context,
+    messages: Messages,
     samples: Annotated[
         Path,
         typer.Argument(
@@ -93,16 +94,13 @@ def kd(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Fit an equilibrium constant to the events of a series of concentrations.
 
     All events of all tables together, corrected for detection and landing; the interval is that of
     the profile likelihood, and a test says whether the tables follow the equilibrium.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         middle, spread = pair("--limit", limit)
         given = None if masses is None else numbers("--masses", masses)
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import re
+from collections.abc import Callable
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 import typer
+
+from iscat_cli.console import Messages
 
 
 class Mode(StrEnum):
@@ -92,6 +97,27 @@ QuietOption = Annotated[
 ]
 
 DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
+
+
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function that is given `messages`, with the options of every command."""
+
+    @wraps(work)
+    def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
+        told = Messages(context.command_path, quiet=quiet, debug=debug, command=context.obj)
+        work(told, **given)
+
+    _, *own = inspect.signature(work, eval_str=True).parameters.values()
+    only_named = inspect.Parameter.KEYWORD_ONLY
+    offered = (
+        inspect.Parameter("context", inspect.Parameter.POSITIONAL_ONLY, annotation=typer.Context),
+        *own,
+        inspect.Parameter("quiet", only_named, default=False, annotation=QuietOption),
+        inspect.Parameter("debug", only_named, default=False, annotation=DebugOption),
+    )
+    vars(run)["__signature__"] = inspect.Signature(offered)
+    run.__annotations__ = {each.name: each.annotation for each in offered}
+    return run
 
 
 def frame_range(option: str, text: str) -> tuple[int, int]:

@@ -8,13 +8,7 @@ from typing import Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result
-from iscat_cli.options import (
-    DebugOption,
-    JsonOption,
-    OverwriteOption,
-    QuietOption,
-    SetOption,
-)
+from iscat_cli.options import JsonOption, OverwriteOption, SetOption, command
 
 EXAMPLE = """Example: the same seed writes the same bytes.
 
@@ -22,8 +16,9 @@ EXAMPLE = """Example: the same seed writes the same bytes.
 """
 
 
+@command
 def simulate(
-    context: typer.Context,
+    messages: Messages,
     *,
     config: Annotated[
         Path, typer.Option(metavar="C.toml", help="Configuration with a [simulation] section.")
@@ -43,16 +38,13 @@ def simulate(
     settings: SetOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Write a shot-noise movie of particles whose position and mass are known.
 
     They land and leave ([[simulation.events]], simulation.count) or diffuse
     ([[simulation.movers]], blurred by the exposure, with the truth of every frame).
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.config import load_config
 
         resolved = load_config(config, settings or ())

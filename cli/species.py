@@ -19,13 +19,7 @@ from iscat_cli.console import (
     table,
     with_options,
 )
-from iscat_cli.options import (
-    DebugOption,
-    JsonOption,
-    OverwriteOption,
-    QuietOption,
-    frame_range,
-)
+from iscat_cli.options import JsonOption, OverwriteOption, command, frame_range
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair, whole
 
 if TYPE_CHECKING:
@@ -60,8 +54,9 @@ class Width(StrEnum):
     FREE = "free"
 
 
+@command
 def species(
-    context: typer.Context,
+    messages: Messages,
     events: Annotated[
         list[Path],
         typer.Argument(
@@ -174,16 +169,13 @@ def species(
     ] = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Find the species of any table of events, each event with its own error.
 
     Fractions are of the particles that came, corrected for those that were too light to be seen.
     Of several tables: are they one sample, and if not, how do masses and fractions differ?
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         middle, spread = pair("--limit", limit)
         given = None if masses is None else numbers("--masses", masses)
         rungs = () if steps is None else whole("--steps", steps)

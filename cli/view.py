@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import DebugOption, QuietOption
+from iscat_cli.options import command
 
 EXAMPLE = """Example: the report of a movie, in the browser.
 
@@ -16,8 +16,9 @@ EXAMPLE = """Example: the report of a movie, in the browser.
 """
 
 
+@command
 def view(
-    context: typer.Context,
+    messages: Messages,
     result: Annotated[
         Path,
         typer.Argument(
@@ -26,16 +27,12 @@ def view(
             "beside it.",
         ),
     ],
-    *,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Open the page of a result in the browser.
 
     Prints where the page is; on a machine without a browser that is all, and the status is 1.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         import webbrowser
 
         from iscat_analysis.errors import DataError

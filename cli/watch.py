@@ -18,13 +18,12 @@ from iscat_cli.batch import (
 from iscat_cli.console import Messages, failures, print_json, print_result, with_options
 from iscat_cli.options import (
     ConfigOption,
-    DebugOption,
     JsonOption,
-    QuietOption,
     SchedulerFileOption,
     SchedulerOption,
     SetOption,
     WorkersOption,
+    command,
     with_workers,
 )
 from iscat_cli.tables import numbers
@@ -42,8 +41,9 @@ same command goes on; 2 usage, table or configuration.
 """
 
 
+@command
 def watch(
-    context: typer.Context,
+    messages: Messages,
     folder: Annotated[
         Path, typer.Argument(metavar="FOLDER", help="Folder that movies are saved in.")
     ],
@@ -67,16 +67,13 @@ def watch(
     ] = 10.0,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Analyse movies as they are saved, and keep batch.html current, until Ctrl-C.
 
     What is still being written is waited for. A movie that fails is told once, and tried again when
     it changes. Results are those of iscat batch, which may go on with them.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.day.watch import FOLDER
         from iscat_analysis.day.watch import watch as run
 
@@ -94,7 +91,7 @@ def watch(
                 interval_s=interval,
                 progress=progress,
                 notify=lambda line: messages.notify(with_options(line)),
-                command=context.obj,
+                command=messages.command,
             )
         if found is None:
             if as_json:

@@ -49,7 +49,7 @@ DEPENDENCIES = (
 )  # fmt: skip
 """Packages whose versions are part of a result."""
 
-_CONNECT_S = 4.0
+CONNECT_S = 4.0
 _ADDRESS = re.compile(r"(?:tcp://)?(\[[^\]/]+\]|[^:/\[]+):(\d{1,5})/?", flags=re.ASCII)
 _LOOK_S = 1.0  # between two looks at how many workers there are
 _BUSY_S = 1.0  # that a job waits where its worker is busy, before it goes to another
@@ -436,7 +436,7 @@ def _connected(address: str) -> Client:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of versions, which are compared here
-            return Client(address, timeout=_CONNECT_S, set_as_default=False, name="iscat")
+            return Client(address, timeout=CONNECT_S, set_as_default=False, name="iscat")
     except (OSError, TimeoutError, ValueError):
         raise _unanswered(address) from None
 
@@ -450,8 +450,8 @@ def _refuse_silence(address: str) -> None:
             "tcp://10.0.0.1:8786; encrypted and other connections are not supported"
         )
     try:
-        with socket.create_connection((match[1].strip("[]"), int(match[2])), _CONNECT_S) as line:
-            line.settimeout(_CONNECT_S)
+        with socket.create_connection((match[1].strip("[]"), int(match[2])), CONNECT_S) as line:
+            line.settimeout(CONNECT_S)
             greets = bool(line.recv(1))  # a scheduler speaks first
     except (OSError, OverflowError, UnicodeError):
         greets = False

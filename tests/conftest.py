@@ -34,14 +34,15 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_tracked_optics", "test_output", "test_second_process", "test_cli_ending",
-    "test_short_tracks", "test_equilibrium", "test_optics_at_heights", "test_compilation",
-    "test_report_browser", "test_crowded", "test_day",
-    "test_cluster", "test_pipeline", "test_report", "test_landing", "test_moving",
-    "test_equilibrium_spread", "test_cli_help", "test_misfit_search",
-    "test_focus_scan", "test_movers", "test_benchmark", "test_optics_calibration", "test_public",
-    "test_arguments", "test_bounds_laws", "test_distribution", "test_many_movers",
-    "test_posterior", "test_mass_calibration", "test_systematic",
+    "test_output", "test_tracked_optics", "test_report_browser", "test_day", "test_moving",
+    "test_compilation", "test_equilibrium", "test_landing", "test_pipeline", "test_cluster",
+    "test_stored", "test_crowded", "test_focus_scan", "test_cli_help", "test_cli_contract",
+    "test_report", "test_planes", "test_benchmark", "test_bad_input", "test_fuzz", "test_movers",
+    "test_optics_calibration", "test_public", "test_arguments", "test_bounds_laws",
+    "test_distribution", "test_posterior", "test_mass_calibration", "test_systematic",
+    "test_cli_samples", "test_fast_fits", "test_photon_transfer", "test_tracking",
+    "test_short_tracks", "test_optics_at_heights", "test_equilibrium_spread",
+    "test_second_process", "test_many_movers",
 )  # fmt: skip
 """Modules that take longest; they are begun first, so that no worker is left with one."""
 

@@ -1,12 +1,28 @@
-"""Small movies of two particles, for days of many."""
+"""Small movies, and results that stand for those of every movie of a day."""
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.day import run
+
+SMALL = [
+    "simulation.frames=60",
+    "simulation.shape=[64, 64]",
+    "simulation.events=[{frame=30, x_px=31.2, y_px=30.8, mass_kda=900.0}]",
+    "background.frames=[0, 30]",
+    "fit.frames=[30, 60]",
+    "posterior.enabled=false",
+    "bounds.pixels=41",
+]
+"""Changes of a sample configuration that keep a job short without changing what it shows."""
 
 LANDING = """
 [optics]
@@ -63,3 +79,26 @@ def simulate(path: Path, *, seed: int, masses: tuple[float, ...] = (900.0, 1500.
     shape = [8 + 32 * side] * 2
     changes = {"simulation.shape": shape, "simulation.events": events}
     ia.simulate_movie({**SETUP, **changes}, str(path), seed=seed)
+
+
+def analysed(place: Path) -> Path:
+    """Make a movie and its result in a folder."""
+    simulate(place / "movie.tif", seed=1)
+    ia.fit_stack(place / "movie.tif", ia.configure(SETUP), out=place / "movie.iscat")
+    return place
+
+
+def put_in_place_of_fits(made: Path, patch: pytest.MonkeyPatch) -> list[str]:
+    """Let every fit of a day take the finished result; the list fills with the movies fitted."""
+    done: list[str] = []
+
+    def fit_stack(movie: Path, _: object, *, out: Path, **__: object) -> SimpleNamespace:
+        done.append(movie.name)
+        with ia.open_stack(movie) as stack:
+            sha256 = stack.sha256()
+        shutil.copytree(made / "movie.iscat", out, dirs_exist_ok=True)
+        summary = json.loads((out / "summary.json").read_text())
+        return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
+
+    patch.setattr(run, "fit_stack", fit_stack)
+    return done

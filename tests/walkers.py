@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.records import EVENT_COLUMNS
-from iscat_analysis.species.tracks import TrackSetup
+from iscat_analysis.species import TrackSetup
 
 RATE_HZ, EXPOSURE_MS = 331.0, 2.5
 PIXEL_NM, FIELD_PX = 84.0, 128

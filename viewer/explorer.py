@@ -119,7 +119,7 @@ class Explorer(QWidget):
         ]
         for event, callback in heard:
             event.connect(callback)
-        clicked = self._clicked
+        clicked = self.on_click
         clicks.append(clicked)
 
         def leave() -> None:
@@ -293,7 +293,7 @@ class Explorer(QWidget):
 
     # ---- events ----------------------------------------------------------------------------
 
-    def _clicked(self, viewer: Any, event: Any) -> None:
+    def on_click(self, viewer: Any, event: Any) -> None:
         """Show the event under the mouse."""
         for layer in reversed(viewer.layers):
             result = _result_of(layer)

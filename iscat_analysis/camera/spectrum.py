@@ -31,7 +31,7 @@ _OUTLIER_SIGMAS = 5.0  # robust standard deviations beyond which a pixel's chang
 _MOST_MORE_OUTLIERS = 4  # such pixels more than in most pairs of frames, where something has landed
 _FIRST_PAIRS = 9  # their median number of such pixels is that of a pair in which nothing lands
 _EVERY_NTH_PIXEL = 8  # of as many pixels, whose median tells how large the noise is
-_LEAST_SIGMAS = 4.5  # standard errors beyond which a correlation is one
+LEAST_SIGMAS = 4.5  # standard errors beyond which a correlation is one
 _LEAST_CORRECTION = 0.01  # of the expected variance, below which nothing is corrected
 _LEAST_VARIANCE = 0.05  # of the variance, that every frequency is taken to have
 _NORMAL_QUARTILE = 0.6744897501960817
@@ -226,7 +226,7 @@ def _spectrum_of(
         """
         mean: FloatArray = lines.mean(axis=0)
         # a distance and its opposite have the same covariance: half as many are independent
-        limit = _LEAST_SIGMAS * error * math.sqrt(2 / len(lines))
+        limit = LEAST_SIGMAS * error * math.sqrt(2 / len(lines))
         return mean if abs(mean[here]) > limit else 0 * mean
 
     by_row, by_column = shared(covariance[lags, far_x].T), shared(covariance[far_y, lags])
@@ -239,7 +239,7 @@ def _spectrum_of(
     common = by_row[:, None] + by_column[None, :]
     neighbours = np.abs(local)
     neighbours[here, here] = 0.0
-    if neighbours.max() < max(_LEAST_SIGMAS * error, _LEAST_CORRECTION * variance):
+    if neighbours.max() < max(LEAST_SIGMAS * error, _LEAST_CORRECTION * variance):
         if abs(variance - 1) < _LEAST_CORRECTION and not common.any():
             return None
         local = np.zeros_like(local)

@@ -124,7 +124,7 @@ def species_table(found: Sequence[Found]) -> pd.DataFrame:
     rows = []
     for each in found:
         described = each.summary.get("distribution") or {}
-        shares = _shares(described.get("species", ()))
+        shares = shares_of(described.get("species", ()))
         for species, share in zip(described.get("species", ()), shares, strict=True):
             values = {key: species.get(key) for key in SPECIES_COLUMNS if key in species}
             seen = poisson_rate(species["landing"], each.seconds)
@@ -137,7 +137,7 @@ def species_table(found: Sequence[Found]) -> pd.DataFrame:
     return table.astype({**numbers, "outlier": bool})
 
 
-def _shares(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
+def shares_of(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
     """Give the share of each species among those that are no outliers, with its 95 % interval.
 
     The errors are those of the counts, as the bootstrap has them, on the scale of log odds.

@@ -127,7 +127,7 @@ def watch(
         notify=warn,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, warn), _Folder(watched, results, warn)
+    run, seen = _Run(analyse, standards, warn), WatchedFolder(watched, results, warn)
     ended = stop or threading.Event()
     done: Ready | None = None
     try:
@@ -172,7 +172,7 @@ class _MovieFiles:
         return self.checks >= MOST_CHECKS or (self.checks > 0 and self.readable)
 
 
-class _Folder:
+class WatchedFolder:
     """A folder that is checked for new movies."""
 
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:

@@ -52,7 +52,7 @@ class Checkpoint:
         digest = hashlib.sha256(text.encode())
         for value in (camera.gain_e_per_adu, camera.offset_adu, camera.read_noise_e):
             digest.update(np.asarray(value, dtype=np.float64).tobytes())
-        self._key = digest.hexdigest()[:32]
+        self.key = digest.hexdigest()[:32]
 
     def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
         """Load the table and the arrays of a finished part; None where there are none."""
@@ -83,7 +83,7 @@ class Checkpoint:
 
     def _paths(self, number: int) -> tuple[Path, Path]:
         folder = self._folder or Path()
-        stem = f"{self._key}-{number:05d}"
+        stem = f"{self.key}-{number:05d}"
         return folder / f"{stem}.parquet", folder / f"{stem}.npz"
 
 

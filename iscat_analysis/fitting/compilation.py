@@ -10,7 +10,7 @@ from numba.core import event
 
 from iscat_analysis import _kernels
 
-_PATIENCE_S = 1.0  # of compilation, before it is announced
+PATIENCE_S = 1.0  # of compilation, before it is announced
 _ROOM = f"{_kernels.__name__}."
 
 
@@ -27,7 +27,7 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         self._depth += 1
         ours = event.data["dispatcher"].py_func.__module__.startswith(_ROOM)
         if ours and self._timer is None:
-            self._timer = threading.Timer(_PATIENCE_S, self._announce)
+            self._timer = threading.Timer(PATIENCE_S, self._announce)
             self._timer.daemon = True
             self._timer.start()
 

@@ -96,15 +96,15 @@ def three_tests(
     freedom = cells - int(np.count_nonzero(free))
     if freedom <= 0:
         return math.nan, (math.nan, math.nan, math.nan)
-    above = _gamma_above(chi2, freedom, excess / cells)
-    structure = _gamma_above(mode_chi2, modes, mode_excess) if modes else 1.0
+    above = gamma_above(chi2, freedom, excess / cells)
+    structure = gamma_above(mode_chi2, modes, mode_excess) if modes else 1.0
     if count:
         least = min(least, 2 * float(likelihood.noise.tails(*tails[:, :count]).min()))
     outlier = likelihood.noise.least_of_all(rate[likelihood.used], least)
     return chi2 / freedom, (2 * min(above, 1 - above), structure, outlier)
 
 
-def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
+def gamma_above(chi2: float, freedom: float, excess: float) -> float:
     """Upper tail of a sum of squares of variance (2 + excess)·freedom."""
     spread = max(1 + excess / 2, _LEAST_VARIANCE_RATIO)
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))

@@ -170,9 +170,7 @@ class Likelihood:
         lens, pixels, kind, data = self._arguments
         if free[2]:
             table = self.model.axial_table
-        elif self._is_pictured(
-            theta[2], np.where(free, lower, theta), np.where(free, upper, theta)
-        ):
+        elif self.is_pictured(theta[2], np.where(free, lower, theta), np.where(free, upper, theta)):
             lens, table = self.model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
         else:
             table = self.model.height_table(theta[2])
@@ -284,7 +282,7 @@ class Likelihood:
                 "the box or give forward_model a larger reach_nm or z_max_nm"
             )
 
-    def _is_pictured(self, z_nm: float, lower: FloatArray, upper: FloatArray) -> bool:
+    def is_pictured(self, z_nm: float, lower: FloatArray, upper: FloatArray) -> bool:
         """Whether a table of the picture at the model's height serves all places in a box.
 
         One serves all particles at that height; others are met once.

@@ -290,7 +290,7 @@ class Poisson(NoiseModel):
 
         Counts are whole: what each pixel can attain below it is less than that.
         """
-        below = _attainable(rate, least)
+        below = attainable_tails(rate, least)
         return -math.expm1(float(np.sum(np.log1p(-np.minimum(below, _CERTAIN)))))
 
 
@@ -302,7 +302,7 @@ NOISE_MODELS: Mapping[str, NoiseModel] = {
 """Every noise model, by the name that ``fit.likelihood`` gives it."""
 
 
-def _attainable(rate: FloatArray, tail: float) -> FloatArray:
+def attainable_tails(rate: FloatArray, tail: float) -> FloatArray:
     """Probability that a Poisson count has a two-sided tail of at most `tail`, for each rate."""
     half = tail / 2
     if half < _LEAST_TAIL or half >= 0.5:

@@ -142,7 +142,7 @@ def step_controls(
         context, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
         [event.fit for event in events], level=True,
     )  # fmt: skip
-    most = _most_windows(field.places, (chunk.edges.size - 2) / context.searches)
+    most = most_windows(field.places, (chunk.edges.size - 2) / context.searches)
     apart: list[int] = []
     for t in times:
         if not apart or t >= apart[-1] + window:
@@ -176,7 +176,7 @@ def step_controls(
     return total
 
 
-def _most_windows(places: int, share: float) -> int:
+def most_windows(places: int, share: float) -> int:
     """Give the number of such windows in a chunk, in proportion to its share of the movie."""
     enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
     return int(np.clip(enough, FEWEST_WINDOWS, MOST_WINDOWS))

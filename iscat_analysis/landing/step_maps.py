@@ -34,14 +34,14 @@ class StepMaps:
     ) -> None:
         self._context, self._chunk, self.matched = context, chunk, matched
         self._neighbours, self._pattern = neighbours, pattern
-        self._is_local = pattern is None and context.lines is None and matched.noise is None
+        self.is_local = pattern is None and context.lines is None and matched.noise is None
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._known: list[Step] = []
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
 
     def without(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
         """Subtract known steps."""
-        if self._is_local:
+        if self.is_local:
             maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
             for step in _missing(self._known, steps):
                 self._add(maps, step, 1.0)

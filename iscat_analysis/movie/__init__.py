@@ -27,7 +27,7 @@ from iscat_analysis.records import StackMetadata
 
 __all__ = ["ArrayLike", "Frames", "Stack", "open_stack", "path_beside"]
 
-_READERS: Mapping[bytes, Callable[[Path], Frames]] = {
+READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     signature: kind.open for kind in FORMATS for signature in kind.signatures
 }
 """The first bytes of a file and what opens it."""
@@ -173,7 +173,7 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
     if description_of(path) is not None:
         recorded = open_recorded(path)
         return Stack(path, recorded, files=recorded.files)
-    reader = _READERS.get(signature[:4])
+    reader = READERS.get(signature[:4])
     if reader is None:
         raise DataError(f"{path}: {_refusal(path, signature)}")
     frames = reader(path)

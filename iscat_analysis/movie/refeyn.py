@@ -29,7 +29,7 @@ PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
 """Side of an unbinned pixel by instrument [nm]; the files do not store it."""
 
 _BLOCK_BYTES = 64_000_000
-_ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
+ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
 _MOST_FRAME_DECODED_RATIO = 100  # of one decoded frame over the file
 
 
@@ -121,7 +121,7 @@ class DifferenceFrames(RefeynFrames):
         super().__init__(stored, reader, path)
         self._known = known
         frame_bytes = self.shape[1] * self.shape[2] * stored.dtype.itemsize
-        kept = max(1, min(self.shape[0], _ANCHOR_BYTES // frame_bytes))
+        kept = max(1, min(self.shape[0], ANCHOR_BYTES // frame_bytes))
         self._spacing = -(-self.shape[0] // kept)
         self._step = max(1, _BLOCK_BYTES // frame_bytes)
         self._anchors: dict[int, NDArray[Any]] = {}

@@ -98,7 +98,7 @@ def species_of(
     """Describe the species of all events; `searched` is the share that was searched."""
     good = table[table["status"] == Status.OK]
     distribution = _distribution(context, good, searched or 1.0)
-    across = _species_width(context, table, distribution)
+    across = species_width(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
 
@@ -152,7 +152,7 @@ def _distribution(
     return found.to_dict()
 
 
-def _species_width(
+def species_width(
     context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Compare the width of each species with σ; poor fits are included if the model is rejected."""

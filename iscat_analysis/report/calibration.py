@@ -14,7 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.report.numbers import decimals_for, fixed, number
-from iscat_analysis.report.page import render_page
+from iscat_analysis.report.page import render_document
 from iscat_analysis.report.style import GREY, INK, VERMILLION, new_figure, publish
 from iscat_analysis.units import count
 
@@ -37,15 +37,7 @@ def camera_page(title: str, found: Mapping[str, Any], toml: str) -> str:
             "charts": _charts(_camera_figures(found)),
         }
     ]
-    if found["notes"]:
-        sections.append(
-            {"id": "notes", "title": "Notes", "notes": [_sentence(n) for n in found["notes"]]}
-        )
-    sections.append(_paste(toml))
-    return render_page(
-        "document.html",
-        {"title": title, "subtitle": "Camera calibration by photon transfer", "sections": sections},
-    )
+    return _page(title, "Camera calibration by photon transfer", sections, found["notes"], toml)
 
 
 def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
@@ -87,24 +79,18 @@ def mass_page(title: str, found: Mapping[str, Any], toml: str) -> str:
             "tables": [_standards_table(standards)],
         }
     ]
-    if found["notes"]:
-        sections.append(
-            {"id": "notes", "title": "Notes", "notes": [_sentence(n) for n in found["notes"]]}
-        )
-    sections.append(_paste(toml))
-    return render_page(
-        "document.html",
-        {"title": title, "subtitle": "Mass calibration from standards", "sections": sections},
-    )
+    return _page(title, "Mass calibration from standards", sections, found["notes"], toml)
 
 
-def _paste(toml: str) -> dict[str, Any]:
-    return {
-        "id": "configuration",
-        "title": "Configuration",
-        "lead": "To paste into the configuration of the measurement.",
-        "code": toml,
-    }
+def _page(
+    title: str, subtitle: str, sections: list[dict[str, Any]], notes: Sequence[str], toml: str
+) -> str:
+    """Make a page of sections, then notes, then what is pasted into the configuration."""
+    if notes:
+        said = [_sentence(note) for note in notes]
+        sections = [*sections, {"id": "notes", "title": "Notes", "notes": said}]
+    lead = "To paste into the configuration of the measurement."
+    return render_document(title, subtitle, sections, toml, lead)
 
 
 def _sentence(text: str) -> str:

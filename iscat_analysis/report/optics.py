@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from iscat_analysis.report.numbers import number
-from iscat_analysis.report.page import render_page
+from iscat_analysis.report.page import OPTICS_FILE, render_document
 from iscat_analysis.report.style import BLUE, VERMILLION, new_figure, publish
 
 _LABELS = {
@@ -123,16 +123,7 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
         "title": "What could not be known",
         "notes": unknown or ["Everything that was asked for was determined."],
     })  # fmt: skip
-    sections.append({
-        "id": "configuration",
-        "title": "Configuration",
-        "lead": "optics.toml; name it as optics.file in the configuration of the measurement.",
-        "code": toml,
-    })  # fmt: skip
-    return render_page(
-        "document.html",
-        {"title": title, "subtitle": "Optics, learned from the movie", "sections": sections},
-    )
+    return render_document(title, "Optics, learned from the movie", sections, toml, OPTICS_FILE)
 
 
 def _figures(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:

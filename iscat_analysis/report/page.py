@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,18 @@ from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.track_context import tracks_context
 from iscat_analysis.schemas import jsonable
 from iscat_analysis.text import in_page
+
+OPTICS_FILE = "optics.toml; name it as optics.file in the configuration of the measurement."
+"""What is said of an optics.toml on its page."""
+
+
+def render_document(
+    title: str, subtitle: str, sections: Sequence[Mapping[str, Any]], toml: str, lead: str
+) -> str:
+    """Fill the page of a calibration: its sections, and what goes into the configuration."""
+    configuration = {"id": "configuration", "title": "Configuration", "lead": lead, "code": toml}
+    about = {"title": title, "subtitle": subtitle, "sections": [*sections, configuration]}
+    return render_page("document.html", about)
 
 
 def render_page(template: str, context: Mapping[str, Any]) -> str:

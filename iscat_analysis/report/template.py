@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.report.numbers import number, percent
 from iscat_analysis.report.optics import draw_p_values
-from iscat_analysis.report.page import render_page
+from iscat_analysis.report.page import OPTICS_FILE, render_document
 from iscat_analysis.report.style import new_figure, publish
 
 
@@ -71,17 +71,8 @@ def template_page(title: str, found: Mapping[str, Any], template: Template, toml
                 "[calibration] with standards that were fitted with the same template.",
             ],
         },
-        {
-            "id": "configuration",
-            "title": "Configuration",
-            "lead": "optics.toml; name it as optics.file in the configuration of the measurement.",
-            "code": toml,
-        },
     ]
-    return render_page(
-        "document.html",
-        {"title": title, "subtitle": "Picture of a particle, measured", "sections": sections},
-    )
+    return render_document(title, "Picture of a particle, measured", sections, toml, OPTICS_FILE)
 
 
 def _figures(found: Mapping[str, Any], template: Template) -> Iterator[tuple[str, Figure]]:

@@ -78,7 +78,7 @@ def mass_label(analysis: Analysis) -> str:
     return "mass [kDa]" if main.column == "mass_kda" else "mass, model scale [kDa]"
 
 
-def _colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
+def path_colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
     """Colours of masses, and at which ends of their scale some lie beyond it.
 
     All tracks are drawn, and the scale covers them; but where one that is flagged lies far from
@@ -102,7 +102,7 @@ def _colors(analysis: Analysis) -> tuple[Normalize, Colormap, str]:
 
 def _scale_beside(figure: Figure, axes: Axes, analysis: Analysis) -> None:
     """Draw the scale of masses, with an arrow at an end beyond which some lie."""
-    norm, colors, beyond = _colors(analysis)
+    norm, colors, beyond = path_colors(analysis)
     figure.colorbar(
         mpl.cm.ScalarMappable(norm, colors), ax=axes, label=mass_label(analysis),
         fraction=0.05, pad=0.02, extend=beyond,
@@ -125,7 +125,7 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
         aspect=per_inch[0] / per_inch[1],
     )
     scale_bar(axes, columns, tall, analysis.pixel_size_nm)
-    norm, colors, _ = _colors(analysis)
+    norm, colors, _ = path_colors(analysis)
     values, _ = masses(analysis)
     numbers = track_numbers(fits)
     paths = dict(iter(fits.sort_values("frame").groupby(numbers)))
@@ -251,14 +251,14 @@ def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
         ["bad", "n_d_frames"], ascending=[True, False]
     )
     numbers = track_numbers(fits)
-    norm, colors, _ = _colors(analysis)
+    norm, colors, _ = path_colors(analysis)
     values, _ = masses(analysis)
     figure = new_figure(6.2, 3.6)
     axes = figure.add_subplot()
     for row in ranked.head(MSD_TRACKS).index:
         track = tracks.loc[row]
         path = fits[numbers == track["track"]].drop_duplicates("frame").sort_values("frame")
-        lags, measured, error = _msd(path)
+        lags, measured, error = mean_squared_displacement(path)
         shade = colors(norm(values[row])) if np.isfinite(values[row]) else _NO_MASS
         seconds = lags / rate
         predicted = 4 * track["d_um2_s"] * (seconds - exposure_s / 3) + error / _UM2
@@ -274,7 +274,7 @@ def msd(analysis: Analysis, fits: pd.DataFrame) -> Figure | None:
     return figure
 
 
-def _msd(path: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
+def mean_squared_displacement(path: pd.DataFrame) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Lags [frames], mean-squared displacement, and what the errors of places add to it [nm²]."""
     frames = path["frame"].to_numpy(int)
     places = path[["x_nm", "y_nm"]].to_numpy(float)

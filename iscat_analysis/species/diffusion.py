@@ -137,7 +137,7 @@ def fit_diffusion(
     if not 0 < number_in("level", level) < 1:
         raise ConfigError(f"level = {level!r}: give a coverage between 0 and 1")
     best, sigma, crb, log_likelihood = _estimated(track)
-    other, other_sigma = _covariance_based(track, best)
+    other, other_sigma = covariance_based(track, best)
     spare = other_sigma**2 - crb**2
     return Diffusion(
         d_um2_s=best / _NM2_PER_UM2,
@@ -256,7 +256,7 @@ def _interval(track: Displacements, best: float, level: float) -> tuple[float, f
         there = track.likelihood(d)
         gained = d * zero.log_determinant_slope - (there.log_determinant - zero.log_determinant)
         deviation = math.sqrt(2 * max(peak - there.value, 0.0))
-        return deviation - _critical(math.sqrt(max(gained, 0.0)), level)
+        return deviation - critical_value(math.sqrt(max(gained, 0.0)), level)
 
     step = 1 / math.sqrt(there.information)
     high = best + step
@@ -270,7 +270,7 @@ def _interval(track: Displacements, best: float, level: float) -> tuple[float, f
     return lower, upper
 
 
-def _critical(mu: float, level: float) -> float:
+def critical_value(mu: float, level: float) -> float:
     """Critical deviation where the estimate is N(μ, 1) but cannot fall below 0.
 
     The interval holds μ if the deviation is less than this; the chance of it is Φ(c) − Φ(−l) with
@@ -287,7 +287,7 @@ def _critical(mu: float, level: float) -> float:
     return float(scipy.optimize.brentq(short, one, two)) if mu > 0 and short(one) < 0 else one
 
 
-def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, float]:
+def covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, float]:
     """Estimate D from d_k² + d_k d_{k−1} + d_k d_{k+1}, whose mean is 2 D g_k Δ for any errors.
 
     Vestergaard, Blainey & Flyvbjerg (2014), equation 14, here for errors that differ and for gaps:

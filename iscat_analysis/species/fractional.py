@@ -71,17 +71,17 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
     lags = Lags.of(track)
     at = np.array([math.log(free), 1.0])
     low, high = np.array([at[0] - _LN_D, _EXPONENTS[0]]), np.array([at[0] + _LN_D, _EXPONENTS[1]])
-    here = _likelihood(track, lags, free, 1.0)
+    here = likelihood_at(track, lags, free, 1.0)
     if not math.isfinite(here.value):
         return Fractional(here.value, free, 1.0, math.nan)
     for _ in range(_MOST_STEPS):
         step, gain = _newton(here, low - at, high - at)
         if 2 * gain < _LAST_STEP_SIGMAS**2:
             break
-        there = _likelihood(track, lags, *_powers(at + step))
+        there = likelihood_at(track, lags, *_powers(at + step))
         while not there.value > here.value and np.abs(step).max() > _NO_STEP:
             step /= 2
-            there = _likelihood(track, lags, *_powers(at + step))
+            there = likelihood_at(track, lags, *_powers(at + step))
         if not there.value > here.value:  # rounding is all that is left
             step, gain = np.zeros(2), 0.0
             break
@@ -106,10 +106,10 @@ def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArr
     return step, float(here.slope @ step - step @ curvature @ step / 2)
 
 
-def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
+def likelihood_at(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
     """Log-likelihood of fractional Brownian motion, all axes; −∞ where rounding spoils it."""
     before, there, after = (
-        d * _msd(track, lags.distinct, power)
+        d * mean_squared_displacement(track, lags.distinct, power)
         for power in exponent + _EXPONENT_STEP * np.arange(-1, 2)
     )
     motion = covariance(lags, there)
@@ -173,7 +173,9 @@ def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
     return out, one + other
 
 
-def _msd(track: Displacements, lags: FloatArray, exponent: float) -> FloatArray:
+def mean_squared_displacement(
+    track: Displacements, lags: FloatArray, exponent: float
+) -> FloatArray:
     """Mean-squared displacement of averages over exposures for D = 1, without what is constant.
 
     |t|^α averaged over two exposures is [(t+e)^(α+2) + |t−e|^(α+2) − 2 t^(α+2)]/[e² (α+1)(α+2)].

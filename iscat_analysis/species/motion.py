@@ -218,7 +218,7 @@ def confinement_test(
     ratio, d, stiffness = _harmonic_trap(track, free)
     larger, p_value = 0, math.nan
     for number in range(1, turns + 1):
-        drawn = _free_track(track, free, draw)
+        drawn = free_track(track, free, draw)
         larger += _harmonic_trap(drawn, most_likely(drawn))[0] >= ratio
         p_value = (larger + 1) / (number + 1)
         if larger == enough:
@@ -282,7 +282,7 @@ def _harmonic_trap(track: Displacements, free: float) -> tuple[float, float, flo
     return max(2 * (value - none), 0.0), d, stiffness
 
 
-def _free_track(track: Displacements, d: float, rng: np.random.Generator) -> Displacements:
+def free_track(track: Displacements, d: float, rng: np.random.Generator) -> Displacements:
     """Draw a free track with the same frames and errors.
 
     The mean over an exposure is halfway between its ends, with the variance D e/6 of a bridge.

@@ -130,7 +130,7 @@ def plan_blocks(
         return Plan(_spans(first, last, count))
     shift = motion.at(np.arange(first, last, dtype=float))
     moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * _jitter_covariance(motion.shift_px)))
+    unrest = float(np.sum(stiffness * jitter_covariance(motion.shift_px)))
 
     def cost_of(count: int) -> float:
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
@@ -216,7 +216,7 @@ def _stiffness(
     return total / len(means_e)
 
 
-def _jitter_covariance(shift_px: FloatArray) -> FloatArray:
+def jitter_covariance(shift_px: FloatArray) -> FloatArray:
     """Covariance (2, 2) of errors of single shifts, such as bright particles make.
 
     It is that of second differences over 6, in which a steady drift does not show.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
@@ -43,6 +44,7 @@ from iscat_analysis.tracking.linking import (
     linked,
     mass_error,
     mass_places,
+    mean_square,
     meeting,
     numbered,
     seen,
@@ -58,7 +60,6 @@ from iscat_analysis.tracking.moving_field import (
     restore_particle_light,
     search_frames,
 )
-from iscat_analysis.tracking.outlier_positions import without_outliers
 
 ROUNDS = 8
 """Searches of the whole movie; each sees what the fits so far leave over."""
@@ -72,6 +73,8 @@ _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
 _FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
+_AROUND = 5  # rows of a track, to whose median each is compared
+_OUTLIER_RMS = 5.0  # rms of the distance from there; of normal errors 1 in 10¹¹ is larger
 _LINKER_ROWS_PER_FRAME = 1.5  # rows in a frame, from which some will be linked by trackpy
 _MOST_ROWS_PER_AREA = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
@@ -343,3 +346,22 @@ def blurred_rows(
     if not len(variances):
         return rows, np.zeros(1)
     return replace(rows, group=group[rows.track].astype(np.int64)), variances
+
+
+def without_outliers(rows: Localizations) -> Localizations:
+    """Replace outlying positions of each track by the median of those before and after."""
+    # In single frames the best place of a particle may be beside it: on its ring, or where another
+    # was while the background was still wrong.  Such a row says that the particle was not where the
+    # background of all other frames has it, so that the mass of one that hardly moves hangs on it.
+    theta = rows.theta.copy()
+    for k in np.unique(rows.track):
+        mine = np.flatnonzero(rows.track == k)
+        if len(mine) < _AROUND:
+            continue
+        positions = theta[mine, :2]
+        usual = median_filter(positions, size=(_AROUND, 1), mode="nearest")
+        distance_squared = ((positions - usual) ** 2).sum(axis=1)
+        outliers = distance_squared > _OUTLIER_RMS**2 * mean_square(positions - usual)
+        theta[mine[outliers], :2] = usual[outliers]
+        theta[mine[outliers], 3] = np.median(theta[mine, 3])
+    return replace(rows, theta=theta)

@@ -59,7 +59,7 @@ def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int
     sigma, crb = np.hypot(sigma, own), np.hypot(crb, own)
     freedom = np.maximum(judged.pixels - index.size, 1)
     p_value = _p_values(judged.chi2, freedom, judged.worst, judged.pixels)
-    collected = judged.level / pixel**2 * _areas(model, estimate[:, 2], estimate[:, 3])
+    collected = judged.level / pixel**2 * collected_areas(model, estimate[:, 2], estimate[:, 3])
     columns: dict[str, object] = {
         "track": rows.track, "frame": rows.frame + first_frame,
         "n_before": np.full(n, field.frames), "n_after": np.ones(n, dtype=int),
@@ -70,7 +70,7 @@ def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int
         "chi2_reduced": judged.chi2 / freedom, "p_value": p_value,
         "flags": _flags(context, moving, sigma, p_value, losses),
     }  # fmt: skip
-    quantum = _quantum(model, estimate[:, 2], mass, collected, free)
+    quantum = quantum_bounds(model, estimate[:, 2], mass, collected, free)
     for k, name in enumerate(PARAMETERS):
         columns[f"sigma_{name}"], columns[f"crb_{name}"] = sigma[:, k], crb[:, k]
         columns[f"qcrb_{name}"] = quantum[:, k]
@@ -238,7 +238,7 @@ def _heights(z_nm: FloatArray) -> FloatArray:
     return np.array([low]) if low == high else np.linspace(low, high, _HEIGHTS)
 
 
-def _areas(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:
+def collected_areas(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> FloatArray:
     """Give the collected light as an area of background [nm²]."""
     heights = _heights(z_nm)
     nominal = model.material.mass_kda
@@ -247,7 +247,7 @@ def _areas(model: ForwardModel, z_nm: FloatArray, amplitude: FloatArray) -> Floa
     return np.asarray(np.interp(z_nm, heights, unit) * scale**2)
 
 
-def _quantum(
+def quantum_bounds(
     model: ForwardModel, z_nm: FloatArray, mass: FloatArray, collected: FloatArray, free: BoolArray
 ) -> FloatArray:
     """Quantum bounds, shape (n, 4); NaN where not free."""

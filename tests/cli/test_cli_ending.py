@@ -34,7 +34,7 @@ def in_a_thread():
 
 def run(program, arguments):
     try:
-        with failures(Messages("iscat busy"), debug=False):
+        with failures(Messages("iscat busy")):
             print("busy", flush=True)
             {where}()
     except typer.Exit as end:
@@ -46,8 +46,15 @@ sys.exit(iscat_cli.main())
 """
 
 
-@pytest.mark.parametrize("where", ["compiled", "in_a_thread"])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("where", "number"),
+    [
+        ("compiled", signal.SIGINT),
+        ("in_a_thread", signal.SIGTERM),
+        pytest.param("compiled", signal.SIGTERM, marks=pytest.mark.large),
+        pytest.param("in_a_thread", signal.SIGINT, marks=pytest.mark.large),
+    ],
+)
 def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Signals) -> None:
     code = BUSY.replace("{where}", where)
     process = subprocess.Popen(
@@ -71,7 +78,7 @@ def test_compiled_code_does_not_hold_the_program(where: str, number: signal.Sign
 
 def test_an_interrupt_that_meets_compiled_code_is_an_interrupt(capsys) -> None:
     """Numba turns an exception that a signal raises inside its dispatcher into a SystemError."""
-    with pytest.raises(typer.Exit) as ended, failures(Messages("iscat fit"), debug=False):
+    with pytest.raises(typer.Exit) as ended, failures(Messages("iscat fit")):
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
     assert ended.value.exit_code == 130
     assert capsys.readouterr().err == "iscat fit: error: interrupted\n"
@@ -98,7 +105,7 @@ def test_an_interrupt_that_meets_compiled_code_is_an_interrupt(capsys) -> None:
 def test_commands_name_options_where_the_library_names_arguments(
     said: str, shown: str, capsys
 ) -> None:
-    with pytest.raises(typer.Exit), failures(Messages("iscat fit"), debug=False):
+    with pytest.raises(typer.Exit), failures(Messages("iscat fit")):
         raise ConfigError(said)
     assert capsys.readouterr().err == f"iscat fit: error: {shown}\n"
 
@@ -139,7 +146,7 @@ def callback():
 
 def run(program, arguments):
     try:
-        with failures(Messages("iscat"), debug=False):
+        with failures(Messages("iscat")):
             callback()
             {then}
     except typer.Exit as end:
@@ -178,6 +185,6 @@ def test_signals_are_as_before_when_a_command_has_ended() -> None:
         return [*map(signal.getsignal, numbers), signal.pthread_sigmask(signal.SIG_BLOCK, ())]
 
     before = state()
-    with failures(Messages("iscat"), debug=False):
+    with failures(Messages("iscat")):
         pass
     assert state() == before

@@ -18,6 +18,7 @@ import tifffile
 from event_tables import draw_series
 from scenes import write_bright_landings
 from sketches import sketch_figures
+from small_movies import SMALL
 from walkers import SETUP, fits_of, walk
 
 from iscat_analysis.config import SIMULATED, Config, config_to_toml, load_config
@@ -29,18 +30,6 @@ from iscat_cli.console import Messages, duration
 
 PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
 SHELLS = ["bash", "zsh", "fish"]
-
-# What keeps an example short without changing what it shows.
-SMALL = [
-    "simulation.frames=60",
-    "simulation.shape=[64, 64]",
-    "simulation.events=[{frame=30, x_px=31.2, y_px=30.8, mass_kda=900.0}]",
-    "background.frames=[0, 30]",
-    "fit.frames=[30, 60]",
-    "posterior.enabled=false",
-    "bounds.pixels=41",
-]
-
 
 NAMED = [((command.__name__,), example) for command, example in COMMANDS]
 NAMED += [
@@ -119,7 +108,7 @@ def test_every_example_runs(
             raise KeyboardInterrupt
 
         Path("movies").mkdir()
-        monkeypatch.setattr("iscat_analysis.day.watch._Folder.check", interrupt)
+        monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", interrupt)
     if "samples.csv" in arguments:
         sketch_figures(monkeypatch)
         Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")

@@ -16,6 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from small_movies import SMALL
 
 from iscat_analysis.bounds.paper import table1
 from iscat_analysis.config import config_to_toml, load_config
@@ -25,16 +26,6 @@ from iscat_analysis.schemas import schema, schema_names
 from iscat_cli import main, main_fit
 
 pytestmark = pytest.mark.usefixtures("sketched")
-
-SMALL = [
-    "simulation.frames=60",
-    "simulation.shape=[64, 64]",
-    "simulation.events=[{frame=30, x_px=31.2, y_px=30.8, mass_kda=900.0}]",
-    "background.frames=[0, 30]",
-    "fit.frames=[30, 60]",
-    "posterior.enabled=false",
-    "bounds.pixels=41",
-]
 
 
 def _check(value: Any, name: str) -> None:

@@ -116,9 +116,9 @@ def written(
     """Let the commands write every kind of page, from small jobs."""
     folder = tmp_path_factory.mktemp("written")
     movie, shade, landing = (folder / f"{name}.tif" for name in ("movie", "dark", "landing"))
-    few = ["--config", str(sample_configs["landing"]), "--set", "simulation.count=20"]
-    few += ["--set", "simulation.frames=500"]
-    dark = 4 * np.random.default_rng(1).standard_normal((60, 128, 128))
+    few = ["--config", str(sample_configs["landing"]), "--set", "simulation.count=12"]
+    few += ["--set", "simulation.frames=400"]
+    dark = 4 * np.random.default_rng(1).standard_normal((60, 64, 64))
     tifffile.imwrite(shade, np.rint(100 + dark).astype("uint16"))
     mass = np.random.default_rng(1).normal(np.repeat([66.0, 146.0, 480.0], 60), 8.0)
     table = pd.DataFrame(0.0, index=range(mass.size), columns=list(EVENT_COLUMNS))
@@ -129,11 +129,12 @@ def written(
         patch.setattr(paper, "FOCI_NM", np.linspace(-1000.0, 1000.0, 5))
         for arguments in (
             ["simulate", *few, "--out", str(landing)],
-            ["fit", str(landing), *few, "--inject", "4", "--out", str(folder / "landing")],
+            ["fit", str(landing), *few, "--inject", "2", "--out", str(folder / "landing")],
             ["calibrate", "mass", str(folder / "fits.csv"),
              "--standards", "66,146,480", "--out", str(folder / "line")],
             ["simulate", "--config", str(sample_configs["mass"]), "--out", str(movie),
-             "--set", "camera.offset_adu=100"],
+             "--set", "camera.offset_adu=100", "--set", "simulation.shape=[64, 64]",
+             "--set", "simulation.frames=200", "--set", "simulation.events=[]"],
             ["calibrate", "camera", str(movie), "--dark", str(shade),
              "--out", str(folder / "camera")],
             ["benchmark", "--config", str(sample_configs["joint"]), "--trials", "20",

@@ -46,7 +46,7 @@ def _run(order: dict[str, Any]) -> int:
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:
-        chunks._MEMORY_SHARE = order["memory_share"]
+        chunks.MEMORY_SHARE = order["memory_share"]
     if "die" in order:
         _die_while_renaming(*order["die"])
     os.write(order["ready"], b"\n")

@@ -19,9 +19,8 @@ import zarr
 from hardening.samples import samples
 from tiff_files import movie
 
-from iscat_analysis.answers.binding import fit_kd
+from iscat_analysis import find_species, fit_kd, open_result
 from iscat_analysis.answers.calibrations import read_contrasts
-from iscat_analysis.answers.species import find_species
 from iscat_analysis.camera.counts import read_map
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.day.table import read_table
@@ -29,7 +28,6 @@ from iscat_analysis.executors import open_executor
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.optics.measured import Template
-from iscat_analysis.pipeline.stored import open_result
 from iscat_analysis.reading import read_json, read_parquet
 
 Seed = dict[str, bytes]

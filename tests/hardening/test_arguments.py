@@ -172,7 +172,7 @@ def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(config_module, "load_config", enough)
-    monkeypatch.setattr("iscat_analysis.day.watch._Folder.look", interrupt)
+    monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", interrupt)
     return tmp_path
 
 

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 from cluster_worker import busy
 from distributed import Client
+from small_movies import SETUP
 
 import iscat_analysis as ia
 from iscat_analysis import executors as places
@@ -51,19 +52,7 @@ LANDING = {
     "simulation.leavings": 2,
     "simulation.species": [480.0],
 }
-BOUND = {
-    "optics.focus_nm": -300.0,
-    "optics.calibrate": "never",
-    "camera.pixel_size_nm": 84.4,
-    "particle.mass_kda": 900.0,
-    "background.frames": (0, 30),
-    "fit.frames": (30, 60),
-    "posterior.enabled": False,
-    "calibration.gradient_per_kda": -3.1e-5,
-    "simulation.shape": [64, 64],
-    "simulation.frames": 60,
-}
-NAMES = ("a", "b", "c", "d")
+NAMES = ("a", "b")
 
 
 class Workers:
@@ -133,7 +122,7 @@ def wait_until(condition: Callable[[], bool]) -> None:
 def cluster(tmp_path_factory, repo_root: Path) -> Iterator[Workers]:
     """Start a scheduler; tests add the workers that they need."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(places, "_CONNECT_S", DEADLINE_S)  # other tests keep the machine busy
+        patch.setattr(places, "CONNECT_S", DEADLINE_S)  # other tests keep the machine busy
         workers = Workers(tmp_path_factory.mktemp("cluster"), repo_root)
         try:
             yield workers
@@ -271,7 +260,7 @@ def test_a_movie_without_chunks_is_analysed_here_and_says_so(
     cluster: Workers, tmp_path: Path, capsys
 ) -> None:
     _simulate(tmp_path / "a.tif", 1)
-    (tmp_path / "setup.toml").write_text(ia.config_to_toml(ia.configure(BOUND)))
+    (tmp_path / "setup.toml").write_text(ia.config_to_toml(ia.configure(SETUP)))
     command = [str(tmp_path / "a.tif"), "--config", str(tmp_path / "setup.toml")]
     assert main_fit([*command, "--scheduler-file", str(cluster.file)]) == 0
     assert "a.tif: is analysed in this process: only landing movies" in capsys.readouterr().err
@@ -295,12 +284,12 @@ def _simulate(path: Path, seed: int) -> None:
         {"frame": 30, "x_px": 20.3 + 22 * k, "y_px": 20.8 + 20 * k, "mass_kda": 900.0 + 600 * k}
         for k in (0, 1)
     ]
-    ia.simulate_movie({**BOUND, "simulation.events": events}, path, seed=seed)
+    ia.simulate_movie({**SETUP, "simulation.events": events}, path, seed=seed)
 
 
 @pytest.fixture(scope="module")
 def day(tmp_path_factory) -> Path:
-    """Make a day: four movies, and one that is cut short."""
+    """Make a day: two movies, and one that is cut short."""
     folder = tmp_path_factory.mktemp("day")
     for number, name in enumerate(NAMES):
         _simulate(folder / f"{name}.tif", number + 1)
@@ -315,7 +304,7 @@ def test_movies_of_a_day_give_the_same_bytes_when_a_worker_is_killed(
 ) -> None:
     """A movie that cannot be analysed says the same, and once."""
     cluster.add(2)
-    given = {"config": BOUND, "command": "iscat batch"}
+    given = {"config": SETUP, "command": "iscat batch"}
     expected = ia.batch(day / "samples.csv", out=day / "here", **given)
     told: list[str] = []
     with one_killed(cluster):
@@ -342,7 +331,7 @@ def test_a_worker_that_does_not_see_a_movie_says_which(
     cluster.add(2)
     monkeypatch.setattr("iscat_analysis.day.run.seen", lambda path: f"another {path}")
     (day / "one.csv").write_text("path\na.tif\n")
-    found = ia.batch(day / "one.csv", out=day / "blind", config=BOUND, scheduler_file=cluster.file)
+    found = ia.batch(day / "one.csv", out=day / "blind", config=SETUP, scheduler_file=cluster.file)
     ((name, why),) = found.failed
     assert name == "a"
     assert f"{day / 'a.tif'}: is not on " in why

@@ -9,14 +9,12 @@ import shutil
 import threading
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from types import SimpleNamespace
 
 import pandas as pd
 import pytest
-from small_movies import SETUP, simulate
+from small_movies import SETUP, analysed, put_in_place_of_fits
 
 import iscat_analysis as ia
-from iscat_analysis.day import run
 from iscat_cli import main
 
 NAMES = [
@@ -29,24 +27,13 @@ WRITTEN = [name.encode("utf-8", "backslashreplace").decode() for name in NAMES]
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """Make a movie and its result."""
-    place = tmp_path_factory.mktemp("made")
-    simulate(place / "movie.tif", seed=1)
-    ia.fit_stack(place / "movie.tif", ia.configure(SETUP), out=place / "movie.iscat")
-    return place
+    return analysed(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
 def lab(made: Path, tmp_path: Path, monkeypatch) -> Path:
     """Return a folder of movies whose fits are all done."""
-
-    def fit_stack(movie: Path, _: object, *, out: Path, **__: object) -> SimpleNamespace:
-        with ia.open_stack(movie) as stack:
-            sha256 = stack.sha256()
-        shutil.copytree(made / "movie.iscat", out, dirs_exist_ok=True)
-        summary = json.loads((out / "summary.json").read_text())
-        return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
-
-    monkeypatch.setattr(run, "fit_stack", fit_stack)
+    put_in_place_of_fits(made, monkeypatch)
     folder = tmp_path / "lab"
     folder.mkdir()
     for name in NAMES:

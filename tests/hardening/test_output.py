@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import re
@@ -11,9 +13,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 from report_factory import make_analysis
+from sketches import sketch_figures
 from small_movies import LANDING
 
 from iscat_analysis.config import load_config
@@ -29,7 +33,9 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
 from iscat_analysis.report import write_report
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output, claim_output
+from iscat_analysis.search.sliding import chunks
 from iscat_analysis.study.simulate import write_stack
+from iscat_cli import main
 
 KILLS = 50
 """Runs that are killed, where all of the large tests are run."""
@@ -61,17 +67,36 @@ FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overw
 
 
 class Runner:
-    """Runs `runner.py`: one order or several at the same time, each in a process of its own.
+    """Runs orders: in processes of their own, or here where none of them is ended.
 
     An order is one of `runner.py` with ``"cwd": folder``, and ``"kill": [signal, share]`` to be
-    ended after that share of an undisturbed run's duration, which is the first order's or
-    ``"duration": seconds``.  An answer is ``{"status": …, "err": …, "seconds": …}``; a signal's
-    status is negative.
+    ended after that share of an undisturbed run's duration, or of ``"duration": seconds``.  An
+    answer is ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
     """
 
     def __init__(self, folder: Path) -> None:
         self.bench = folder
-        self.duration = 0.0
+
+    @cached_property
+    def duration(self) -> float:
+        """Seconds of an undisturbed run, once what it needs is compiled."""
+        return float(self.here({"run": FIT, "cwd": str(self.bench)})["seconds"])
+
+    def here(self, order: dict[str, Any]) -> dict[str, Any]:
+        """Do in this process what `runner.py` does, which spares the imports of another one."""
+        said, begin = io.StringIO(), time.monotonic()
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            contextlib.chdir(order["cwd"]),
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(said),
+        ):
+            if not order.get("figures"):
+                sketch_figures(patch)
+            if "memory_share" in order:
+                patch.setattr(chunks, "MEMORY_SHARE", order["memory_share"])
+            status = main(order["run"])
+        return {"status": status, "err": said.getvalue(), "seconds": time.monotonic() - begin}
 
     def run(self, *orders: dict[str, Any]) -> list[dict[str, Any]]:
         with ThreadPoolExecutor(len(orders)) as pool:
@@ -105,15 +130,14 @@ class Runner:
 
 @pytest.fixture(scope="module")
 def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
-    """Return what runs programs, once it knows how long one takes."""
+    """Return what runs programs, with a movie and its result."""
     bench = tmp_path_factory.mktemp("bench")
     (bench / "setup.toml").write_text(SETUP)
     write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
     runner = Runner(bench)
-    for _ in range(2):  # the first compiles
-        (first,) = runner.run({"run": FIT, "cwd": str(bench)})
-        assert first["status"] == 0, first["err"]
-    runner.duration = first["seconds"]
+    # In a process of its own, at whose end all that it compiled is kept for those that are killed.
+    (first,) = runner.run({"run": FIT, "cwd": str(bench)})
+    assert first["status"] == 0, first["err"]
     return runner
 
 
@@ -178,10 +202,11 @@ def contents(result: Path) -> dict[str, bytes]:
 
 
 def test_repeats_are_identical(runner: Runner, place: Path) -> None:
+    """In a process that has done other things before, and in one of its own."""
+    order = {"run": FIT, "cwd": str(place), "figures": True}
     found = []
-    for _ in range(2):
-        (answer,) = runner.run({"run": FIT, "cwd": str(place), "figures": True})
-        assert answer["status"] == 0
+    for run in (runner.here, lambda order: runner.run(order)[0]):
+        assert run(order)["status"] == 0
         assert_whole(place / "result")
         found.append(contents(place / "result"))
     assert len(found[0]) > 10
@@ -236,7 +261,8 @@ def landing(
     write_stack(load_config(place / "setup.toml"), place / "movie.tif")
     order = {"run": FIT, "cwd": str(place), "memory_share": 0.0031}
     runner.run(order)  # compiles what landing movies need
-    (whole,) = runner.run(order)
+    shutil.rmtree(place / "result")
+    whole = runner.here(order)
     assert whole["status"] == 0, whole["err"]
     assert not (place / ".result.partial").exists()
     summary = json.loads((place / "result" / "summary.json").read_text(encoding="utf-8"))
@@ -255,7 +281,7 @@ def test_a_landing_movie_killed_between_chunks_resumes(
     (answer,) = runner.run({**order, "die": ["after", chunks]})
     assert answer["status"] == -signal.SIGKILL
     assert len(list((place / ".result.partial").glob("*.npz"))) == chunks
-    (again,) = runner.run(order)
+    again = runner.here(order)
     assert again["status"] == 0, again["err"]
     assert differing(contents(place / "result"), expected) == []
     assert names(place) == ["movie.tif", "movie.truth.csv", "result", "setup.toml"]
@@ -300,13 +326,12 @@ def test_killed_between_two_renamings(runner: Runner, place: Path, word: str, nu
     (place / "result" / "summary.json").write_text('{"earlier": true}')
     (answer,) = runner.run({"run": FIT, "cwd": str(place), "die": [word, number]})
     assert answer["status"] == -signal.SIGKILL
-    refused = {"run": [*FIT[:-1]], "cwd": str(place)}  # without --overwrite
-    (again,) = runner.run(refused)
+    again = runner.here({"run": FIT[:-1], "cwd": str(place)})  # without --overwrite
     assert again["status"] == 1
     assert "holds an earlier result" in one_line(again)
     summary = json.loads((place / "result" / "summary.json").read_text())
     assert ("earlier" in summary) == ((word, number) != ("after", 2))
-    (again,) = runner.run({"run": FIT, "cwd": str(place)})
+    again = runner.here({"run": FIT, "cwd": str(place)})
     assert again["status"] == 0
     assert_whole(place / "result")
     assert names(place) == ["movie.tif", "result", "setup.toml"]
@@ -319,9 +344,11 @@ def test_killed_between_two_renamings(runner: Runner, place: Path, word: str, nu
         *(pytest.param(n, marks=pytest.mark.large) for n in (signal.SIGTERM, signal.SIGHUP)),
     ],
 )
-def test_asked_to_end(runner: Runner, place: Path, number: int) -> None:
+def test_asked_to_end(
+    runner: Runner, place: Path, number: int, repetitions: Callable[[int, int], int]
+) -> None:
     rng = np.random.default_rng(SEED)
-    for _ in range(3):
+    for _ in range(repetitions(1, 3)):
         order = {"run": FIT, "cwd": str(place), "kill": [number, float(rng.uniform(0, 1))]}
         (answer,) = runner.run(order)
         assert answer["status"] in (0, 130, -number, -signal.SIGINT)  # before it began; too slow
@@ -332,18 +359,17 @@ def test_asked_to_end(runner: Runner, place: Path, number: int) -> None:
             assert_whole(place / "result")
 
 
-def test_two_runs_into_one_folder(runner: Runner, place: Path) -> None:
-    for options in (FIT, FIT[:-1]):
-        shutil.rmtree(place / "result", ignore_errors=True)
-        answers = runner.run(*[{"run": options, "cwd": str(place)}] * 3)
-        statuses = sorted(answer["status"] for answer in answers)
-        assert statuses[0] == 0
-        assert set(statuses) <= {0, 1}
-        for answer in answers:
-            if answer["status"]:
-                assert re.search("another run|earlier result", one_line(answer))
-        assert_whole(place / "result")
-        assert names(place) == ["movie.tif", "result", "setup.toml"]
+@pytest.mark.parametrize("options", [pytest.param(FIT, marks=pytest.mark.large), FIT[:-1]])
+def test_two_runs_into_one_folder(runner: Runner, place: Path, options: list[str]) -> None:
+    answers = runner.run(*[{"run": options, "cwd": str(place)}] * 2)
+    statuses = sorted(answer["status"] for answer in answers)
+    assert statuses[0] == 0
+    assert set(statuses) <= {0, 1}
+    for answer in answers:
+        if answer["status"]:
+            assert re.search("another run|earlier result", one_line(answer))
+    assert_whole(place / "result")
+    assert names(place) == ["movie.tif", "result", "setup.toml"]
 
 
 def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> None:
@@ -355,8 +381,7 @@ def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> No
     expected = f"result: another run (process {os.getpid()}) is about to write there"
     assert expected in one_line(answer)
     assert not (place / "result").exists()
-    (answer,) = runner.run({"run": FIT, "cwd": str(place)})
-    assert answer["status"] == 0
+    assert runner.here({"run": FIT, "cwd": str(place)})["status"] == 0
 
 
 # ---- disks ---------------------------------------------------------------------------------------
@@ -417,7 +442,7 @@ def test_a_read_only_disk(mount: Path, runner: Runner) -> None:
     shutil.copy(runner.bench / "setup.toml", mount)
     subprocess.run(["mount", "-o", "remount,ro", str(mount)], check=True)
     run = ["fit", "movie.tif", "--config", "setup.toml"]
-    (answer,) = runner.run({"run": run, "cwd": str(mount)})
+    answer = runner.here({"run": run, "cwd": str(mount)})
     assert answer["status"] == 1
     assert "movie.iscat: cannot be made (Read-only file system); choose another --out" in one_line(
         answer
@@ -459,18 +484,19 @@ def test_names(runner: Runner, tmp_path: Path, name: str) -> None:
     shutil.copy(runner.bench / "movie.tif", folder / f"{name}.tif")
     shutil.copy(runner.bench / "setup.toml", folder / f"{name}.toml")
     config = f"--config={name}.toml"
-    (answer,) = runner.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    order = {"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)}
+    answer = runner.here(order)
     assert answer["status"] == 0, answer["err"]
     assert_whole(folder / f"{name}.iscat")
     assert names(folder) == sorted(f"{name}.{end}" for end in ("tif", "toml", "iscat"))
-    (answer,) = runner.run({"run": ["fit", config, "--", f"{name}.tif"], "cwd": str(folder)})
+    answer = runner.here(order)
     assert answer["status"] == 1
     assert "holds an earlier result" in one_line(answer)
 
 
 def test_a_name_that_is_too_long_is_refused_early(runner: Runner, place: Path) -> None:
     run = ["fit", "movie.tif", "--config", "setup.toml", "--out", "z" * 300]
-    (answer,) = runner.run({"run": run, "cwd": str(place)})
+    answer = runner.here({"run": run, "cwd": str(place)})
     assert answer["status"] == 1
     assert "File name too long" in one_line(answer)
 

@@ -135,7 +135,7 @@ def test_differences_are_summed_once_in_order(
 ) -> None:
     frames = wrapping(200)
     path = write_two_mp(tmp_path / "m.mp", frames, **ENCODED)
-    monkeypatch.setattr(refeyn_module, "_ANCHOR_BYTES", 10 * frames[0].nbytes)
+    monkeypatch.setattr(refeyn_module, "ANCHOR_BYTES", 10 * frames[0].nbytes)
     read: list[int] = []
     original = refeyn_module.StoredArray.read
 

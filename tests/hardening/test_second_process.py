@@ -33,7 +33,7 @@ from iscat_analysis import executors
 from iscat_analysis.search.sliding import chunks
 from iscat_cli import main
 
-chunks._MEMORY_SHARE = 0.0031
+chunks.MEMORY_SHARE = 0.0031
 executors.processors = lambda: 2
 executors._LARGE_BYTES = float(sys.argv.pop(1))
 lost = int(sys.argv.pop(1))

@@ -10,8 +10,7 @@ import pytest
 import reference
 from golden_setups import GOLDEN, reference_setup
 
-from iscat_analysis.bounds import bounds_report
-from iscat_analysis.bounds.quantum import quantum_information
+from iscat_analysis.bounds import bounds_report, quantum_information
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model

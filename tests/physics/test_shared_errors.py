@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from calibrations import PIXEL_NM
 
-from iscat_analysis.bounds.shared import (
+from iscat_analysis.bounds import (
     displacement,
     eliminated,
     imitation,

@@ -85,6 +85,7 @@ def _analysed(counts: np.ndarray, calibrate: str) -> ia.Result:
     )
 
 
+@pytest.mark.large
 def test_optics_are_learned_from_particles_that_do_not_stand_alone(
     bound: tuple[Landings, np.ndarray],
 ) -> None:
@@ -117,6 +118,7 @@ def test_optics_are_learned_from_particles_that_do_not_stand_alone(
     assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * len(pulls))
 
 
+@pytest.mark.large
 def test_the_same_particles_through_the_configured_optics_are_not_described(
     bound: tuple[Landings, np.ndarray],
 ) -> None:

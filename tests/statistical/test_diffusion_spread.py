@@ -71,7 +71,7 @@ def repeat(
     rng, told = np.random.default_rng(seed), told or track
     rows = []
     for _ in range(trials):
-        drawn = replace(told, positions_nm=motion._free_track(track, d * 1e6, rng).positions_nm)
+        drawn = replace(told, positions_nm=motion.free_track(track, d * 1e6, rng).positions_nm)
         found = ia.fit_diffusion(
             drawn.frames, drawn.positions_nm.T, np.sqrt(drawn.variance_nm2.T),
             frame_rate_hz=RATE_HZ, exposure_ms=1e3 * drawn.exposure_s,
@@ -213,7 +213,7 @@ def test_free_motion_is_not_called_otherwise(repetitions: Callable[[int, int], i
     trials = repetitions(60, 400)
     rng, anomalous, confined, pulls = np.random.default_rng(2), [], [], []
     for number in range(trials):
-        drawn = motion._free_track(still(60, 100 + number), 0.15e6, rng)
+        drawn = motion.free_track(still(60, 100 + number), 0.15e6, rng)
         arguments = (drawn.frames, drawn.positions_nm.T, np.sqrt(drawn.variance_nm2.T))
         one = ia.anomalous_test(*arguments, frame_rate_hz=RATE_HZ)
         two = ia.confinement_test(*arguments, frame_rate_hz=RATE_HZ, resamples=19, rng=rng)

@@ -9,7 +9,7 @@ import numpy as np
 from event_tables import draw_visits
 
 import iscat_analysis as ia
-from iscat_analysis.answers.kinetics import Kinetics
+from iscat_analysis import Kinetics
 from iscat_analysis.species import Efficiency
 from iscat_analysis.species.kinetics import UnbindingRate
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from scenes import Stack
 from scipy.ndimage import convolve1d
 from scipy.stats import poisson
 
@@ -28,20 +29,6 @@ LEVEL_E = 1e5
 WINDOW = 40
 SIGMAS = 4.0
 TAIL = 1e-4  # of the Poisson law on either side
-
-
-class Memory:
-    """A movie in memory."""
-
-    def __init__(self, counts: np.ndarray) -> None:
-        self.counts = counts
-        self.shape = counts.shape
-        self.dtype = counts.dtype
-        self.name = "movie"
-
-    def read(self, start: int, stop: int) -> np.ndarray:
-        """Frames [start, stop)."""
-        return self.counts[start:stop]
 
 
 STILL, DRIFTING = (0.0, 0.0), (0.005, -0.002)
@@ -78,7 +65,7 @@ def _config(side: int, frames: int, *settings: str) -> Config:
 def _analyse(config: Config, seed: int) -> pd.DataFrame:
     counts = np.array(list(Movie(config, seed).frames()))
     return analyse_landings(
-        Memory(counts), config, Camera(gain_e_per_adu=4.0),
+        Stack(counts), config, Camera(gain_e_per_adu=4.0),
         warn=lambda _: None, progress=lambda *_: None,
     ).fits  # fmt: skip
 
@@ -151,7 +138,7 @@ def _alarms_in(kind: str, movies: int) -> int:
         counts = np.round(_with_noise(drawn, light, kind, seed) / 4.0)
         found += len(
             analyse_landings(
-                Memory(np.clip(counts, 0, 65535).astype(np.uint16)), config,
+                Stack(np.clip(counts, 0, 65535).astype(np.uint16)), config,
                 Camera(gain_e_per_adu=4.0), warn=lambda _: None, progress=lambda *_: None,
             ).fits
         )  # fmt: skip

@@ -12,7 +12,7 @@ from scipy.stats import binom, kstest, poisson
 
 from iscat_analysis.inference.fit import POOR_FIT_P, fit_particle
 from iscat_analysis.inference.goodness import three_tests
-from iscat_analysis.inference.noise_models import _attainable
+from iscat_analysis.inference.noise_models import attainable_tails
 from iscat_analysis.records import FitResult, FloatArray, Status
 from iscat_analysis.study import Setting, make_setting, run_trials, trial_generator
 
@@ -86,7 +86,7 @@ def test_the_least_likely_of_few_counts_is_judged_exactly() -> None:
     tails = np.minimum(1.0, 2 * np.minimum(above, below))
     for tail in (0.5, 1e-2, 1.1e-5, 1e-7, 3e-11):
         exact = np.sum(poisson.pmf(counts, means) * (tails <= tail), axis=0)
-        np.testing.assert_allclose(_attainable(means, tail), exact, rtol=1e-6, atol=1e-16)
+        np.testing.assert_allclose(attainable_tails(means, tail), exact, rtol=1e-6, atol=1e-16)
 
 
 @pytest.mark.parametrize("mode", ["mass", "joint"])

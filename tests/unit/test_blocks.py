@@ -170,8 +170,8 @@ def test_what_pulls_at_single_shifts_is_no_drift() -> None:
     """Second differences of independent shifts have 1 + 4 + 1 times their variance."""
     rng = np.random.default_rng(3)
     steady = np.outer(np.arange(2000), [0.3, -0.1])
-    assert np.abs(blocks_module._unrest(steady)).max() < 1e-20
-    found = blocks_module._unrest(steady + rng.normal(0, [0.02, 0.05], (2000, 2)))
+    assert np.abs(blocks_module.jitter_covariance(steady)).max() < 1e-20
+    found = blocks_module.jitter_covariance(steady + rng.normal(0, [0.02, 0.05], (2000, 2)))
     assert np.allclose(np.sqrt(np.diag(found)), [0.02, 0.05], rtol=SIGMAS * 0.03)
     assert abs(found[0, 1]) < SIGMAS * 0.02 * 0.05 / math.sqrt(600)
 

@@ -179,7 +179,7 @@ def test_shared_errors_are_those_of_all_pixels(
         return float(np.abs(np.linalg.eigvalsh(off)).max())
 
     assert error() < 1e-3
-    monkeypatch.setattr(common, "_MOST_VARIANCE_LEFT_OUT", math.inf)
+    monkeypatch.setattr(common, "MOST_VARIANCE_LEFT_OUT", math.inf)
     assert error() > 3e-3 or kind == "short"  # whose rows hardly feel one another
     found = common_amplitudes(field, ground, rows, judged, np.ones(frames, dtype=bool))
     weights = np.linalg.solve(amplitudes, np.ones(frames))
@@ -208,7 +208,7 @@ def test_a_particle_that_hardly_moves_is_worked_out_to_the_last_digit(
     found = common_amplitudes(field, ground, rows, judged, every)
     assert found.variance[0] == pytest.approx(exact, rel=1e-3)
     assert exact > 1e5 * found.known[0]
-    monkeypatch.setattr(common, "_MOST_STEPS", 2)
+    monkeypatch.setattr(common, "MOST_STEPS", 2)
     rough = common_amplitudes(field, ground, rows, judged, every)
     assert rough.variance[0] != pytest.approx(exact, rel=0.1)
 

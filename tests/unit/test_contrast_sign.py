@@ -60,7 +60,7 @@ def _refused(movie: Path, changes: dict[str, Any]) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("focus_nm", [-25.0, -10.0, 20.0])
+@pytest.mark.parametrize("focus_nm", [pytest.param(-25.0, marks=pytest.mark.large), -10.0, 20.0])
 def test_the_movie_tells_a_focus_that_gives_no_contrast(flat: Path, focus_nm: float) -> None:
     result = ia.fit_movie(flat, config={**SETUP, "optics.focus_nm": focus_nm})
     said = " ".join(result.warnings)

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from iscat_analysis.day.compare import holm, match_species, sample_means, shifts
-from iscat_analysis.day.gather import _shares, poisson_rate
+from iscat_analysis.day.gather import poisson_rate, shares_of
 
 # Standard errors of a share of rejections in so many repetitions.
 FAR = 4.0
@@ -144,7 +144,7 @@ def _counted(seen: float, efficiency: float, *, outlier: bool = False) -> dict[s
 
 def test_shares_leave_out_what_lies_apart() -> None:
     """100 and 50 seen of 100 %, and of 50 %, are as many; one at 1e-6 does not take it all."""
-    shares = _shares([_counted(100, 1.0), _counted(50, 0.5), _counted(1, 1e-6, outlier=True)])
+    shares = shares_of([_counted(100, 1.0), _counted(50, 0.5), _counted(1, 1e-6, outlier=True)])
     assert [s["share"] for s in shares[:2]] == pytest.approx([0.5, 0.5])
     assert math.isnan(shares[2]["share"])
     # Log odds of counts 100 and 50 have the variance 1/100 + 1/50.
@@ -154,4 +154,4 @@ def test_shares_leave_out_what_lies_apart() -> None:
 
 
 def test_a_single_species_has_the_whole_share() -> None:
-    assert _shares([_counted(100, 1.0)]) == [{"share": 1.0}]
+    assert shares_of([_counted(100, 1.0)]) == [{"share": 1.0}]

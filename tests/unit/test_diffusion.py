@@ -37,7 +37,7 @@ def make_track(
         frames, np.zeros((n, axes)), rng.uniform(10, 30, (n, axes)),
         frame_rate_hz=RATE_HZ, exposure_ms=exposure * 1e3 / RATE_HZ,
     )  # fmt: skip
-    return motion._free_track(track, 0.15e6, rng)
+    return motion.free_track(track, 0.15e6, rng)
 
 
 def given(track: Displacements) -> dict[str, Any]:
@@ -203,10 +203,10 @@ def test_critical_values_cover() -> None:
     for mu in (0.0, 0.05, 0.5, 1.0, 1.5, 1.9, 3.0):
         best = np.maximum(x + mu, 0)
         ratio = (x + mu - mu) ** 2 - (x + mu - best) ** 2
-        held = np.mean(ratio <= diffusion._critical(mu, 0.95) ** 2)
+        held = np.mean(ratio <= diffusion.critical_value(mu, 0.95) ** 2)
         assert abs(held - 0.95) < SIGMAS * math.sqrt(0.95 * 0.05 / x.size)
-    assert diffusion._critical(0.0, 0.95) == pytest.approx(1.6449, abs=1e-4)
-    assert diffusion._critical(2.5, 0.95) == pytest.approx(1.9600, abs=1e-4)
+    assert diffusion.critical_value(0.0, 0.95) == pytest.approx(1.6449, abs=1e-4)
+    assert diffusion.critical_value(2.5, 0.95) == pytest.approx(1.9600, abs=1e-4)
 
 
 def test_a_particle_that_stands_still() -> None:
@@ -230,14 +230,14 @@ def test_the_covariance_based_estimate_needs_no_errors() -> None:
         for value, direction in zip(values, directions.T, strict=True):
             places = np.concatenate([[0.0], np.cumsum(math.sqrt(value) * direction)])
             one = gather(**given(blurred) | {"positions_nm": places})
-            mean += diffusion._covariance_based(one, d)[0]
+            mean += diffusion.covariance_based(one, d)[0]
         assert mean == pytest.approx(d, rel=1e-9, abs=1e-3)
 
 
 def test_the_covariance_based_estimate_has_its_error() -> None:
     rng, d = np.random.default_rng(5), 0.3e6
     track = make_track(n=30)
-    drawn = [diffusion._covariance_based(motion._free_track(track, d, rng), d) for _ in range(1000)]
+    drawn = [diffusion.covariance_based(motion.free_track(track, d, rng), d) for _ in range(1000)]
     values, errors = np.array(drawn).T
     assert abs(values.mean() - d) < SIGMAS * values.std() / math.sqrt(values.size)
     assert values.std() / errors[0] == pytest.approx(1, abs=SIGMAS / math.sqrt(values.size))
@@ -251,7 +251,9 @@ def test_the_covariance_based_estimate_has_its_error() -> None:
 def test_blur_of_anomalous_motion(exponent: float, exposure: float) -> None:
     track = make_track(n=5, missing=0.5, exposure=exposure)
     lags = fractional.Lags.of(track)
-    found = fractional.covariance(lags, fractional._msd(track, lags.distinct, exponent))
+    found = fractional.covariance(
+        lags, fractional.mean_squared_displacement(track, lags.distinct, exponent)
+    )
     dt, start = track.interval_s, track.frames.astype(float)
 
     def averaged(lag: float) -> float:
@@ -319,7 +321,7 @@ def test_the_best_well_is_that_of_a_simplex_search(walled: bool, seed: int) -> N
 
 def test_drawn_tracks_have_the_covariance() -> None:
     track, rng, trials = make_track(n=6), np.random.default_rng(3), 8000
-    drawn = np.array([motion._free_track(track, 0.15e6, rng).steps_nm[0] for _ in range(trials)])
+    drawn = np.array([motion.free_track(track, 0.15e6, rng).steps_nm[0] for _ in range(trials)])
     main, beside = (band[0] for band in track.error)
     main, beside = main + 0.15e6 * track.rate[0], beside + 0.15e6 * track.rate[1]
     expected = np.diag(main) + np.diag(beside, 1) + np.diag(beside, -1)
@@ -394,10 +396,12 @@ def test_slopes_of_the_likelihood_of_an_exponent(exponent: float) -> None:
     part = 1e-5 * np.eye(2)
 
     def told(at: np.ndarray) -> Any:
-        return fractional._likelihood(track, lags, math.exp(at[0]), at[1])
+        return fractional.likelihood_at(track, lags, math.exp(at[0]), at[1])
 
     def covariances(at: np.ndarray) -> np.ndarray:
-        one = fractional.covariance(lags, fractional._msd(track, lags.distinct, at[1]))
+        one = fractional.covariance(
+            lags, fractional.mean_squared_displacement(track, lags.distinct, at[1])
+        )
         sigma = np.array([math.exp(at[0]) * one + np.diag(main) for main in track.error[0]])
         for among, beside in zip(sigma, track.error[1], strict=True):
             among += np.diag(beside, 1) + np.diag(beside, -1)
@@ -430,7 +434,7 @@ def test_the_most_likely_exponent() -> None:
 
         def lost(at: np.ndarray, moved: Displacements = moved) -> float:
             exponent = min(max(at[1], 0.02), 1.98)
-            return -fractional._likelihood(moved, lags, math.exp(at[0]), exponent).value
+            return -fractional.likelihood_at(moved, lags, math.exp(at[0]), exponent).value
 
         best = minimize(lost, [12.0, 1.2], method="Nelder-Mead", options={"xatol": 1e-6})
         found = fractional.most_likely_power(moved, 0.5 * math.exp(best.x[0]))

@@ -22,7 +22,7 @@ from iscat_analysis._kernels.scoring import (
 from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import FOLLOWED, PLAIN, fit_particle, search_box
-from iscat_analysis.inference.goodness import ORDER, WAIST, _gamma_above, three_tests
+from iscat_analysis.inference.goodness import ORDER, WAIST, gamma_above, three_tests
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.inference.precision import precision
@@ -215,7 +215,7 @@ def _structure(which: Likelihood, theta: FloatArray, free: BoolArray) -> float:
     modes = basis[:, count:].T
     leverage = np.sum(modes**2, axis=0)
     excess = float(kurtosis @ leverage**2) / len(modes)
-    return _gamma_above(float(np.sum((modes @ residual) ** 2)), len(modes), excess)
+    return gamma_above(float(np.sum((modes @ residual) ** 2)), len(modes), excess)
 
 
 @pytest.mark.parametrize("free", FREE)
@@ -272,7 +272,9 @@ def _every_start(
 
 
 @pytest.mark.parametrize("mass", [150.0, 1200.0])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "seed", [0, *(pytest.param(n, marks=pytest.mark.large) for n in (1, 2, 3))]
+)
 def test_starts_that_are_given_up_change_nothing(mass: float, seed: int) -> None:
     """The best optimum and all that come near it, as if every start had been followed."""
     model = forward_model(make_config(optics={"focus_nm": -500.0}), 2500.0)
@@ -357,14 +359,25 @@ def test_a_plain_particle_is_found_without_the_given_height(pupil: str, level: b
 
 
 def _through_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Likelihood, "_is_pictured", lambda *_: False)
+    monkeypatch.setattr(Likelihood, "is_pictured", lambda *_: False)
 
 
-@pytest.mark.parametrize("optics", [
+PICTURES: list[dict[str, object]] = [
     {}, {"polarization_deg": 30.0, "analyzer": True}, {"scheme": "darkfield"},
     {"aberrations_nm": {"z7": 15.0, "z5": 10.0}},
-])  # fmt: skip
-@pytest.mark.parametrize("level", [False, True])
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("optics", "level"),
+    [
+        *((optics, bool(k % 2)) for k, optics in enumerate(PICTURES)),
+        *(
+            pytest.param(optics, not k % 2, marks=pytest.mark.large)
+            for k, optics in enumerate(PICTURES)
+        ),
+    ],
+)
 def test_a_picture_gives_the_fit_of_the_field(
     optics: dict[str, object], level: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -382,7 +395,7 @@ def test_a_picture_gives_the_fit_of_the_field(
     )
     start = Candidate(9.6, 9.8, model.height_nm, 800.0, 10.0)
     box = search_box(which, start, "mass", (0.0, 600.0), level=level)
-    assert which._is_pictured(model.height_nm, box.lower, box.upper)
+    assert which.is_pictured(model.height_nm, box.lower, box.upper)
     fast = fit_particle(which, start, "mass", (0.0, 600.0), level=level)
     tight = which.maximize(fast.theta, box.free, box.lower, box.upper, tolerance=1e-10)
     _through_the_field(monkeypatch)
@@ -402,12 +415,12 @@ def test_what_has_no_picture_takes_the_field() -> None:
     grid = PixelGrid.region((0, 20), (0, 20), PIXEL_NM)
     which = noise.poisson(model, grid, np.full(grid.shape, 1e4), 1e4, 1e4)
     low, high = np.full(5, 700.0), np.full(5, 900.0)
-    assert which._is_pictured(model.height_nm, low, high)
-    assert not which._is_pictured(model.height_nm + 1.0, low, high)
-    assert not which._is_pictured(model.height_nm, low - 700, high + 700)
+    assert which.is_pictured(model.height_nm, low, high)
+    assert not which.is_pictured(model.height_nm + 1.0, low, high)
+    assert not which.is_pictured(model.height_nm, low - 700, high + 700)
     askew = PixelGrid(np.sort(np.append(grid.x_nm[:-1], 10.0)), grid.y_nm, PIXEL_NM)
     other = noise.poisson(model, askew, np.full(grid.shape, 1e4), 1e4, 1e4)
-    assert not other._is_pictured(model.height_nm, low, high)
+    assert not other.is_pictured(model.height_nm, low, high)
 
 
 @pytest.mark.parametrize("rows", [5, 16, 35])

@@ -68,13 +68,13 @@ def test_a_movie_that_is_replaced_while_it_is_being_opened_is_refused(
 ) -> None:
     other = tmp_path / "other.tif"
     tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
-    readers = dict(iscat_analysis.movie._READERS)
+    readers = dict(iscat_analysis.movie.READERS)
 
     def late(path: Path) -> object:
         frames = readers[b"II\x2a\x00"](path)
         other.replace(path)
         return frames
 
-    monkeypatch.setattr(iscat_analysis.movie, "_READERS", {**readers, b"II\x2a\x00": late})
+    monkeypatch.setattr(iscat_analysis.movie, "READERS", {**readers, b"II\x2a\x00": late})
     with pytest.raises(DataError, match="was replaced"):
         ia.open_stack(file)

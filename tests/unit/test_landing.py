@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+from scenes import Stack
 
 from iscat_analysis import pipeline as pipeline_module
 from iscat_analysis.camera.counts import Camera
@@ -72,20 +73,17 @@ def _config(*settings: str, **sections: Any) -> Config:
     return config.model_copy(update={"simulation": simulation})
 
 
-class Memory:
-    """A movie in memory."""
+class Memory(Stack):
+    """A movie in memory that notes which frames are read."""
 
     def __init__(self, counts: np.ndarray) -> None:
-        self.counts = counts
-        self.shape = counts.shape
-        self.dtype = counts.dtype
-        self.name = "movie"
+        super().__init__(counts)
         self.reads: list[tuple[int, int]] = []
 
     def read(self, start: int, stop: int) -> np.ndarray:
         """Frames [start, stop)."""
         self.reads.append((start, stop))
-        return self.counts[start:stop].copy()
+        return super().read(start, stop).copy()
 
 
 @pytest.fixture(scope="module")
@@ -380,7 +378,7 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
 def test_what_is_shown_of_events_is_made_of_the_first_alone(
     counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     for module in (merging, chunk_work):
         monkeypatch.setattr(module, "VIEWS", 2)
         monkeypatch.setattr(module, "CLIPS", 1)
@@ -405,7 +403,7 @@ def test_lines_of_chunks_have_no_numbers(
     counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A row is numbered when it is made, and that is when all chunks are there."""
-    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     real, lines = landing_module.analyse_chunk, []
 
     def looked_at(*arguments: Any) -> FinishedChunk:
@@ -591,7 +589,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = _config("posterior.enabled=false", "background.window_frames=20", "compute.workers=1")
-    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.0031)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.0031)
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
@@ -629,11 +627,11 @@ def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
     from iscat_analysis.landing.chunk_store import Store
 
     one, two = _config(), _config("optics.focus_nm=-250")
-    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera())._key for c in (one, two)}
-    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9), Camera())._key)
+    keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera()).key for c in (one, two)}
+    keys.add(Store(tmp_path, one, "another", (8, 8), (0, 9), Camera()).key)
     assert len(keys) == 3
     faster = one.model_copy(update={"compute": one.compute.model_copy(update={"workers": 7})})
-    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9), Camera())._key in keys
+    assert Store(tmp_path, faster, "movie", (8, 8), (0, 9), Camera()).key in keys
 
 
 # ---- drift -----------------------------------------------------------------------------------
@@ -694,7 +692,7 @@ def test_its_result_does_not_depend_on_the_workers(
 def test_its_chunks_agree(
     drifting: np.ndarray, followed: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     cut, _ = _run(drifting, _config(CORRECTED))
     assert cut.summary["chunks"] > 1
     _assert_moved(cut.fits)
@@ -753,12 +751,8 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
     pd.testing.assert_frame_equal(result.fits, plain[0].fits)
 
 
-@pytest.mark.usefixtures("sketched")
-def test_an_interrupted_injection_keeps_what_the_movie_gave(
-    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    config = _config("posterior.enabled=false")
-    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+def _interrupted_at_the_second_chunk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Interrupt the second chunk that is begun; the list grows with every one."""
     real, calls = landing_module.analyse_chunk, []
 
     def stopping(*arguments: Any) -> Any:
@@ -768,6 +762,16 @@ def test_an_interrupted_injection_keeps_what_the_movie_gave(
         return real(*arguments)
 
     monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    return calls
+
+
+@pytest.mark.usefixtures("sketched")
+def test_an_interrupted_injection_keeps_what_the_movie_gave(
+    movie: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = _config("posterior.enabled=false")
+    monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
+    calls = _interrupted_at_the_second_chunk(monkeypatch)
     out = tmp_path / "cut.iscat"
     with pytest.raises(KeyboardInterrupt):
         fit_stack(movie, config, out=out, inject=3)
@@ -793,18 +797,10 @@ def test_chunks_of_another_camera_map_are_not_used(counts: np.ndarray, tmp_path:
 def test_a_corrected_run_resumes_to_the_same_result(
     drifting: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
     config = _config(CORRECTED, "compute.workers=1")
-    real, calls = landing_module.analyse_chunk, []
     whole, _ = _run(drifting, config)
-
-    def stopping(*arguments: Any) -> Any:
-        calls.append(1)
-        if len(calls) == 2:
-            raise KeyboardInterrupt
-        return real(*arguments)
-
-    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    calls = _interrupted_at_the_second_chunk(monkeypatch)
     _run(drifting, config, partial=tmp_path, identity="movie")
     resumed, _ = _run(drifting, config, partial=tmp_path, identity="movie")
     assert len(calls) == 1 + whole.summary["chunks"]

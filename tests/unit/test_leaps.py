@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from iscat_analysis.tracking.joint.localizations import Localizations
-from iscat_analysis.tracking.outlier_positions import without_outliers
+from iscat_analysis.tracking.moving import without_outliers
 
 FRAMES = 200
 

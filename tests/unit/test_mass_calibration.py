@@ -146,13 +146,13 @@ def test_a_peak_is_fitted_to_its_maximum(
 ) -> None:
     """From where fits end, a search with differences in place of the gradient gains nothing."""
     fitted = []
-    fit = peaks._fit_peak
+    fit = peaks.fit_peak
 
     def recorded(*window: Any) -> peaks.ContrastPeak:
         fitted.append((window, fit(*window)))
         return fitted[-1][1]
 
-    monkeypatch.setattr(peaks, "_fit_peak", recorded)
+    monkeypatch.setattr(peaks, "fit_peak", recorded)
     for seed in range(3):
         size = np.abs(events(np.random.default_rng(seed)))
         find_contrast_peaks(size, np.full(size.shape, NOISE if known_errors else 0.0))
@@ -166,7 +166,7 @@ def test_a_peak_is_fitted_to_its_maximum(
         ])  # fmt: skip
 
         def loss(at: NDArray[np.float64], given: Any = (x, sigma, window, centre, width)) -> float:
-            return peaks._loss(*given, at)[0]
+            return peaks.peak_loss(*given, at)[0]
 
         bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
         best = minimize(loss, theta, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})

@@ -283,13 +283,13 @@ def test_rows_that_plain_steps_do_not_fit_are_fitted(
     pool: ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     counts, ground, truth = _movie(_paths(30.0), noise=True)
-    field, asked, search = _field(counts, pool), [], frame_fits._climb
+    field, asked, search = _field(counts, pool), [], frame_fits.fit_with_search
 
     def climbed(*given: Any) -> tuple[float, int]:
         asked.append(given)
         return search(*given)
 
-    monkeypatch.setattr(frame_fits, "_fit_with_search", climbed)
+    monkeypatch.setattr(frame_fits, "fit_with_search", climbed)
     near, _, done = field.fit(ground, truth, sweeps=4)
     assert done.all()
     assert not asked

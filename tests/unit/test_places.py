@@ -45,7 +45,7 @@ def nobody() -> str:
 def test_wrong_places_are_refused_in_one_line(
     nobody: str, tmp_path: Path, capsys, monkeypatch
 ) -> None:
-    monkeypatch.setattr("iscat_analysis.executors._CONNECT_S", 0.3)
+    monkeypatch.setattr("iscat_analysis.executors.CONNECT_S", 0.3)
     empty = tmp_path / "empty.json"
     empty.write_text("{}")
     (tmp_path / "samples.csv").write_text("path\nmovie.npy\n")

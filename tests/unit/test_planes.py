@@ -139,7 +139,7 @@ print(len(ia.fit_movie(movie.counts, config=config).table))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is filled by its C library")
-@pytest.mark.parametrize("filled", ["0", "255"])
+@pytest.mark.parametrize("filled", [pytest.param("0", marks=pytest.mark.large), "255"])
 def test_pixels_far_from_a_particle_outside_the_field_are_not_drawn_from_beyond_its_tables(
     filled: str,
 ) -> None:

@@ -30,6 +30,7 @@ SIDE, BLOCKS, RATE_HZ, PIXEL_NM = 72, 30, 331.0, 84.4
 LIGHT_E = 4e5
 SPOT = spot_of(525.0, 1.42, PIXEL_NM)
 SEEDS = range(12)
+MOVIES = [pytest.param(n, marks=pytest.mark.large) if n > 2 else n for n in SEEDS]
 FINE = 4  # places of the picture to a pixel
 
 
@@ -93,7 +94,7 @@ def landing(
     return _noisy(blocks, rng)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 @pytest.mark.parametrize("leave", [False, True])
 def test_landings_are_told_from_motion(seed: int, leave: bool) -> None:
     found = find_changes(landing(seed, leave=leave), SPOT)
@@ -105,7 +106,7 @@ def test_landings_are_told_from_motion(seed: int, leave: bool) -> None:
     assert f"of {found.number} clear changes" in said
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 @pytest.mark.parametrize("d_um2_s", [0.1, 0.3, 0.8])
 def test_motion_is_told_from_landings(seed: int, d_um2_s: float) -> None:
     found = find_changes(moving(seed, d_um2_s), SPOT)
@@ -127,7 +128,9 @@ def test_motion_of_two_particles_is_told_in_300_frames(d_um2_s: float) -> None:
     ("frames", "species"),
     [(200, ((400.0, 0.15, 2), (200.0, 0.8, 1))), (300, ((400.0, 0.05, 3),))],
 )
-@pytest.mark.parametrize("seed", [300, 301, 302])
+@pytest.mark.parametrize(
+    "seed", [300, *(pytest.param(seed, marks=pytest.mark.large) for seed in (301, 302))]
+)
 def test_a_movie_of_three_particles_that_move_is_told(
     seed: int, frames: int, species: tuple[tuple[float, float, int], ...]
 ) -> None:
@@ -139,14 +142,14 @@ def test_a_movie_of_three_particles_that_move_is_told(
 
 
 @pytest.mark.parametrize("stay", [10, 30, 60])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_particles_that_land_for_a_moment_do_not_move(seed: int, stay: int) -> None:
     found = find_changes(landing(seed, events=8, leave=True, stay=stay), SPOT)
     assert found.number > 0
     assert as_moving(found, "movie.tif") == ""
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_a_place_where_one_lands_and_leaves_again_and_again_does_not_move(seed: int) -> None:
     rng = np.random.default_rng(seed)
     there = np.cumsum(rng.random(BLOCKS * BLOCK) < 0.03) % 2
@@ -157,7 +160,7 @@ def test_a_place_where_one_lands_and_leaves_again_and_again_does_not_move(seed: 
     assert as_moving(found, "movie.tif") == ""
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_neighbours_that_land_one_after_the_other_do_not_move(seed: int) -> None:
     rng = np.random.default_rng(seed)
     frames = np.arange(BLOCKS * BLOCK).reshape(BLOCKS, BLOCK)
@@ -175,19 +178,19 @@ def test_few_landings_are_told_in_mode_track() -> None:
     assert sum(map(bool, said)) >= 11
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_slow_motion_is_not_taken_for_landings(seed: int) -> None:
     assert as_landing(find_changes(moving(seed, 0.01), SPOT), "movie.tif") == ""
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_a_pattern_that_drifts_is_not_taken_for_motion(seed: int) -> None:
     found = find_changes(landing(seed, drift_px=0.02), SPOT)
     assert found.number > 0
     assert as_moving(found, "movie.tif") == ""
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", MOVIES)
 def test_an_empty_movie_shows_neither(seed: int) -> None:
     found = find_changes(landing(seed, events=0), SPOT)
     assert found.number == 0

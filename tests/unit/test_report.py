@@ -477,10 +477,10 @@ def test_a_page_without_a_title_is_an_error() -> None:
 def test_the_histogram_keeps_species_apart() -> None:
     """A bin is two standard deviations wide, within reason."""
     spread = np.full(30, 6.0)
-    assert 1000 / figures._bins(1000.0, spread) == pytest.approx(12, rel=0.01)
-    assert figures._bins(5.0, spread) == 10
-    assert figures._bins(1e5, spread) == 90
-    assert figures._bins(1000.0, np.array([])) == 10
+    assert 1000 / figures.histogram_bins(1000.0, spread) == pytest.approx(12, rel=0.01)
+    assert figures.histogram_bins(5.0, spread) == 10
+    assert figures.histogram_bins(1e5, spread) == 90
+    assert figures.histogram_bins(1000.0, np.array([])) == 10
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.measured_images import ring_average
 from iscat_analysis.landing.searched import LEVELS, Searched, searched_warning
-from iscat_analysis.species.events import Efficiency
+from iscat_analysis.species import Efficiency
 from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM, SIDE, FRAMES = 84.0, 112, 240

@@ -29,9 +29,9 @@ class Judged(StepMaps):
     def without(self, steps: Sequence[Step], mapper: Any) -> Any:
         """See `StepMaps`."""
         found = super().without(steps, mapper)
-        assert self._is_local
+        assert self.is_local
         blank, slow = StepMaps(*self.arguments), StepMaps(*self.arguments)
-        slow._is_local = False
+        slow.is_local = False
         expected, effective = slow.without(steps, mapper)
         np.testing.assert_allclose(found[1], effective, rtol=1e-12)
         taken = np.abs(blank.without([], mapper)[0] - expected).max()

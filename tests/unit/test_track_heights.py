@@ -14,7 +14,7 @@ from iscat_analysis.tracking.heights import decide_heights
 from iscat_analysis.tracking.joint.exposures import Exposures
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
-from iscat_analysis.tracking.moving_table import _areas, _quantum
+from iscat_analysis.tracking.moving_table import collected_areas, quantum_bounds
 
 SHAPE, FRAMES, LEVEL_E, ROI = (28, 28), 40, 4e5, 24
 
@@ -66,8 +66,8 @@ def test_a_height_that_noise_puts_below_the_coverslip_has_the_bounds_of_the_cove
     model = forward_model(make_config(), 1500.0)
     z, ones = np.array([-3.0, 0.0, 150.0]), np.ones(3)
     free = np.array([True, True, True, True])
-    bounds = _quantum(model, z, 300.0 * ones, 1e4 * ones, free)
+    bounds = quantum_bounds(model, z, 300.0 * ones, 1e4 * ones, free)
     assert np.array_equal(bounds[0], bounds[1])
     assert not np.allclose(bounds[2], bounds[1], rtol=0.01)
-    areas = _areas(model, z, 300.0 * ones)
+    areas = collected_areas(model, z, 300.0 * ones)
     assert areas[0] == areas[1] != areas[2]

@@ -53,7 +53,7 @@ def test_the_line_through_a_mean_squared_displacement_is_the_one_expected() -> N
     rng, lags_of = np.random.default_rng(3), []
     for _ in range(200):
         path = fits_of([walk(rng, 80, 0.3)], rng, sigma_nm=20.0)
-        lags, measured, error = track_figures._msd(path)
+        lags, measured, error = track_figures.mean_squared_displacement(path)
         predicted = 4 * 0.3e6 * (lags / RATE_HZ - EXPOSURE_MS / 3e3) + error
         lags_of.append(measured / predicted)
     ratios = np.array(lags_of)
@@ -86,10 +86,10 @@ def test_the_colours_of_paths_cover_all_that_are_drawn() -> None:
     assert analysis.tracks is not None
     tracks = analysis.tracks.assign(status="ok", mass_kda=[399.8, 400.3, 401.2, 196.0])
     tracks.loc[3, "status"] = "not_free"
-    scale, _, beyond = track_figures._colors(replace(analysis, tracks=tracks))
+    scale, _, beyond = track_figures.path_colors(replace(analysis, tracks=tracks))
     assert (scale.vmin, scale.vmax, beyond) == (196.0, 401.2, "neither")
     tracks.loc[3, "mass_kda"] = 9e3
-    scale, _, beyond = track_figures._colors(replace(analysis, tracks=tracks))
+    scale, _, beyond = track_figures.path_colors(replace(analysis, tracks=tracks))
     assert (scale.vmin, beyond) == (399.8, "max")
     assert scale.vmax == pytest.approx(3 * 401.2)
     drawn = track_figures.trajectories(replace(analysis, tracks=tracks), analysis.table)

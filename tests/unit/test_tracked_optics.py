@@ -88,6 +88,7 @@ def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() ->
     assert "optics.calibrate" not in said
 
 
+@pytest.mark.large  # that of `ringed` is harder
 def test_an_aberration_is_learned_from_tracks() -> None:
     aberrated = replace(Instrument(emission="reciprocal"), aberrations_nm={11: 20.0})
     movie = _movie(aberrated)

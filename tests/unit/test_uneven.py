@@ -24,7 +24,18 @@ KNOWN = {"background.method": "known", "background.level_e": LEVEL_E}
 MEASURED = {"background.frames": (0, 60)}
 
 
-def _movie(path: Path, *, speckle: float, heavy: bool = False) -> Path:
+@pytest.fixture(scope="module")
+def movies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Record light that is even or not, and particles whose rings are everywhere."""
+    folder = tmp_path_factory.mktemp("uneven")
+    kinds = {"even": 0.0, "little": 0.003, "much": 0.03, "heavy": 0.0}
+    return {
+        kind: _movie(folder / f"{kind}.tif", speckle=speckle, heavy=kind == "heavy")
+        for kind, speckle in kinds.items()
+    }
+
+
+def _movie(path: Path, *, speckle: float, heavy: bool) -> Path:
     """Record nine particles, or sixteen heavy ones whose rings are everywhere."""
     side, apart, mass = (4, 20, 3000.0) if heavy else (3, 29, 1000.0)
     events = [
@@ -49,10 +60,12 @@ def _said(path: Path, changes: dict[str, Any]) -> list[str]:
     return [text for text in result.warnings if "from pixel to pixel" in text]
 
 
-@pytest.mark.parametrize("speckle", [0.003, 0.03])
-def test_an_uneven_field_over_a_known_level_is_named(tmp_path: Path, speckle: float) -> None:
+@pytest.mark.parametrize(("kind", "speckle"), [("little", 0.003), ("much", 0.03)])
+def test_an_uneven_field_over_a_known_level_is_named(
+    movies: dict[str, Path], kind: str, speckle: float
+) -> None:
     """Every row was a poor fit without a word."""
-    movie = _movie(tmp_path / "movie.tif", speckle=speckle)
+    movie = movies[kind]
     (said,) = _said(movie, KNOWN)
     percent = float(said.split("differs by ")[1].split(" %")[0])
     assert percent == pytest.approx(100 * speckle, rel=0.15)
@@ -60,20 +73,17 @@ def test_an_uneven_field_over_a_known_level_is_named(tmp_path: Path, speckle: fl
     assert not _said(movie, MEASURED)  # where it divides out
 
 
-@pytest.mark.parametrize("heavy", [False, True])
-def test_rings_of_particles_are_not_called_uneven(tmp_path: Path, heavy: bool) -> None:
-    movie = _movie(tmp_path / "movie.tif", speckle=0.0, heavy=heavy)
-    assert not _said(movie, KNOWN)
+@pytest.mark.parametrize("kind", ["even", "heavy"])
+def test_rings_of_particles_are_not_called_uneven(movies: dict[str, Path], kind: str) -> None:
+    assert not _said(movies[kind], KNOWN)
 
 
-def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(tmp_path: Path) -> None:
-    movie = _movie(tmp_path / "movie.tif", speckle=0.0, heavy=True)
-    assert not _said(movie, {**KNOWN, "optics.focus_nm": -380.0})
+def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(movies: dict[str, Path]) -> None:
+    assert not _said(movies["heavy"], {**KNOWN, "optics.focus_nm": -380.0})
 
 
-def test_an_uneven_field_is_not_followed(tmp_path: Path) -> None:
+def test_an_uneven_field_is_not_followed(movies: dict[str, Path]) -> None:
     """Of particles that move the light is judged first, and what looks like some is its pattern."""
-    movie = _movie(tmp_path / "movie.tif", speckle=0.03)
     track = {"fit.mode": "track", "track.free": "mass", "fit.frames": (60, 62)}
     with pytest.raises(DataError, match=r'light differs by 3 %.*background\.method = "tracks"'):
-        _said(movie, {**KNOWN, **track})
+        _said(movies["much"], {**KNOWN, **track})

@@ -10,18 +10,17 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from small_movies import SETUP, simulate
+from small_movies import SETUP, analysed, put_in_place_of_fits
 from tiff_files import write_ome_set
 
 import iscat_analysis as ia
 import iscat_analysis.day as day_module
 from iscat_analysis.day import run
-from iscat_analysis.day.watch import MOST_CHECKS, Ready, _Folder
+from iscat_analysis.day.watch import MOST_CHECKS, Ready, WatchedFolder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
@@ -44,8 +43,8 @@ def _names(look: Ready | None) -> list[str] | None:
     return None if look is None else [row.path.name for row in look[0].rows]
 
 
-def _looks(folder: Path, told: list[str] | None = None) -> _Folder:
-    return _Folder(folder, folder / "batch", (told if told is not None else []).append)
+def _looks(folder: Path, told: list[str] | None = None) -> WatchedFolder:
+    return WatchedFolder(folder, folder / "batch", (told if told is not None else []).append)
 
 
 # ---- looks -----------------------------------------------------------------------------------
@@ -133,7 +132,7 @@ def test_results_in_the_folder_are_no_movies(folder: Path) -> None:
     (out / "movies").mkdir(parents=True)
     (folder / "a.iscat").mkdir()
     np.save(folder / "a.npy", COUNTS)
-    seen = _Folder(folder, out, [].append)
+    seen = WatchedFolder(folder, out, [].append)
     seen.check()
     assert _names(seen.check()) == ["a.npy"]
 
@@ -158,27 +157,13 @@ def test_a_folder_that_cannot_be_read_is_waited_for(folder: Path) -> None:
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
     """Make a movie and its result."""
-    place = tmp_path_factory.mktemp("made")
-    simulate(place / "movie.tif", seed=1)
-    ia.fit_stack(place / "movie.tif", ia.configure(SETUP), out=place / "movie.iscat")
-    return place
+    return analysed(tmp_path_factory.mktemp("made"))
 
 
 @pytest.fixture
 def fits(made: Path, monkeypatch) -> list[str]:
     """Put the finished result in the place of every fit, and note the movies that it is of."""
-    done: list[str] = []
-
-    def fit_stack(movie: Path, _: object, *, out: Path, **__: object) -> SimpleNamespace:
-        done.append(movie.name)
-        with ia.open_stack(movie) as stack:
-            sha256 = stack.sha256()
-        shutil.copytree(made / "movie.iscat", out, dirs_exist_ok=True)
-        summary = json.loads((out / "summary.json").read_text())
-        return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
-
-    monkeypatch.setattr(run, "fit_stack", fit_stack)
-    return done
+    return put_in_place_of_fits(made, monkeypatch)
 
 
 class Day:
@@ -297,7 +282,7 @@ def test_without_movies_too_one_object_is_printed(folder: Path, monkeypatch, cap
     def interrupt(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_Folder, "check", interrupt)
+    monkeypatch.setattr(WatchedFolder, "check", interrupt)
     assert main(["watch", str(folder), "--json", "--quiet"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["out"] == str(folder / "batch")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scenes import PIXEL_NM, Stack
 
+from iscat_analysis import Preview
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
@@ -25,7 +26,6 @@ from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import FINDERS, analyse
-from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study.simulate import Movie
 from iscat_analysis.tracking.moving_field import initial_background, load_field, tracking_context

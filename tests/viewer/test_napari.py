@@ -364,7 +364,7 @@ def _click(viewer: Any, explorer: Any, t: float, y: float, x: float) -> None:
     event = SimpleNamespace(
         position=(t, y, x), view_direction=None, dims_displayed=[1, 2], type="mouse_press"
     )
-    explorer._clicked(viewer, event)
+    explorer.on_click(viewer, event)
 
 
 def test_a_click_shows_data_model_and_residual(viewer, explorer, folder: Path) -> None:

@@ -93,7 +93,7 @@ def _settled_peak(
         inside = (x > window[0]) & (x < window[1])
         if np.count_nonzero(inside) < _LEAST_IN_PEAK or not window[0] < centre < window[1]:
             return peak
-        previous, peak = peak, _fit_peak(x[inside], sigma[inside], window, centre, width)
+        previous, peak = peak, fit_peak(x[inside], sigma[inside], window, centre, width)
         centre, width = peak.contrast, max(peak.width, 0.1 * math.hypot(width, noise))
         if previous is not None and abs(previous.contrast - centre) < 0.1 * peak.contrast_se:
             break
@@ -112,11 +112,11 @@ def _half_width(grid: FloatArray, density: FloatArray, place: int, level: float)
     return float(np.mean(sides)) if sides else float(grid[-1] - grid[0])
 
 
-def _fit_peak(
+def fit_peak(
     x: FloatArray, sigma: FloatArray, window: tuple[float, float], centre: float, width: float
 ) -> ContrastPeak:
     """Fit a normal distribution, truncated to the window, on a flat background."""
-    loss = partial(_loss, x, sigma, window, centre, width)
+    loss = partial(peak_loss, x, sigma, window, centre, width)
     bounds = [(-1.5, 1.5), (-2.5, 1.0), (-3.0, 6.0)]
     best = scipy.optimize.minimize(loss, [0.0, 0.0, 2.0], jac=True, method="TNC", bounds=bounds)
     theta = np.asarray(best.x)
@@ -134,7 +134,7 @@ def _fit_peak(
     return ContrastPeak(float(centre + width * theta[0]), max(se, fallback), spread, share * x.size)
 
 
-def _loss(
+def peak_loss(
     x: FloatArray,
     sigma: FloatArray,
     window: tuple[float, float],

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.calibration.averaging import NOISE_COLUMNS, noise_curve, verdict_of
 from iscat_analysis.camera.calibration.moments import (
     Moments,
+    blocks,
     brightness_bins,
     moments_of,
     robust_sigma,
@@ -28,12 +29,13 @@ from iscat_analysis.camera.calibration.pixels import (
     unsteady,
 )
 from iscat_analysis.camera.calibration.regression import Solution, dark_numbers, solve
-from iscat_analysis.camera.calibration.repeated_exposures import without_repeats
 from iscat_analysis.camera.calibration.result import CameraCalibration, Estimate
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.selected_frames import SelectedFrames
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress, silent
+from iscat_analysis.units import listed
 
 LEAST_FRAMES = 8
 """Fewer say too little about the variance of a pixel."""
@@ -45,6 +47,7 @@ _LEAST_PIXELS = 64
 _SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
 _MOST_CLIPPED_SHARE = 0.01  # of a dark's pixels at zero that are worth a line
 _MOST_CHI2_REDUCED = 3.0  # reduced χ² of the photon-transfer curve
+_NAMED = 4  # frames that a note about repeated ones names
 _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
 
 
@@ -319,3 +322,29 @@ def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> Camer
         frames=0,
         notes=(note, *mask_notes(masked)),
     )
+
+
+def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSource:
+    """Leave out frames that are zero throughout or equal to the frame before."""
+    total = stack.shape[0]
+    good = np.zeros(total, dtype=np.bool_)
+    last: NDArray[Any] | None = None
+    for start, stop in blocks(stack):
+        for k, frame in enumerate(stack.read(start, stop), start):
+            good[k] = frame.any() and not (last is not None and np.array_equal(frame, last))
+            last = frame
+    kept = np.flatnonzero(good)
+    if kept.size <= 1 or kept.size == total:
+        return stack
+    if kept.size < least:
+        raise DataError(
+            f"{stack.name}: only {kept.size} of {total} frames are neither zero throughout nor the "
+            f"same as the frame before; photon transfer needs {least} or more"
+        )
+    lost = np.flatnonzero(~good)
+    notes.append(
+        f"{stack.name}: frame{'s' if lost.size > 1 else ''} {listed(lost, _NAMED)} "
+        f"{'are' if lost.size > 1 else 'is'} zero throughout or the same as the frame before "
+        "(dropped or stuck in the camera); left out"
+    )
+    return SelectedFrames(stack, kept)

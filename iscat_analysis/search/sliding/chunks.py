@@ -40,7 +40,7 @@ HALO = 2
 
 _LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
-_MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
+MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
@@ -238,7 +238,7 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
 
 def counts_budget(config: Config) -> int:
     """Bytes that the stored counts of a chunk may take."""
-    return int(_MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
+    return int(MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
 
 
 def plan_chunks(
@@ -259,7 +259,7 @@ def plan_chunks(
     room = (budget - 40 * pixels) // per_frame
     core = (room - 2 * halo) // stride * stride
     if core < stride:
-        least = math.ceil((40 * pixels + per_frame * (2 * halo + stride)) / _MEMORY_SHARE / 1e6)
+        least = math.ceil((40 * pixels + per_frame * (2 * halo + stride)) / MEMORY_SHARE / 1e6)
         raise DataError(
             f"{reader.name}: windows of {window} frames of {reader.shape[1]} x {reader.shape[0]} "
             f"pixels need compute.memory_limit_mb = {least}; raise it, or lower "

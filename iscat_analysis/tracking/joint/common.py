@@ -39,13 +39,13 @@ IntArray = NDArray[np.int64]
 
 _SINGULAR = 1e-9
 _IMAGES = 4  # that are sent through E at a time
-_MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
+MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
 _SEED = 1  # of the images to begin with
 _ROUNDS = 3  # of a mean and of the weights there
 _MOST_AMPLITUDE_RATIO = 2.0  # amplitude over the mean, beyond which weights stay
 # Of the information on a mass, that a step of the conjugate gradients adds
 _LEAST_INFORMATION_SHARE = 1e-6
-_MOST_STEPS = 400
+MOST_STEPS = 400
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
     inner = turned @ coupling.own() @ root
     most = float(np.linalg.eigvalsh(inner)[:, -1].max())
     # as no eigenvalue is larger than their sum
-    if _variance_left_out(most, float(np.einsum("nii->", inner))) > _MOST_VARIANCE_LEFT_OUT:
+    if _variance_left_out(most, float(np.einsum("nii->", inner))) > MOST_VARIANCE_LEFT_OUT:
         more = _krylov_part(coupling, root, most)
         if more is None:
             return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
@@ -109,7 +109,7 @@ def _krylov_part(coupling: Coupling, root: FloatArray, most: float) -> FloatArra
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
-    while len(basis) < rank and _variance_left_out(most, largest) > _MOST_VARIANCE_LEFT_OUT:
+    while len(basis) < rank and _variance_left_out(most, largest) > MOST_VARIANCE_LEFT_OUT:
         added = _orthonormal(images, basis)[: rank - len(basis)]
         seen, images = coupling.followed(covariance, added)
         seen = seen @ root
@@ -239,7 +239,7 @@ def _solve_conjugate_gradients(
     answer, taken = np.zeros_like(image), 0.0
     left, direction = image.copy(), image.copy()
     size = float(left @ left)
-    for _ in range(_MOST_STEPS):
+    for _ in range(MOST_STEPS):
         turned = direction - coupling.followed(covariance, direction[None])[1][0]
         curvature = float(direction @ turned)
         if not curvature > _SINGULAR * float(direction @ direction):

@@ -78,12 +78,12 @@ def fit_rows(
         information, gain, expected, background, sums, place, room,
     ):  # fmt: skip
         row = int(place[2])
-        gain[row], outcome[row] = _fit_with_search(
+        gain[row], outcome[row] = fit_with_search(
             field, near, search, place, room, int(group[row]), theta[row]
         )
 
 
-def _fit_with_search(
+def fit_with_search(
     field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
     theta: FloatArray,
 ) -> tuple[float, int]:  # fmt: skip
