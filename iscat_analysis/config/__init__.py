@@ -17,6 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
+from iscat_analysis.config.field import FIELD_TERMS, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
@@ -62,6 +63,7 @@ __all__ = [
     "ALL",
     "ASSUMED",
     "AUTO",
+    "FIELD_TERMS",
     "LARGEST_SD_NM",
     "MEASURABLE",
     "PIXEL_NM",
@@ -91,6 +93,7 @@ __all__ = [
     "Uncertainty",
     "config_to_toml",
     "configure",
+    "field_keys",
     "load_config",
     "parse_config",
     "plausible_pixel",

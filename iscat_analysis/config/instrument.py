@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from iscat_analysis.config.field import FieldTerms
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -103,7 +104,7 @@ class OpticsCovariance(Section):
         return self
 
 
-class Optics(Section):
+class Optics(FieldTerms):
     """The microscope (physics.md, section 1)."""
 
     file: str | None = Field(

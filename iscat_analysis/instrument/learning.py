@@ -23,12 +23,6 @@ from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.crowded import learn_in_field, seen_in_field
-from iscat_analysis.instrument.focus_drift import (
-    STEADY,
-    focus_drift,
-    learned_with_drift,
-    with_drift,
-)
 from iscat_analysis.instrument.learner import (
     FREE,
     LEAST_SIGHTS,
@@ -50,7 +44,15 @@ from iscat_analysis.instrument.particle_images import (
     scan_particle_images,
 )
 from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p, not_alone
+from iscat_analysis.instrument.uneven import (
+    EVEN,
+    FieldOfView,
+    asked_change,
+    learned_with_changes,
+    with_changes,
+)
 from iscat_analysis.movie import Stack
+from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames, well_lit
 from iscat_analysis.threads import threads
@@ -85,12 +87,12 @@ def learn_optics(
         reason
         or config.fit.mode == "track"  # which learns from its tracks
         or optics.calibrate == "never"
-        or (optics.calibrate == "auto" and (optics.file is not None or optics.focus_drift_nm))
+        or (optics.calibrate == "auto" and (optics.file is not None or terms_of(optics)))
     ):
         return config, {}
     tested: dict[str, Any] = {}
-    passed, sliding, drift = False, background_mode(config) == "sliding", STEADY
-    frames = fitted_frames(movie, config, config.background.recorded)
+    passed, sliding, change = False, background_mode(config) == "sliding", EVEN
+    view = FieldOfView.of(movie, config, in_time=sliding)
     first_tested = optics.calibrate == "auto" and sliding
     with threads(config.compute.workers) as pool:
         sights, others = bright_particle_images(
@@ -112,14 +114,19 @@ def learn_optics(
                 sights, others = bright_particle_images(movie, config, camera, pool, opening)
                 alone = len(sights)
                 median, fitted = median_p(sights, config, others, pool.map)
-            if sliding:
-                drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
-            if drift.moves:  # which the first particles of a long movie tell badly
+            if not heights_free(config):
+                change = asked_change(fitted, config, settings_of(config), view, pool.map)
+            if sliding and change.matters:  # which the first particles of a long movie tell badly
                 sights, others = bright_particle_images(
                     movie, config, camera, pool, opening, whole=True
                 )
                 alone = len(sights)
-            elif optics.calibrate == "auto" and median < REJECTED_P and not heights_free(config):
+            elif (
+                optics.calibrate == "auto"
+                and median < REJECTED_P
+                and not heights_free(config)
+                and not change.matters
+            ):
                 pairs, median = not_alone(sights, config, others, pool.map)
                 sights = [sight for k, sight in enumerate(sights) if k not in pairs]
                 alone -= sum(k < alone for k in pairs)
@@ -127,7 +134,7 @@ def learn_optics(
                     raise DataError(too_few(movie.name, len(sights)))
             tested = {"tested": len(sights), "median_p": median}
             passed = optics.calibrate == "auto" and median >= REJECTED_P
-            if passed and not drift.moves:
+            if passed and not change.matters:
                 return config, tested | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 reason = f"{NOISE}; the analysis goes on as configured"
@@ -135,19 +142,21 @@ def learn_optics(
                 return config, tested | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
             found = (
-                learned_with_drift(
-                    sights, others, config, settings_of(config), drift, source, pool.map
+                learned_with_changes(
+                    sights, others, config, settings_of(config), view, source, pool.map
                 )
                 if passed
                 else learned_from(
                     sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
                 )
             )
+            if found is None:  # pictures that were not fitted want no change
+                return config, tested | {"calibrated": False}
         except DataError as error:
-            reason = f"{error}; {drift.said}" if drift.moves else str(error)
+            reason = f"{error}; {change.said}" if change.matters else str(error)
             warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
             return config, tested | {"calibrated": False, "reason": reason}
-    return taken(found, config, tested, drift.said if passed else _verdict(tested), warn=warn)
+    return taken(found, config, tested, change.said if passed else _verdict(tested), warn=warn)
 
 
 def why_not(config: Config) -> str:
@@ -287,9 +296,9 @@ def learned_from(
     crowded = way == "fixed"
     if not crowded or len(sights) >= LEAST_SIGHTS:
         found = calibrate_particle_images(sights, others, config, groups, source, mapper=pool.map)
-        if way == "sliding":
-            frames = fitted_frames(movie, config)
-            return with_drift(found, sights, others, config, frames, source, pool.map)
+        if not heights_free(config):
+            view = FieldOfView.of(movie, config, in_time=way == "sliding")
+            found = with_changes(found, sights, others, config, view, source, pool.map)
         if found.accepted or not crowded:
             return found
     return learn_in_field(_summed(movie, config, camera), config, groups, source, pool)

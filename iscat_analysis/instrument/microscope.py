@@ -12,6 +12,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.learner import (
+    FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     LEAST_SIGHTS,
@@ -34,7 +35,7 @@ from iscat_analysis.units import count
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
 
-_MODELS_KEPT = 24
+_MODELS_KEPT = 64  # as many as there are pictures with optics of their own
 
 
 def refuse_uncalibratable(config: Config) -> None:
@@ -73,8 +74,7 @@ def calibrate_particle_images(
         configured[FOCUS_STEP] = focus_step_nm
         low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
-    if known is not None and FOCUS_DRIFT in known:
-        configured[FOCUS_DRIFT] = 0.0
+    configured |= {name: 0.0 for name in (FOCUS_DRIFT, *FIELD) if known and name in known}
     build = microscopes(config, max(reach_nm(sight) for sight in sights))
     optics = config.optics
     measured = measure_microscope(

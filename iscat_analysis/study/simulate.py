@@ -31,7 +31,9 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.optics.collected import photons_per_intensity
+from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.local import LocalModels
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
 from iscat_analysis.study.particles import SimulatedParticle, place_particles
@@ -134,6 +136,14 @@ class Movie:
         self._model = forward_model(
             config, reach, z_max_nm=max([config.particle.nominal_height_nm, *heights])
         )
+        self._local = None
+        if terms_of(config.optics):
+            if not all(p.still for p in self.movers):
+                raise ConfigError(
+                    "optics: particles that move are simulated in a field that is the same "
+                    "everywhere: leave out simulation.movers, or the terms of the field"
+                )
+            self._local = LocalModels(config, self._model, simulation.shape)
         self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
         self._sample_e = self._background()
         self.background_e = self._sample_e[self._field]
@@ -150,7 +160,7 @@ class Movie:
             (
                 i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
                 p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
-                peaks.get((p.z_nm, p.mass_kda)),
+                peaks.get((p.z_nm, p.mass_kda)) if self._local is None else self._peak_of(p),
             )
             for i, p in enumerate(self.particles)
         ]  # fmt: skip
@@ -318,7 +328,8 @@ class Movie:
         y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
         dx, dy = np.meshgrid(x, y)
         field = np.zeros((2, *dx.shape), dtype=complex)  # an analyser leaves the first alone
-        given = self._model.field(dx, dy, z_nm, mass_kda)
+        model = self._model if self._local is None else self._local.at(x_nm, y_nm)
+        given = model.field(dx, dy, z_nm, mass_kda)
         field[: len(given)] = given
         return field
 
@@ -393,6 +404,14 @@ class Movie:
                 heights = np.linspace(heights[0], heights[-1], _HEIGHTS)
             kinds |= {(float(z), p.mass_kda) for z in heights}
         return {kind: self._model.peak_contrast(*kind) for kind in kinds}
+
+    def _peak_of(self, particle: SimulatedParticle) -> float | None:
+        """Peak contrast of a particle where it lands, in a field that is not even."""
+        if self._local is None or not self._model.rho:
+            return None
+        dy, dx = self.drift_px[particle.frame]
+        place = ((particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm)
+        return self._local.at(*place).peak_contrast(particle.z_nm, particle.mass_kda)
 
     def _check_range(self) -> None:
         camera = self._camera

@@ -9,8 +9,9 @@ before a movie is recorded what it would tell.
 from __future__ import annotations
 
 from iscat_analysis.instrument.learner.estimate import (
+    Asked,
     Estimate,
-    first_step,
+    asked_changes,
     maximise,
     optics_limits,
     prior_range,
@@ -24,14 +25,18 @@ from iscat_analysis.instrument.learner.measure import (
     Judgement,
     Measured,
     Twin,
+    fitted_sights,
+    held_out_sights,
     judge,
     measure_microscope,
 )
 from iscat_analysis.instrument.learner.neighbours import Neighbours
 from iscat_analysis.instrument.learner.particle_images import (
+    FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     PRIVATE,
+    Build,
     ParticleImage,
     Settings,
 )
@@ -50,6 +55,7 @@ from iscat_analysis.instrument.learner.settings import (
 
 __all__ = [
     "FAINTEST",
+    "FIELD",
     "FOCUS_DRIFT",
     "FOCUS_STEP",
     "FREE",
@@ -57,6 +63,8 @@ __all__ = [
     "LEAST_SIGHTS",
     "MOST_SIGHTS",
     "PRIVATE",
+    "Asked",
+    "Build",
     "Estimate",
     "Judgement",
     "Measured",
@@ -67,12 +75,14 @@ __all__ = [
     "Pictures",
     "Settings",
     "Twin",
+    "asked_changes",
     "build_microscope",
-    "first_step",
+    "fitted_sights",
     "forecast_optics",
     "free_groups",
     "free_names",
     "heights_free",
+    "held_out_sights",
     "is_term",
     "judge",
     "make_pictures",

@@ -18,19 +18,22 @@ from numpy.typing import NDArray
 
 from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.instrument.learner.particle_images import (
+    FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     PRIVATE,
-    RISES,
     ROAM_NM,
     Build,
     Microscope,
     ParticleImage,
     Settings,
 )
+from iscat_analysis.optics.field_map import Spot
 from iscat_analysis.records import FloatArray, Mapper
 
 PRIOR_RANGE = {
+    **{name: 180.0 for name in FIELD if name.endswith("_deg")},
+    **{name: 1000.0 for name in FIELD if name.startswith("focus_")},
     "focus_nm": 1000.0,
     "na": 0.05,
     "reference_phase_deg": 180.0,
@@ -47,6 +50,8 @@ TERM_RANGE_NM = 100.0
 """The same for every aberration [nm]."""
 
 _LARGEST_STEP = {
+    **{name: 40.0 for name in FIELD if name.endswith("_deg")},
+    **{name: 120.0 for name in FIELD if name.startswith("focus_")},
     "focus_nm": 120.0,
     "na": 0.02,
     "reference_phase_deg": 40.0,
@@ -64,6 +69,7 @@ _Z = 2  # of what is a sight's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _LOWEST_NA = 0.3
 _NA_ROOM = 2e-3  # below the index of the oil
+_FLAT = 1e-10  # share of the largest eigenvalue below which a direction is not determined
 _TOGETHER = 5  # sights of one task; a millisecond each
 _MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
 
@@ -148,22 +154,41 @@ def maximise(
     )
 
 
-def first_step(
+@dataclass(frozen=True)
+class Asked:
+    """How the likelihood of pictures changes with parameters of the optics, to second order."""
+
+    names: tuple[str, ...]
+    information: FloatArray
+    score: FloatArray
+    scatter: FloatArray
+
+    def step(self, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Say how far the pictures ask to change some of them, the others held.
+
+        Shapes: `step` (n,), `covariance` (n, n).
+        """
+        chosen = [self.names.index(name) for name in names]
+        both = np.ix_(chosen, chosen)
+        unit = 1 / np.sqrt(np.maximum(np.diag(self.information)[chosen], 1e-300))
+        scaled = self.information[both] * np.outer(unit, unit)
+        bound = np.linalg.pinv(scaled, rcond=_FLAT, hermitian=True) * np.outer(unit, unit)
+        return bound @ self.score[chosen], bound @ self.scatter[both] @ bound
+
+
+def asked_changes(
     sights: Sequence[ParticleImage],
     build: Build,
     settings: Settings,
     names: Sequence[str],
     mapper: Mapper = map,
-) -> tuple[FloatArray, FloatArray]:
-    """Say how far pictures ask to change some parameters, to first order.
-
-    Shapes: `step` (n,), `covariance` (n, n).
-    """
+) -> Asked:
+    """Look how pictures ask to change the optics."""
     private, walls = np.array([sight.private for sight in sights]), _walls(sights)
     at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
     information, score, _ = at.reduced(0.0)
-    bound = np.linalg.pinv(information, hermitian=True)
-    return bound @ score, bound @ at.scatter([sight.owner for sight in sights]) @ bound
+    scatter = at.scatter([sight.owner for sight in sights])
+    return Asked(tuple(names), information, score, scatter)
 
 
 def _walls(sights: Sequence[ParticleImage]) -> FloatArray:
@@ -223,14 +248,14 @@ class _Point:
         mapper: Mapper,
     ) -> _Point:
         """Evaluate all sights; an unknown that its wall stops counts as known."""
-        models: dict[float, Microscope] = {}
+        models: dict[Spot, Microscope] = {}
         for sight in sights:
-            if sight.focus_steps not in models:
-                models[sight.focus_steps] = build(sight.seen_with(values))
+            if sight.spot not in models:
+                models[sight.spot] = build(sight.seen_with(values))
 
         def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
             return [
-                _scores(sight, models[sight.focus_steps], names, own)
+                _scores(sight, models[sight.spot], names, own)
                 for sight, own in zip(
                     sights[first : first + _TOGETHER], private[first:], strict=False
                 )
@@ -346,16 +371,16 @@ def _scores(
     place = (sight.grid, x, y, z, mass)
     k = len(names)
     if names:
-        wanted = tuple(dict.fromkeys("focus_nm" if n in RISES else n for n in names))
+        wanted = tuple(dict.fromkeys(base for n in names for base in sight.slopes(n)))
         signal, own, slopes = model.joint_gradient(*place, wanted)
     else:
         signal, own = model.gradient(*place)
     rows = np.empty((k + PRIVATE, signal.size))
     for row, name in zip(rows, names, strict=False):
-        if name in RISES:
-            row[:] = sight.focus_steps * slopes[wanted.index("focus_nm")].ravel()
-        else:
-            row[:] = slopes[wanted.index(name)].ravel()
+        row[:] = sum(
+            weight * slopes[wanted.index(base)].ravel()
+            for base, weight in sight.slopes(name).items()
+        )
     rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
     value, residual, weight, of_signal, of_level = sight.noise.terms(sight.data, signal, level)
     rows[:-1] *= of_signal.ravel()

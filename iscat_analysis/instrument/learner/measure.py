@@ -17,7 +17,13 @@ import numpy as np
 from iscat_analysis.instrument.learner.estimate import Estimate, maximise
 from iscat_analysis.instrument.learner.neighbours import Neighbours
 from iscat_analysis.instrument.learner.null_directions import find_hidden
-from iscat_analysis.instrument.learner.particle_images import RISES, Build, ParticleImage, Settings
+from iscat_analysis.instrument.learner.particle_images import (
+    FIELD,
+    RISES,
+    Build,
+    ParticleImage,
+    Settings,
+)
 from iscat_analysis.instrument.learner.settings import (
     FREE,
     HIGHER,
@@ -138,12 +144,12 @@ def measure_microscope(
     return search.run(sorted(sights, key=lambda sight: -sight.snr))
 
 
-def _fitted(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def fitted_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are fitted."""
     return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
 
 
-def _held_out(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def held_out_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are not."""
     return list(sights[1::HELD_OUT])
 
@@ -248,8 +254,8 @@ class _Search:
             )
             names = free_names(self.free, rough.values, FREE["zernike"])
             tried.append(rough)
-            fit = self._fit(_fitted(sights), rough.values, names, _TRIAL_PASSES)
-            judged = self._fit(_held_out(sights), fit.values, ())
+            fit = self._fit(fitted_sights(sights), rough.values, names, _TRIAL_PASSES)
+            judged = self._fit(held_out_sights(sights), fit.values, ())
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
             earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
             joint.append((earned, fit, judged.sights))
@@ -263,11 +269,11 @@ class _Search:
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
-        fitted = _fitted(sights)
+        fitted = fitted_sights(sights)
         best = self._fit(fitted, known, names)
         # focus and phase move all heights, those of pictures that were not fitted to other fringes
         rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.sights, fitted, strict=True)])
-        held_out = [s.raised(float(rise)) for s in _held_out(sights)]
+        held_out = [s.raised(float(rise)) for s in held_out_sights(sights)]
         return best, self._own(held_out, best.values)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
@@ -336,7 +342,8 @@ class _Search:
         mirrored = dict(best.values)
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
         mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
-        mirrored |= {name: -best.values[name] for name in RISES if name in best.names}
+        reversed_too = [n for n in (*RISES, *FIELD) if n in best.names and n != "coma_field_nm"]
+        mirrored |= {name: -best.values[name] for name in reversed_too}
         for name in best.names:
             if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
                 mirrored[name] = -best.values[name]

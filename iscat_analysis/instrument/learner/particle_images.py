@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from iscat_analysis.inference.noise_models import NoiseModel
+from iscat_analysis.optics.field_map import DRIFT, WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 
@@ -16,11 +17,15 @@ FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
 ``[optics]``."""
 
-FOCUS_DRIFT = "focus_drift_nm"
+FOCUS_DRIFT = DRIFT
 """Rise of the focus in 1000 frames of a movie [nm]."""
 
 RISES = (FOCUS_STEP, FOCUS_DRIFT)
 """What moves the focus from one picture to another, and is no property of the microscope."""
+
+FIELD = tuple(name for name in WEIGHTS if name != DRIFT and not name.startswith("reference_"))
+"""What differs over the field, and shows in the shape of pictures: of the reference's amplitude,
+which shows in their size alone, the pictures of particles of unknown mass say nothing."""
 
 PRIVATE = 5
 """Unknowns of one sight, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
@@ -75,6 +80,7 @@ class ParticleImage:
     mass_kda: float = 0.0
     level: float = 0.0
     focus_steps: float = 0.0
+    place: tuple[float, float] = (0.0, 0.0)
     frames: tuple[float, float] = (0.0, 0.0)
     snr: float = 0.0
     neighbours: tuple[tuple[int, float], ...] = ()
@@ -93,6 +99,17 @@ class ParticleImage:
         """Which of its own unknowns are, shape (5,)."""
         return np.array([True, True, self.heights_nm is not None, True, True])
 
+    @property
+    def spot(self) -> Spot:
+        """Where in the field and when the picture was taken."""
+        return Spot(*self.place, self.focus_steps)
+
+    def slopes(self, name: str) -> Mapping[str, float]:
+        """Give by how much a shared parameter changes those of this picture's optics."""
+        if name == FOCUS_STEP:
+            return {"focus_nm": self.focus_steps}
+        return WEIGHTS[name](self.spot) if name in WEIGHTS else {name: 1.0}
+
     def among(self, contrast: FloatArray) -> ParticleImage:
         """Return the sight with the contrast of its neighbours in its expectation."""
         rings = 1 + contrast
@@ -102,9 +119,11 @@ class ParticleImage:
         return replace(self, data=data, rings=rings, baseline=baseline)
 
     def seen_with(self, settings: Settings) -> dict[str, Any]:
-        """Return the settings with the focus of this picture, as keys of ``[optics]``."""
-        own = {key: value for key, value in settings.items() if key not in RISES}
-        own["focus_nm"] += self.focus_steps * sum(settings.get(key, 0.0) for key in RISES)
+        """Return the optics of this picture, as keys of ``[optics]``."""
+        own = {k: v for k, v in settings.items() if k not in WEIGHTS and k != FOCUS_STEP}
+        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        for base, change in changes_at(settings, self.spot).items():
+            own[base] = own.get(base, 0.0) + change
         return own
 
     def moved(self, private: FloatArray) -> ParticleImage:

@@ -10,9 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.config import Config, OpticsCovariance
+from iscat_analysis.config import FIELD_TERMS, Config, OpticsCovariance, toml_value
 from iscat_analysis.instrument.learner.measure import Judgement, Measured
-from iscat_analysis.instrument.learner.particle_images import FOCUS_DRIFT, FOCUS_STEP, RISES
+from iscat_analysis.instrument.learner.particle_images import (
+    FIELD,
+    FOCUS_DRIFT,
+    FOCUS_STEP,
+    RISES,
+)
 from iscat_analysis.instrument.learner.pictures import Pictures
 from iscat_analysis.instrument.learner.settings import exists, is_term, with_settings
 from iscat_analysis.records import FloatArray
@@ -86,6 +91,11 @@ class OpticsCalibration:
                 "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
             )
             parts.append(f"{drift} in 1000 frames")
+        parts += [
+            with_error(name_in_words(n), self.value(n), self.sigma(n), n.rsplit("_", 1)[1])
+            for n in self.names
+            if n in FIELD
+        ]
         terms = [n for n in self.names if is_term(n)]
         if terms:
             rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
@@ -126,7 +136,13 @@ class OpticsCalibration:
             text = said or (f'"{value}"' if isinstance(value, str) else f"{value:.9g}")
             lines.append(f"{key} = {text}")
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
-        lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
+        lines += [f"aberrations_nm = {{ {terms} }}"]
+        lines += [
+            f"{key} = {toml_value(getattr(optics, key))}"
+            for key in sorted({key for key, _ in FIELD_TERMS.values()} | {"field_px"})
+            if not optics.is_even and getattr(optics, key)
+        ]
+        lines += ["", "[uncertainty]"]
         names, covariance = _of_optics(self.names, self.covariance)
         lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
         quoted = ", ".join(f'"{name}"' for name in names)
@@ -211,7 +227,7 @@ def _of_optics(
     names: tuple[str, ...], covariance: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Leave out what is no property of the microscope."""
-    kept = [k for k, name in enumerate(names) if name not in RISES]
+    kept = [k for k, name in enumerate(names) if name not in (*RISES, *FIELD)]
     return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 
@@ -288,6 +304,13 @@ def correlation(covariance: FloatArray) -> FloatArray:
     """
     sigma = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
+
+
+def name_in_words(name: str) -> str:
+    """Say what a coefficient of the field is."""
+    what, *_, last, _ = name.split("_")
+    kind = {"tilt": "tilt", "curvature": "curvature"}.get(name.split("_")[1], "over the field")
+    return f"{what} {kind} along {last}" if last in ("x", "y") else f"{what} {kind}"
 
 
 def with_error(label: str, value: float, sigma: float, unit: str) -> str:

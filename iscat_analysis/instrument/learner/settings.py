@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import FIELD_TERMS, Config, field_keys
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.instrument.learner.particle_images import FOCUS_DRIFT, FOCUS_STEP, Settings
+from iscat_analysis.instrument.learner.particle_images import (
+    FIELD,
+    FOCUS_DRIFT,
+    FOCUS_STEP,
+    Settings,
+)
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 
 PRIMARY = ("z5", "z6", "z7", "z8", "z11")
@@ -20,11 +25,18 @@ HIGHER = ("z22",)
 """Secondary spherical aberration."""
 
 FREE = {
-    "focus": ("focus_nm", FOCUS_STEP, FOCUS_DRIFT),
+    "focus": ("focus_nm", FOCUS_STEP, FOCUS_DRIFT, *(n for n in FIELD if n[:5] == "focus")),
     "na": ("na",),
-    "phase": ("reference_phase_deg",),
+    "phase": ("reference_phase_deg", *(n for n in FIELD if n[:5] == "phase")),
     "mask": ("mask_na", "attenuation"),
-    "zernike": (*PRIMARY, *SECONDARY, *HIGHER),
+    "zernike": (
+        *PRIMARY,
+        *SECONDARY,
+        *HIGHER,
+        "coma_field_nm",
+        "astigmatism_field_x_nm",
+        "astigmatism_field_y_nm",
+    ),
     "polarization": ("polarization_deg",),
 }
 """What ``--free`` may name, and the continuous parameters that each stands for; whether light is
@@ -78,13 +90,18 @@ def settings_of(config: Config) -> dict[str, Any]:
     optics = config.optics
     keys = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation",
             "polarization", "polarization_deg", "analyzer")  # fmt: skip
-    terms = dict.fromkeys(FREE["zernike"], 0.0) | dict(optics.aberrations_nm)
+    terms = dict.fromkeys(filter(is_term, FREE["zernike"]), 0.0) | dict(optics.aberrations_nm)
     return {key: getattr(optics, key) for key in keys} | terms
 
 
 def with_settings(config: Config, settings: Settings) -> Config:
     """Put parameters into a configuration."""
-    plain = {k: v for k, v in settings.items() if not is_term(k) and k != FOCUS_STEP}
+    plain = {
+        k: v
+        for k, v in settings.items()
+        if not is_term(k) and k != FOCUS_STEP and k not in FIELD_TERMS
+    }
+    plain |= field_keys({name: settings.get(name, 0.0) for name in FIELD})
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
     optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
     return config.model_copy(update={"optics": optics})

@@ -145,9 +145,9 @@ def with_masses(
     models: dict[float, Any] = {}
     out = []
     for sight in sights:
-        if sight.focus_steps not in models:
-            models[sight.focus_steps] = build(sight.seen_with(settings))
-        parts = _parts(models[sight.focus_steps], sight, (sight.x_nm, sight.y_nm))
+        if sight.spot not in models:
+            models[sight.spot] = build(sight.seen_with(settings))
+        parts = _parts(models[sight.spot], sight, (sight.x_nm, sight.y_nm))
         contrast, variance = contrast_of(sight)
         weight = 1 / variance
         pictures = np.array([part - np.average(part, weights=weight) for part in parts])
