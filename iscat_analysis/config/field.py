@@ -30,7 +30,17 @@ FIELD_TERMS: Mapping[str, tuple[str, int | None]] = {
 
 
 class FieldTerms(Section):
-    """What is not the same everywhere: each the change from the centre to the edge of the field."""
+    """Spread of the light, and what is not the same everywhere in the field.
+
+    Terms of the field are each the change from its centre to its edge.
+    """
+
+    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = Field(
+        0.0, description="aperture of a cone that is evenly filled with light; 0: one plane wave"
+    )
+    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = Field(
+        0.0, description="full width at half maximum of the spectrum; 0: one wavelength"
+    )
 
     focus_tilt_nm: tuple[Size, Size] = Field(
         (0.0, 0.0), description="rise of the focus from the centre of the field to its edge, [x, y]"

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -192,7 +193,7 @@ class Movie:
         """Yield what every frame has in common with the one before, until that changes."""
         q = self._model.samples[1].size
         rows, columns = self._grid.shape
-        field = np.zeros((2, rows * q, columns * q), dtype=complex)
+        field = np.zeros((self._components, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
         particles = [*self.particles, *(self._standing(p) for p in self.movers if p.still)]
         still = None
@@ -265,7 +266,8 @@ class Movie:
 
     def _signal(self, field: ComplexArray) -> FloatArray:
         """Intensity with the reference, of a field that is given on the samples inside pixels."""
-        reference = np.array([self._model.rho, 0.0])[:, None, None]
+        reference = np.zeros((self._components, 1, 1))
+        reference[0] = self._model.rho
         return self._in_pixels(np.sum(np.abs(reference + field) ** 2, axis=0))
 
     def _in_pixels(self, intensity: FloatArray) -> FloatArray:
@@ -279,6 +281,12 @@ class Movie:
         if self._model.rho:
             return np.asarray(self._sample_e * signal)
         return np.asarray(self._sample_e + self._signal_scale * signal)
+
+    @cached_property
+    def _components(self) -> int:
+        """Components of the field whose light is added up, two and what incoherent light adds."""
+        here = self._model.field(np.zeros(1), np.zeros(1), self._model.height_nm, 1.0)
+        return max(2, len(here))
 
     @property
     def _field(self) -> tuple[slice, slice]:
@@ -327,7 +335,7 @@ class Movie:
         x = (self._grid.x_nm[:, None] + offsets).ravel() - x_nm
         y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
         dx, dy = np.meshgrid(x, y)
-        field = np.zeros((2, *dx.shape), dtype=complex)  # an analyser leaves the first alone
+        field = np.zeros((self._components, *dx.shape), dtype=complex)  # an analyser leaves one
         model = self._model if self._local is None else self._local.at(x_nm, y_nm)
         given = model.field(dx, dy, z_nm, mass_kda)
         field[: len(given)] = given
