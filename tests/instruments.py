@@ -177,6 +177,14 @@ class Pictures:
         amplitude = mass_kda * self.per_kda
         return amplitude * linear + amplitude**2 * square
 
+    def quadratures(
+        self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float, turn: float
+    ) -> FloatArray:
+        """Interference with a reference that is ahead by an angle."""
+        e = self._field(dx_nm, dy_nm)
+        reference = self._reference * np.exp(1j * turn)
+        return mass_kda * self.per_kda * 2 * np.real(e @ np.conj(reference))
+
     def at_height(self, z_nm: float) -> Pictures:
         """Put the particle at another height, and leave the focus where it was."""
         turn = np.exp(1j * self._rise * (z_nm - self._nominal_nm))

@@ -17,6 +17,7 @@ from scipy.ndimage import gaussian_filter
 
 PIXEL_NM = 84.0
 GAIN = 4.0
+_RINGS, _SPOKES = 4, 24  # of plane waves in a cone
 
 Optics = Callable[[Instrument, float, float], tuple[Instrument, float]]
 """Gives the instrument at a place, and the amplitude of its reference over that in the middle."""
@@ -74,6 +75,33 @@ def other_reference(curved_rad: float, tilt: float = 0.0) -> Optics:
     return at
 
 
+def in_a_cone(
+    picture: Pictures,
+    instrument: Instrument,
+    dx_nm: FloatArray,
+    dy_nm: FloatArray,
+    mass_kda: float,
+    illumination_na: float,
+) -> FloatArray:
+    """Contrast averaged over plane waves of a cone, each with its own path through the oil."""
+    if not illumination_na:
+        return picture.contrast(dx_nm, dy_nm, mass_kda)
+    m, k = instrument, 2 * np.pi / instrument.wavelength_nm
+    linear = [picture.quadratures(dx_nm, dy_nm, mass_kda, turn) for turn in (0.0, np.pi / 2)]
+    square = picture.contrast(dx_nm, dy_nm, mass_kda) - linear[0]
+    points, weights = np.polynomial.legendre.leggauss(_RINGS)
+    total = np.zeros(np.broadcast_shapes(dx_nm.shape, dy_nm.shape))
+    oil_nm = m.height_nm - m.focus_nm - m.height_nm * m.n_immersion / m.n_sample
+    for area, weight in zip((points + 1) / 2, weights / 2, strict=True):
+        na = illumination_na * np.sqrt(area)
+        path = oil_nm * (np.sqrt(m.n_immersion**2 - na**2) - m.n_immersion)
+        path -= m.height_nm * (np.sqrt(m.n_sample**2 - na**2) - m.n_sample)
+        for angle in 2 * np.pi * np.arange(_SPOKES) / _SPOKES:
+            turn = k * (na * (np.cos(angle) * dx_nm + np.sin(angle) * dy_nm) + path)
+            total += weight / _SPOKES * (np.cos(turn) * linear[0] + np.sin(turn) * linear[1])
+    return total + square
+
+
 class UnevenMovie:
     """A landing movie in memory, each particle with its own optics, with Poisson noise."""
 
@@ -89,6 +117,7 @@ class UnevenMovie:
         *,
         seed: int,
         level_e: float = 1e5,
+        illumination_na: float = 0.0,
     ) -> None:
         rng = np.random.default_rng(seed)
         frames, rows, columns = shape
@@ -105,14 +134,12 @@ class UnevenMovie:
                 i = pending.pop(0)
                 local, reference = optics(instrument, *(float(v) for v in places[i]))
                 picture = Pictures(local, reach_nm)
-                light = light * (
-                    1
-                    + picture.contrast(
-                        (x - landings.x_px[i] * PIXEL_NM)[None, :],
-                        (y - landings.y_px[i] * PIXEL_NM)[:, None],
-                        float(landings.mass_kda[i]) * middle.per_kda / picture.per_kda / reference,
-                    )
+                size = float(landings.mass_kda[i]) * middle.per_kda / picture.per_kda / reference
+                at = (
+                    (x - landings.x_px[i] * PIXEL_NM)[None, :],
+                    (y - landings.y_px[i] * PIXEL_NM)[:, None],
                 )
+                light = light * (1 + in_a_cone(picture, local, *at, size, illumination_na))
             expected = light * (1 + 0.01 * rng.standard_normal())
             noisy = expected + np.sqrt(expected) * rng.standard_normal((rows, columns))
             counts[t] = np.floor(noisy / GAIN + rng.random((rows, columns)))

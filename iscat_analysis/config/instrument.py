@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.field import FieldTerms
+from iscat_analysis.config.field import FIELD_TERMS, FieldTerms
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -86,12 +86,20 @@ class OpticsCovariance(Section):
     names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
     matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
 
+    @property
+    def of_the_middle(self) -> OpticsCovariance:
+        """Errors of the optics in the middle of the field, without those of its terms."""
+        kept = [k for k, name in enumerate(self.names) if name not in FIELD_TERMS]
+        matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
+        return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
+
     @model_validator(mode="after")
     def _symmetric(self) -> OpticsCovariance:
         size = len(self.names)
-        unknown = [name for name in self.names if name not in MEASURABLE]
+        known = (*MEASURABLE, *FIELD_TERMS)
+        unknown = [name for name in self.names if name not in known]
         if unknown:
-            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(MEASURABLE)}")
+            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
         if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
             raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
         for i, row in enumerate(self.matrix):

@@ -252,7 +252,7 @@ class LatticeField:
         out = np.empty((dx.size, 2, len(self.harmonics)))
         sum_waves(self._waves_at(z_nm), 1 / self.radial_step_nm, dx, dy, out)
         parts = self.cone.added(out.transpose(2, 1, 0)[None], dx, dy)[0]
-        return (parts[:, 0] + 1j * parts[:, 1]).reshape(-1, *np.shape(dx_nm))
+        return np.asarray(parts[:, 0] + 1j * parts[:, 1]).reshape(-1, *np.shape(dx_nm))
 
     @cached_property
     def _waves_at(self) -> Callable[[float], FloatArray]:

@@ -227,7 +227,7 @@ def _of_optics(
     names: tuple[str, ...], covariance: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Leave out what is no property of the microscope."""
-    kept = [k for k, name in enumerate(names) if name not in (*RISES, *FIELD)]
+    kept = [k for k, name in enumerate(names) if name not in RISES]
     return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 

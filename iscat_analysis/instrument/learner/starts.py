@@ -21,6 +21,7 @@ from scipy import fft, ndimage
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.field_map import Spot
 from iscat_analysis.records import FloatArray
 
 FOCUS_RANGE_NM = 1000.0
@@ -142,7 +143,7 @@ def with_masses(
     sights: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
 ) -> tuple[ParticleImage, ...]:
     """Give every sight the mass that fits it best where it stands."""
-    models: dict[float, Any] = {}
+    models: dict[Spot, Any] = {}
     out = []
     for sight in sights:
         if sight.spot not in models:
