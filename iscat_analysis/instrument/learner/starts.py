@@ -20,8 +20,8 @@ from scipy import fft, ndimage
 
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.field_map import Spot
+from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FloatArray
 
 FOCUS_RANGE_NM = 1000.0
