@@ -296,8 +296,7 @@ def _optics(
     as_json: bool,
 ) -> None:
     """Print how well particles would tell the microscope."""
-    from iscat_analysis.instrument.learner import forecast_optics
-    from iscat_analysis.instrument.learner.forecast import EVENTS
+    from iscat_analysis.instrument.forecast import EVENTS, forecast_optics
     from iscat_analysis.report.bounds import OPTICS_BOUNDS_FILES, write_optics_bounds
     from iscat_analysis.report.output import check_output
 

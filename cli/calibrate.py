@@ -21,7 +21,7 @@ from iscat_cli.options import (
 if TYPE_CHECKING:
     from iscat_analysis.calibration.mass import MassCalibration
     from iscat_analysis.camera.calibration import CameraCalibration, Estimate
-    from iscat_analysis.instrument.learner import OpticsCalibration
+    from iscat_analysis.instrument.result import OpticsCalibration
 
 SUMMARY = "Calibrate the camera, the optics, or contrast against mass."
 

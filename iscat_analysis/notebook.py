@@ -18,10 +18,10 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.config.values import LARGEST_NM
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import number_in, path_in
-from iscat_analysis.instrument.learner import OpticsCalibration, OpticsForecast
-from iscat_analysis.instrument.learner import forecast_optics as _forecast
-from iscat_analysis.instrument.learner.forecast import EVENTS
+from iscat_analysis.instrument.forecast import EVENTS, OpticsForecast
+from iscat_analysis.instrument.forecast import forecast_optics as _forecast
 from iscat_analysis.instrument.learning import calibrate_movie
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import Progress, silent

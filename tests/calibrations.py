@@ -11,7 +11,9 @@ import numpy as np
 from iscat_analysis.config import Config, parse_config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
-from iscat_analysis.instrument.learner import ParticleImage, build_microscope, settings_of
+from iscat_analysis.instrument.microscope import build_microscope
+from iscat_analysis.instrument.parameters import settings_of
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 

@@ -17,10 +17,11 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
-from iscat_analysis.instrument.learner import Pictures, make_pictures, maximise, settings_of
-from iscat_analysis.instrument.learner.starts import with_masses
-from iscat_analysis.instrument.microscope import microscopes
-from iscat_analysis.instrument.particle_images import reach_nm
+from iscat_analysis.instrument.joint_fit import maximise
+from iscat_analysis.instrument.microscope import microscopes, reach_nm
+from iscat_analysis.instrument.parameters import settings_of
+from iscat_analysis.instrument.particle_image import with_masses
+from iscat_analysis.instrument.result import Pictures, make_pictures
 
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "tutorial.toml"

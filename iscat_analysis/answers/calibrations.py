@@ -21,9 +21,9 @@ from iscat_analysis.calibration.mass import (
 from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.instrument.learner import OpticsCalibration
 from iscat_analysis.instrument.learning import calibrate_movie
-from iscat_analysis.instrument.picture import MeasuredPicture, measure_template
+from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.instrument.template import MeasuredPicture, measure_template
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.text_tables import decimal_mark, separator

@@ -7,9 +7,9 @@ belongs to a contrast, and nothing can be fitted: the movie must say where the f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,34 +20,30 @@ from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
-from iscat_analysis.instrument.crowded import seen_in_field
-from iscat_analysis.instrument.learner import (
-    FREE,
-    LEAST_SIGHTS,
-    OpticsCalibration,
-    ParticleImage,
-    Settings,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.instrument.collect import bright_particle_images
+from iscat_analysis.instrument.fit_optics import Collected, fit_optics, misfit_of
 from iscat_analysis.instrument.learning import (
     LEAST_TESTED,
     NOISE,
+    adopted,
     learned_from,
     noise_differs,
-    taken,
     too_few,
-    usable,
     why_not,
 )
+from iscat_analysis.instrument.loop import accepted
+from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
-    calibrate_particle_images,
+    REJECTED_P,
     goodness,
+    median_p,
     microscopes,
+    reach_nm,
     with_sign,
 )
-from iscat_analysis.instrument.particle_images import bright_particle_images, reach_nm
-from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
+from iscat_analysis.instrument.parameters import FREE, heights_free, settings_of
+from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.instrument.sources import seen_in_field
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
 from iscat_analysis.threads import threads
@@ -134,74 +130,63 @@ def learn_sign(
         try:
             if noise_differs(movie, config, camera):
                 raise DataError("the movie does not tell another: " + NOISE)
-            start = config
             if heights_free(config):
-                start, sights, others = _begun(movie, wrong, camera, pool)
+                seen, near = _begun(movie, wrong, camera, pool)
             else:
-                sights, others = bright_particle_images(movie, config, camera, pool, opening)
-            if len(sights) < LEAST_TESTED:
-                raise DataError(too_few(movie.name, len(sights)))
-            median, _ = median_p(sights, config, others, pool.map)
+                images, others = bright_particle_images(movie, config, camera, pool, opening)
+                seen, near = Collected(config, images, others), config
+            if len(seen.images) < LEAST_TESTED:
+                raise DataError(too_few(movie.name, len(seen.images)))
+            median, _ = median_p(list(seen.images), near, seen.others, pool.map)
             if median >= REJECTED_P:
                 raise DataError("with it the optics describe the particles of the movie")
-            found = _found(movie, sights, others, start, wrong, camera, pool)
+            found = _found(movie, seen, wrong, camera, pool)
         except DataError as error:
             raise wrong.error(str(error)) from error
     warn(wrong.said)
-    tested = {"tested": len(sights), "median_p": median}
-    return taken(found, config, tested, wrong.said, warn=warn)
+    tested = {"tested": len(seen.images), "median_p": median}
+    return adopted(found, config, tested, wrong.said, warn=warn)
 
 
 def _begun(
     movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
-) -> tuple[Config, list[ParticleImage], list[ParticleImage]]:
+) -> tuple[Collected, Config]:
     """Fit the field with each focus of the right sign, and take what describes most particles."""
-    windows = measured_windows(movie, wrong.config, camera, *frame_ranges(movie, wrong.config))
-    best: tuple[float, Config, list[ParticleImage], list[ParticleImage]] | None = None
+    config = wrong.config
+    windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
+    best: tuple[float, Collected, Config] | None = None
     for start in wrong.starts:
-        sights, others = seen_in_field(windows, start, pool)
-        if len(sights) < LEAST_TESTED:
+        images, others = seen_in_field(windows, start, pool)
+        if len(images) < LEAST_TESTED:
             continue
-        model = microscopes(start, max(map(reach_nm, sights)))(settings_of(start))
-        chi2 = float(np.median([goodness(sight, model)[0] for sight in sights]))
+        model = microscopes(start, max(map(reach_nm, images)))(settings_of(start))
+        chi2 = float(np.median([goodness(image, model)[0] for image in images]))
         if best is None or chi2 < best[0]:
-            best = chi2, start, sights, others
-    return best[1:] if best is not None else (wrong.config, [], [])
+            best = chi2, Collected(config, images, others, settings_of(start)), start
+    return best[1:] if best is not None else (Collected(config, ()), config)
 
 
 def _found(
-    movie: Stack,
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    start: Config,
-    wrong: WrongSign,
-    camera: Camera,
-    pool: ThreadPoolExecutor,
+    movie: Stack, seen: Collected, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
 ) -> OpticsCalibration:
     """Measure the focus alone, or where that does not describe the particles all of the optics."""
-    source, config = {"movie": movie.name}, wrong.config
-    known: Settings | None = None if start is config else settings_of(start)
-    found = calibrate_particle_images(
-        sights, others, config, ("focus",), source,
-        least=LEAST_TESTED, known=known, mapper=pool.map,
-    )  # fmt: skip
+    config, origin = wrong.config, {"movie": movie.name}
+    found = fit_optics(replace(seen, least=LEAST_TESTED), ("focus",), origin, pool.map)
     focus = float(str(found.measured.settings["focus_nm"]))
     if found.accepted:
         learned, _ = with_sign(found.config)
         if learned is None or _phase(learned) != _phase(config):
             raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
         return found
-    if len(sights) >= LEAST_SIGHTS:
+    if len(seen.images) >= LEAST_SIGHTS:
         if heights_free(config):
-            known = found.measured.settings
-            every = calibrate_particle_images(
-                sights, others, config, tuple(FREE), source, known=known, mapper=pool.map
-            )
+            near = replace(seen, near=found.measured.settings)
+            every = fit_optics(near, tuple(FREE), origin, pool.map)
         else:
-            every = learned_from(sights, others, movie, config, camera, tuple(FREE), source, pool)
-        if usable(every, config)[0] is not None:
+            every = learned_from(seen, movie, config, camera, tuple(FREE), origin, pool)
+        if accepted(every, config)[0] is not None:
             return every
-    chi2 = float(np.mean(found.measured.judgement.chi2_reduced))
+    chi2 = misfit_of(found)
     more = "" if heights_free(config) else ", as where more than the focus is wrong"
     raise DataError(
         f"of the foci tried {focus:.0f} nm describes the brightest particles best, but not well "

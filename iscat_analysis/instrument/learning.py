@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -22,34 +23,26 @@ from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.checks import number_in
-from iscat_analysis.instrument.crowded import learn_in_field, seen_in_field
-from iscat_analysis.instrument.learner import (
-    FREE,
-    LEAST_SIGHTS,
-    OpticsCalibration,
-    ParticleImage,
-    free_groups,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
+from iscat_analysis.instrument.fit_optics import Collected
+from iscat_analysis.instrument.loop import accepted, learn
+from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
-    calibrate_particle_images,
-    refuse_uncalibratable,
-    with_sign,
-)
-from iscat_analysis.instrument.particle_images import (
+    REJECTED_P,
     TESTED,
-    bright_particle_images,
-    kind_of,
-    scan_particle_images,
+    median_p,
+    not_alone,
+    refuse_uncalibratable,
 )
-from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p, not_alone
+from iscat_analysis.instrument.parameters import FREE, free_groups, heights_free, settings_of
+from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.instrument.sources import StandingAlone, WholeField, seen_in_field
 from iscat_analysis.instrument.uneven import (
     EVEN,
+    Change,
     FieldOfView,
     asked_change,
-    learned_with_changes,
-    with_changes,
+    in_uneven_field,
 )
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import terms_of
@@ -90,73 +83,98 @@ def learn_optics(
         or (optics.calibrate == "auto" and (optics.file is not None or terms_of(optics)))
     ):
         return config, {}
-    tested: dict[str, Any] = {}
-    passed, sliding, change = False, background_mode(config) == "sliding", EVEN
-    view = FieldOfView.of(movie, config, in_time=sliding)
-    first_tested = optics.calibrate == "auto" and sliding
+    tested: Tested | None = None
     with threads(config.compute.workers) as pool:
-        sights, others = bright_particle_images(
-            movie, config, camera, pool, opening, rings=not first_tested
-        )
-        alone, source = len(sights), {"movie": movie.name}
-        together = alone < LEAST_TESTED and background_mode(config) == "fixed"
-        windows = _summed(movie, config, camera) if together else None
         try:
-            if windows is not None:
-                if drift_warning(movie.name, examine_background(movie, camera, windows)):
-                    raise DataError("the edges of a fixed pattern that moved look like particles")
-                sights, others = seen_in_field(windows, config, pool)
-            if len(sights) < LEAST_TESTED:
-                by_noise = noise_differs(movie, config, camera)
-                raise DataError(too_few(movie.name, len(sights), by_noise=by_noise))
-            median, fitted = median_p(sights, config, others, pool.map)
-            if first_tested and median < REJECTED_P:  # more particles, and whose rings they show
-                sights, others = bright_particle_images(movie, config, camera, pool, opening)
-                alone = len(sights)
-                median, fitted = median_p(sights, config, others, pool.map)
-            if not heights_free(config):
-                change = asked_change(fitted, config, settings_of(config), view, pool.map)
-            if sliding and change.matters:  # which the first particles of a long movie tell badly
-                sights, others = bright_particle_images(
-                    movie, config, camera, pool, opening, whole=True
-                )
-                alone = len(sights)
-            elif (
-                optics.calibrate == "auto"
-                and median < REJECTED_P
-                and not heights_free(config)
-                and not change.matters
-            ):
-                pairs, median = not_alone(sights, config, others, pool.map)
-                sights = [sight for k, sight in enumerate(sights) if k not in pairs]
-                alone -= sum(k < alone for k in pairs)
-                if len(sights) < LEAST_TESTED:
-                    raise DataError(too_few(movie.name, len(sights)))
-            tested = {"tested": len(sights), "median_p": median}
-            passed = optics.calibrate == "auto" and median >= REJECTED_P
-            if passed and not change.matters:
-                return config, tested | {"calibrated": False}
+            tested = tested_optics(movie, config, camera, pool, opening)
+            passed = optics.calibrate == "auto" and tested.median_p >= REJECTED_P
+            if passed and not tested.change.matters:
+                return config, tested.summary | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 reason = f"{NOISE}; the analysis goes on as configured"
                 warn(f"the optics cannot be tested on this movie: {reason}")
-                return config, tested | {"calibrated": False, "reason": reason}
+                return config, tested.summary | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
-            found = (
-                learned_with_changes(
-                    sights, others, config, settings_of(config), view, source, pool.map
-                )
-                if passed
-                else learned_from(
-                    sights[:alone], others, movie, config, camera, tuple(FREE), source, pool
-                )
-            )
-            if found is None:  # pictures that were not fitted want no change
-                return config, tested | {"calibrated": False}
+            origin = {"movie": movie.name}
+            if passed:
+                view = FieldOfView.of(movie, config, in_time=background_mode(config) == "sliding")
+                moved = in_uneven_field(tested.seen, settings_of(config), view, pool.map)
+                if moved is None:  # pictures that were not fitted want no change
+                    return config, tested.summary | {"calibrated": False}
+                known = StandingAlone(moved, pool)
+                found = learn(known, config, tuple(FREE), origin, pool.map).outcome
+            else:
+                found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
         except DataError as error:
-            reason = f"{error}; {change.said}" if change.matters else str(error)
+            changing = tested is not None and tested.change.matters
+            reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
             warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
-            return config, tested | {"calibrated": False, "reason": reason}
-    return taken(found, config, tested, change.said if passed else _verdict(tested), warn=warn)
+            summary = tested.summary if tested else {}
+            return config, summary | {"calibrated": False, "reason": reason}
+    verdict = tested.change.said if passed else _verdict(tested)
+    return adopted(found, config, tested.summary, verdict, warn=warn)
+
+
+@dataclass(frozen=True)
+class Tested:
+    """The brightest particles of a movie, and how the configured optics describe them."""
+
+    seen: Collected
+    """Those that stand alone, from which optics can be learned at once."""
+
+    particles: int
+    median_p: float
+    change: Change = EVEN
+    """Over the field or in time, that they ask for."""
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Give what the summary says of the test."""
+        return {"tested": self.particles, "median_p": self.median_p}
+
+
+def tested_optics(
+    movie: Stack,
+    config: Config,
+    camera: Camera,
+    pool: ThreadPoolExecutor,
+    opening: NoiseSurvey | None,
+) -> Tested:
+    """Collect the brightest particles and test the configured optics on them.
+
+    Where these fail, or the focus moves, more particles are collected, with the rings of others.
+    """
+    sliding, auto = background_mode(config) == "sliding", config.optics.calibrate == "auto"
+    first = sliding and auto
+    images, others = bright_particle_images(movie, config, camera, pool, opening, rings=not first)
+    alone = len(images)
+    if alone < LEAST_TESTED and background_mode(config) == "fixed":
+        windows = _summed(movie, config, camera)
+        if drift_warning(movie.name, examine_background(movie, camera, windows)):
+            raise DataError("the edges of a fixed pattern that moved look like particles")
+        images, others = seen_in_field(windows, config, pool)
+    if len(images) < LEAST_TESTED:
+        by_noise = noise_differs(movie, config, camera)
+        raise DataError(too_few(movie.name, len(images), by_noise=by_noise))
+    median, fitted = median_p(images, config, others, pool.map)
+    if first and median < REJECTED_P:  # more particles, and whose rings they show
+        images, others = bright_particle_images(movie, config, camera, pool, opening)
+        alone = len(images)
+        median, fitted = median_p(images, config, others, pool.map)
+    change = EVEN
+    if not heights_free(config):
+        view = FieldOfView.of(movie, config, in_time=sliding)
+        change = asked_change(fitted, config, settings_of(config), view, pool.map)
+    if sliding and change.matters:  # which the first particles of a long movie tell badly
+        images, others = bright_particle_images(movie, config, camera, pool, opening, whole=True)
+        alone = len(images)
+    elif auto and median < REJECTED_P and not heights_free(config) and not change.matters:
+        pairs, median = not_alone(images, config, others, pool.map)
+        images = [image for k, image in enumerate(images) if k not in pairs]
+        alone -= sum(k < alone for k in pairs)
+        if len(images) < LEAST_TESTED:
+            raise DataError(too_few(movie.name, len(images)))
+    return Tested(Collected(config, images[:alone], others), len(images), median, change)
 
 
 def why_not(config: Config) -> str:
@@ -191,7 +209,7 @@ def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
     return said
 
 
-def taken(
+def adopted(
     found: OpticsCalibration,
     config: Config,
     tested: Mapping[str, Any],
@@ -200,8 +218,8 @@ def taken(
     pictures_of: str = "particles",
     warn: Callable[[str], None],
 ) -> tuple[Config, dict[str, Any]]:
-    """Take what was learned, where it may be used, and say so."""
-    learned, why = usable(found, config)
+    """Use what was learned, where it may be used, and say so."""
+    learned, why = accepted(found, config)
     if learned is None:
         warn(f"{verdict}: {why}; the analysis goes on as configured")
         return config, {**tested, **_told(found), "calibrated": False, "reason": why}
@@ -251,23 +269,18 @@ def calibrate_movie(
     with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:
-            others: list[ParticleImage] = []
-            sights = scan_particle_images(movie, config, camera)
+            images = scan_particle_images(movie, config, camera)
+            seen = Collected(config, images, focus_step_nm=focus_step_nm)
         else:
-            sights, others = bright_particle_images(movie, config, camera, pool)
+            seen = Collected(config, *bright_particle_images(movie, config, camera, pool))
         progress("particles", 1, 1)
-        source = {
+        origin = {
             "movie": movie.path.name,
             "sha256": movie.sha256(),
             "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
             "version": version("iscat-analysis"),
         }  # fmt: skip
-        if focus_step_nm is None:
-            return learned_from(sights, others, movie, config, camera, groups, source, pool)
-        return calibrate_particle_images(
-            sights, others, config, groups, source,
-            focus_step_nm=focus_step_nm, mapper=pool.map,
-        )  # fmt: skip
+        return learned_from(seen, movie, config, camera, groups, origin, pool)
 
 
 def _check_step(step_nm: float, frames: int) -> None:
@@ -282,26 +295,25 @@ def _check_step(step_nm: float, frames: int) -> None:
 
 
 def learned_from(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
+    seen: Collected,
     movie: Stack,
     config: Config,
     camera: Camera,
     groups: Sequence[str],
-    source: Mapping[str, str],
+    origin: Mapping[str, str],
     pool: ThreadPoolExecutor,
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
-    way = background_mode(config)
-    crowded = way == "fixed"
-    if not crowded or len(sights) >= LEAST_SIGHTS:
-        found = calibrate_particle_images(sights, others, config, groups, source, mapper=pool.map)
-        if not heights_free(config):
-            view = FieldOfView.of(movie, config, in_time=way == "sliding")
-            found = with_changes(found, sights, others, config, view, source, pool.map)
+    scan, way = seen.focus_step_nm is not None, background_mode(config)
+    crowded = way == "fixed" and not scan
+    if not crowded or len(seen.images) >= LEAST_SIGHTS:
+        asked = not scan and not heights_free(config) and set(groups) == set(FREE)
+        view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
+        found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome
         if found.accepted or not crowded:
             return found
-    return learn_in_field(_summed(movie, config, camera), config, groups, source, pool)
+    field = WholeField(_summed(movie, config, camera), config, pool)
+    return learn(field, config, groups, origin, pool.map).outcome
 
 
 def _summed(movie: Stack, config: Config, camera: Camera) -> Windows:
@@ -320,15 +332,15 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
     return bool(stuck or noise.differs)
 
 
-def _verdict(tested: dict[str, Any]) -> str:
+def _verdict(tested: Tested | None) -> str:
     """Say what the test found where the optics are not learned."""
-    if not tested:
+    if tested is None:
         return "the optics cannot be tested on this movie"
-    if tested["median_p"] >= REJECTED_P:
+    if tested.median_p >= REJECTED_P:
         return "the optics cannot be learned from this movie"
     return (
-        f"the configured optics do not describe the brightest {min(tested['tested'], TESTED)} "
-        f"particles (median p-value {tested['median_p']:.1g}), and they cannot be learned from them"
+        f"the configured optics do not describe the brightest {min(tested.particles, TESTED)} "
+        f"particles (median p-value {tested.median_p:.1g}), and they cannot be learned from them"
     )
 
 
@@ -339,10 +351,3 @@ def _told(found: OpticsCalibration) -> dict[str, Any]:
         key: told[key]
         for key in ("accepted", "refusals", "parameters", "names", "covariance", "twin", "notes")
     }
-
-
-def usable(found: OpticsCalibration, config: Config) -> tuple[Config | None, str]:
-    """Give the configuration with the learned optics, or why there is none."""
-    if not found.accepted:
-        return None, "; ".join(found.measured.refusals)
-    return with_sign(config.model_copy(update={"optics": found.config.optics}))

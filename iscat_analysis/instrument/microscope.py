@@ -1,39 +1,52 @@
-"""The microscope of a movie, measured from the pictures of its bright particles."""
+"""Microscopes of changing optics, and whether one describes the brightest particles."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.learner import (
-    FIELD,
-    FOCUS_DRIFT,
-    FOCUS_STEP,
-    LEAST_SIGHTS,
-    OpticsCalibration,
+from iscat_analysis.instrument.joint_fit import Neighbours, maximise
+from iscat_analysis.instrument.parameters import Settings, heights_free, settings_of, with_settings
+from iscat_analysis.instrument.particle_image import (
     ParticleImage,
-    Settings,
-    build_microscope,
-    make_pictures,
-    make_result,
-    measure_microscope,
-    optics_limits,
-    settings_of,
+    average_particle_images,
+    with_masses,
 )
-from iscat_analysis.instrument.particle_images import RINGS_NM, reach_nm
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.records import Mapper
-from iscat_analysis.units import count
 
-STEP_FACTORS = (0.5, 2.0)
-"""How much smaller or larger than said the steps of a scan may turn out."""
+
+def build_microscope(
+    config: Config, reach_nm: float, settings: Settings, *, like: ForwardModel | None = None
+) -> ForwardModel:
+    """Make the forward model of other optics, with the model's own mass scale."""
+    changed = with_settings(config, settings).model_copy(update={"calibration": None})
+    highest = None if heights_free(config) else config.particle.nominal_height_nm
+    return forward_model(changed, reach_nm, z_max_nm=highest, like=like)
+
+
+RINGS_NM = 9000.0
+"""Farther than this from a particle its rings are left out."""
+_SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
+
+TESTED = 24
+"""Particles on which optics are tested, the brightest."""
+
+
+def reach_nm(sight: ParticleImage) -> float:
+    """Distance from a particle, which may move in its picture, to the farthest pixel."""
+    return sight.grid.diagonal_nm / 2 + _SHIFT_NM
+
 
 _MODELS_KEPT = 64  # as many as there are pictures with optics of their own
 
@@ -47,53 +60,6 @@ def refuse_uncalibratable(config: Config) -> None:
         )
     if config.optics.convention == "dong2021":
         raise ConfigError('optics.convention = "dong2021" cannot be calibrated: use "exact"')
-
-
-def calibrate_particle_images(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    groups: Sequence[str],
-    source: Mapping[str, str],
-    *,
-    focus_step_nm: float | None = None,
-    least: int = LEAST_SIGHTS,
-    known: Settings | None = None,
-    mapper: Mapper = map,
-) -> OpticsCalibration:
-    """Measure the optics from pictures."""
-    if len(sights) < least:
-        raise DataError(
-            f"{source['movie']}: shows {count(len(sights), 'bright particle')} standing alone, and "
-            f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
-            "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
-        )
-    configured = settings_of(config)
-    limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
-    if focus_step_nm is not None:
-        configured[FOCUS_STEP] = focus_step_nm
-        low, high = sorted(factor * focus_step_nm for factor in STEP_FACTORS)
-        limits[FOCUS_STEP] = (low, high)
-    configured |= {name: 0.0 for name in (FOCUS_DRIFT, *FIELD) if known and name in known}
-    build = microscopes(config, max(reach_nm(sight) for sight in sights))
-    optics = config.optics
-    measured = measure_microscope(
-        sights,
-        configured,
-        build,
-        lambda sight, settings: goodness(sight, build(sight.seen_with(settings))),
-        free=groups,
-        limits=limits,
-        side=int(math.copysign(1, optics.focus_nm)) if optics.focus_nm else 0,
-        landing=1,
-        others=others,
-        build_wide=rings_of(config, sights[0]),
-        known=known,
-        mapper=mapper,
-    )
-    estimate = measured.estimate
-    pictures = make_pictures(estimate.sights, build, estimate.values)
-    return make_result(config, configured, measured, pictures, source)
 
 
 def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
@@ -139,3 +105,110 @@ def with_sign(config: Config) -> tuple[Config | None, str]:
         else:
             return learned, ""
     return None, reason
+
+
+REJECTED_P = 1e-3
+"""Half of the brightest particles must fit worse than this before the optics are doubted: a few
+that are not alone do not suffice."""
+
+_STARTS_NM = tuple(range(-400, 401, 100))  # along each axis; rings are some 200 nm apart
+_FITTED = 3  # of these starts
+_CLEAR = 10.0  # standard errors of χ² by which a wrong microscope would be seen in a picture
+_DESCRIBED = 0.1  # of that, which a picture that is described has at most
+_DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others are not
+
+
+def median_p(
+    sights: list[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
+) -> tuple[float, Sequence[ParticleImage]]:
+    """Give the median p-value of the brightest particles in the configured microscope.
+
+    The rings of neighbours, where any are known, are put into the pictures that fail without.
+    """
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
+    model = build(settings)
+    shown: Sequence[ParticleImage] = sights[:TESTED]
+    x, y = 0.0, 0.0
+    if not heights_free(config):
+        averages, shown = average_particle_images(shown)
+        x, y = _centre(averages[0], model, build, settings)
+
+    def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:
+        fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
+        return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
+
+    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
+    found, fitted = median(with_masses(moved, build, settings))
+    if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
+        return found, fitted
+    elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
+    near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
+    return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
+
+
+def not_alone(
+    sights: Sequence[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage] = (),
+    mapper: Mapper = map,
+) -> tuple[list[int], float]:
+    """Find bright places that the configured microscope describes badly, and others well.
+
+    A microscope that is wrong is so for all particles, and is seen the better the brighter they
+    are.  Where some as bright are described, the places that are not show two that landed at once.
+    From a place that others drew aside a fit ends in another optimum: each begins anew here.
+    """
+    settings = settings_of(config)
+    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
+    model = build(settings)
+
+    def fitted(sight: ParticleImage) -> ParticleImage:
+        x, y = _centre(sight, model, build, settings)
+        (placed,) = with_masses([sight.placed(x, y)], build, settings)
+        return maximise([placed], build, settings, ()).sights[0]
+
+    some = list(mapper(fitted, sights[:TESTED]))
+    if any(sight.neighbours for sight in some):
+        near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
+        pictures = near.around(some, mapper)
+        some = list(maximise(pictures, build, settings, (), mapper=mapper).sights)
+    chi2, p = np.transpose([goodness(sight, model) for sight in some])
+    mass = np.array([sight.mass_kda for sight in some])
+    poor = p < REJECTED_P
+    if not poor.any() or poor.all():
+        return [], float(np.median(p))
+    expected = float(np.median((chi2 - 1)[poor] / mass[poor] ** 2)) * mass**2
+    clear = expected > _CLEAR * np.sqrt(2 / math.prod(some[0].grid.shape))
+    described = ~poor & clear & (chi2 - 1 < _DESCRIBED * expected)
+    if described.sum() < max(2, _DESCRIBED_SHARE * len(some)):
+        return [], float(np.median(p))
+    return np.flatnonzero(poor).tolist(), float(np.median(p[~poor]))
+
+
+def _centre(
+    sight: ParticleImage,
+    model: ForwardModel,
+    build: Callable[[Settings], ForwardModel],
+    settings: Settings,
+) -> tuple[float, float]:
+    """Find the particle in a picture [nm], whose brightest spot may be of a ring.
+
+    From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
+    """
+    starts = [
+        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
+        for x in _STARTS_NM
+        for y in _STARTS_NM
+    ]
+
+    def misfit(one: ParticleImage) -> float:
+        return goodness(one, model)[0]
+
+    likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
+    fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]
+    best = min(fits, key=misfit)
+    return best.x_nm, best.y_nm

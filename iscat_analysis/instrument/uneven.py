@@ -19,26 +19,18 @@ import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.fitting.ranges import fitted_frames
-from iscat_analysis.instrument.learner import (
+from iscat_analysis.instrument.fit_optics import Collected
+from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
+from iscat_analysis.instrument.measure import LEAST_SIGHTS, fitted_sights, held_out_sights
+from iscat_analysis.instrument.microscope import microscopes, reach_nm
+from iscat_analysis.instrument.parameters import (
     FOCUS_DRIFT,
     FREE,
-    LEAST_SIGHTS,
-    Asked,
-    Build,
-    Estimate,
-    OpticsCalibration,
-    ParticleImage,
     Settings,
-    asked_changes,
-    fitted_sights,
     free_names,
-    held_out_sights,
-    maximise,
     prior_range,
 )
-from iscat_analysis.instrument.learner.starts import with_masses
-from iscat_analysis.instrument.microscope import calibrate_particle_images, microscopes
-from iscat_analysis.instrument.particle_images import reach_nm
+from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import centre_of, changes_at
 from iscat_analysis.optics.local import DRIFT_FRAMES
@@ -217,22 +209,20 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
     )
 
 
-def learned_with_changes(
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    settings: Settings,
-    view: FieldOfView,
-    source: Mapping[str, str],
-    mapper: Mapper = map,
-) -> OpticsCalibration | None:
-    """Learn the optics together with their changes; none where held-out pictures want none."""
-    if len(sights) < LEAST_SIGHTS:
+def in_uneven_field(
+    seen: Collected, settings: Settings, view: FieldOfView, mapper: Mapper = map
+) -> Collected | None:
+    """Give pictures their places and times, and a microscope near theirs that changes with these.
+
+    None where pictures that were not fitted want no change.
+    """
+    images, config = seen.images, seen.config
+    if len(images) < LEAST_SIGHTS:
         return None
-    build = microscopes(config, max(map(reach_nm, sights)))
-    signed = with_masses(sights, build, settings)  # what leaves is seen before
-    seen = sorted(view.placed(signed), key=lambda sight: -sight.snr)
-    some, held_out = fitted_sights(seen), held_out_sights(seen)
+    build = microscopes(config, max(map(reach_nm, images)))
+    signed = with_masses(images, build, settings)  # what leaves is seen before
+    ordered = sorted(view.placed(signed), key=lambda sight: -sight.snr)
+    held_out = held_out_sights(ordered)
     shared = free_names(tuple(FREE), settings, FREE["zernike"])
 
     def fitted(
@@ -243,7 +233,7 @@ def learned_with_changes(
     def judged(best: Estimate) -> Estimate:
         return fitted(best.values, (), held_out)
 
-    best = fitted(settings, shared, some)
+    best = fitted(settings, shared, fitted_sights(ordered))
     before, refused = judged(best), set[str]()
     kept: list[str] = []
     while True:
@@ -261,34 +251,5 @@ def learned_with_changes(
             refused.add(change.kind)
     if not kept:
         return None
-    return calibrate_particle_images(
-        (*best.sights, *before.sights), view.placed(others), view.optics(config),
-        tuple(FREE), source, known=best.values, mapper=mapper,
-    )  # fmt: skip
-
-
-def with_changes(
-    found: OpticsCalibration,
-    sights: Sequence[ParticleImage],
-    others: Sequence[ParticleImage],
-    config: Config,
-    view: FieldOfView,
-    source: Mapping[str, str],
-    mapper: Mapper = map,
-) -> OpticsCalibration:
-    """Look whether what was learned changes over field and time, and then learn it with that.
-
-    It is taken only if it describes pictures that were not fitted, and not worse than without.
-    """
-    settings = found.measured.settings
-    if not asked_change(found.measured.estimate.sights, config, settings, view, mapper).matters:
-        return found
-    changing = learned_with_changes(sights, others, config, settings, view, source, mapper)
-    if changing is None or (found.accepted and not changing.accepted):
-        return found
-    return changing if changing.accepted or misfit(changing) < misfit(found) else found
-
-
-def misfit(found: OpticsCalibration) -> float:
-    """Give the reduced χ² of pictures that were not fitted."""
-    return float(np.mean(found.measured.judgement.chi2_reduced))
+    together = (*best.sights, *before.sights)
+    return Collected(view.optics(config), together, view.placed(seen.others), near=best.values)

@@ -22,23 +22,15 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import unheard
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.goodness import goodness_of_fit
-from iscat_analysis.instrument.learner import (
-    FREE,
-    MOST_SIGHTS,
-    OpticsCalibration,
-    Settings,
-    heights_free,
-    settings_of,
-    with_settings,
-)
-from iscat_analysis.instrument.learning import taken, usable
-from iscat_analysis.instrument.microscope import calibrate_particle_images, with_sign
-from iscat_analysis.instrument.tested_optics import REJECTED_P
-from iscat_analysis.instrument.unknown_heights import learn_with_heights
+from iscat_analysis.instrument.fit_optics import Collected
+from iscat_analysis.instrument.learning import adopted
+from iscat_analysis.instrument.loop import Rounds, learn
+from iscat_analysis.instrument.measure import MOST_SIGHTS
+from iscat_analysis.instrument.microscope import REJECTED_P
+from iscat_analysis.instrument.parameters import FREE, Settings, heights_free, settings_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block
-from iscat_analysis.tracking.settling_optics import Round, Rounds
 from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
 from iscat_analysis.units import count
 
@@ -48,10 +40,11 @@ particles meet often."""
 
 ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
-tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
+tracks that were followed with wrong optics is only near the truth, as `instrument.loop` says."""
 
 _ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
+_NO_BETTER = "what was learned does not describe them either"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
 
 
@@ -150,22 +143,26 @@ def learn_from_tracks(
         return as_configured(said, said)
     reason = ""
     notify("learning the optics from the tracks of the movie, which may take minutes…")
+    start = _start(config, cause)
     # with free heights rings are taken for many particles, each with its own: that takes long
     apart = trouble is not None or heights_free(config)
     for cautious in (True,) if apart else (False, True):
         try:
             trial = begin(config, cautious=True) if cautious and trouble is None else begun
-            found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
-            if found is not None:
-                learned, told = taken(
+            tracks = Tracks(start, trial, begin)
+            rounds = learn(tracks, config, tuple(FREE), {"movie": name}, pool.map)
+            if rounds.best is not None:
+                found = rounds.best.found.less_sure(rounds.error_of(rounds.best))
+                learned, told = adopted(
                     found, config, tested, left.verdict, pictures_of="pictures of tracks", warn=warn
                 )
                 return begin(learned), told
-            if trouble is not None and near is not None:
+            why = next((one.reason for one in reversed(rounds.all) if one.reason), _NO_BETTER)
+            last = tracks.begun
+            if trouble is not None and last.left is not None and tracks.described:
                 warn(f"{left.verdict}; others are used that describe them better, but: {why}")
-                rest = near.left.share if near.left is not None else 0.0
-                told = {"calibrated": True, "reason": why, "left_over_then": rest}
-                return near, tested | told
+                told = {"calibrated": True, "reason": why, "left_over_then": last.left.share}
+                return last, tested | told
         except (DataError, ConfigError) as error:  # or what was learned asks for too much memory
             why = str(error)
         reason = reason or why
@@ -187,47 +184,46 @@ def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
             raise error from None
 
 
-def _described(
-    trial: Begun,
-    begin: Begin,
-    config: Config,
-    cause: Cause | None,
-    *,
-    name: str,
-    pool: ThreadPoolExecutor,
-) -> tuple[OpticsCalibration | None, Begun | None, str]:
-    """Measure optics from tracks that were followed with optics that describe them.
+@dataclass
+class Tracks:
+    """Particles that move, followed with the optics that were learned last."""
 
-    Where none are good enough: what was followed last, if it is described, and why.
-    """
-    reason = "what was learned does not describe them either"
-    near = trial if trial.described else None
-    best: tuple[Round, Begun] | None = None
-    rounds = Rounds()
-    for number in range(ROUNDS):
-        if number == _ROUGH_ROUNDS and near is None and best is None:
-            break
-        known = None
-        if number:
-            trial, trouble = _first(rounds.next if near else rounds.all[-1].after, begin)
-            if trouble is not None and best is not None:
-                break
-            near = trial if trouble is None and trial.described else None
-            known = settings_of(trial.config) if near else None
-        found = _measured(trial, _start(config, cause), name, pool, known=known)
-        learned, refusal = usable(found, config)
-        guess = learned or with_sign(with_settings(config, found.measured.settings))[0]
-        reason = refusal or reason
-        if guess is None:
-            break
-        rounds = rounds.with_one(Round(trial.config, guess, found))
-        if learned is not None and near is not None:
-            best = rounds.all[-1], near
-        if near is not None and rounds.settled:
-            break
-    if best is None:
-        return None, near, reason
-    return best[0].found.less_sure(rounds.error_of(best[0])), best[1], ""
+    start: Config
+    begun: Begun
+    """The tracks that were followed last."""
+
+    begin: Begin
+    troubled: bool = False
+    """Whether with these optics only what stands alone could be followed."""
+
+    def collect(self, rounds: Rounds) -> Collected | None:
+        """Follow the first frames with what was learned, and put frames on top of each other."""
+        near: Settings | None = None
+        if rounds.all:
+            last, number = rounds.all[-1], len(rounds.all)
+            lost = number == _ROUGH_ROUNDS and not last.described and rounds.best is None
+            done = last.described and rounds.settled
+            ahead = rounds.next if last.described else last.ahead
+            if number == ROUNDS or lost or done or ahead is None:
+                return None
+            self.begun, trouble = _first(ahead, self.begin)
+            self.troubled = trouble is not None
+            if self.troubled and rounds.best is not None:
+                return None
+            near = settings_of(self.begun.config) if self.described else None
+        aligned, context = self.begun.block.aligned, self.begun.context
+        shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
+        images = [aligned.sight(context, n) for n in shown] if aligned is not None else []
+        return Collected(self.start, images, near=near, found_with=self.begun.config)
+
+    def describes(self, seen: Collected) -> bool:
+        """Tell whether little is left over of the pictures of the tracks."""
+        return self.described and seen.found_with is self.begun.config
+
+    @property
+    def described(self) -> bool:
+        """Whether the optics describe the tracks that were followed last."""
+        return self.begun.described and not self.troubled
 
 
 def mass_error(summary: Mapping[str, Any]) -> float:
@@ -325,26 +321,3 @@ def _start(config: Config, cause: Cause | None) -> Config:
     most = min(config.optics.n_immersion, config.optics.n_glass)
     na = min(config.optics.na + cause.step, 0.5 * (config.optics.na + most))
     return config.model_copy(update={"optics": config.optics.model_copy(update={"na": na})})
-
-
-def _measured(
-    begun: Begun,
-    start: Config,
-    name: str,
-    pool: ThreadPoolExecutor,
-    *,
-    known: Settings | None = None,
-) -> OpticsCalibration:
-    """Measure the microscope from the pictures of tracks; `known` as in `measure_microscope`."""
-    aligned, context = begun.block.aligned, begun.context
-    shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
-    sights = [aligned.sight(context, n) for n in shown] if aligned is not None else []
-    source: Mapping[str, str] = {"movie": name}
-    if context.mode != "joint":
-        return calibrate_particle_images(
-            sights, (), start, tuple(FREE), source, known=known, mapper=pool.map
-        )
-    return learn_with_heights(
-        sights, (), start, tuple(FREE), source,
-        known=known or settings_of(start), around=known is None, mapper=pool.map,
-    )  # fmt: skip

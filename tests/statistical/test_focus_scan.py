@@ -8,12 +8,11 @@ from calibrations import configuration, make_sights
 from instruments import Instrument, focus_scan, strength_of_sphere
 
 import iscat_analysis as ia
-from iscat_analysis.instrument.learner import OpticsCalibration, settings_of
-from iscat_analysis.instrument.learner.estimate import optics_limits
-from iscat_analysis.instrument.learner.measure import measure_microscope
-from iscat_analysis.instrument.learner.starts import _strengths
 from iscat_analysis.instrument.learning import calibrate_movie
-from iscat_analysis.instrument.microscope import goodness
+from iscat_analysis.instrument.measure import OpticsSearch
+from iscat_analysis.instrument.parameters import optics_limits, settings_of
+from iscat_analysis.instrument.particle_image import best_amplitudes
+from iscat_analysis.instrument.result import OpticsCalibration
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0
@@ -101,11 +100,11 @@ def test_the_best_strength_of_a_strong_particle() -> None:
         2 * (tried * (data @ one) + tried**2 * (data @ two))
         - tried**2 * (one @ one) - 2 * tried**3 * (one @ two) - tried**4 * (two @ two)
     )  # fmt: skip
-    amplitude, gain = _strengths(data @ one, data @ two, one @ one, one @ two, two @ two)
+    amplitude, gain = best_amplitudes(data @ one, data @ two, one @ one, one @ two, two @ two)
     assert float(amplitude) == pytest.approx(tried[np.argmax(explained)], abs=1e-3)
     assert float(gain) == pytest.approx(explained.max(), rel=1e-6)
     # without the square it is a plain regression
-    amplitude, gain = _strengths(data @ one, 0.0, one @ one, 0.0, 0.0)
+    amplitude, gain = best_amplitudes(data @ one, 0.0, one @ one, 0.0, 0.0)
     assert float(amplitude) == pytest.approx((data @ one) / (one @ one))
     assert float(gain) == pytest.approx((data @ one) ** 2 / (one @ one))
 
@@ -118,16 +117,13 @@ def test_the_direction_of_linear_light_is_told(direction: float) -> None:
     config = configuration()
     changes = {"polarization_deg": direction, "focus_nm": -350.0}
     sights, _, build = make_sights(changes, 15, seed=int(direction))
-    found = measure_microscope(
-        sights,
+    found = OpticsSearch(
         settings_of(config),
         build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=("focus", "phase", "polarization"),
-        limits=optics_limits(1.515, 1.515),
+        ("focus", "phase", "polarization"),
+        optics_limits(1.515, 1.515),
         side=-1,
-        landing=1,
-    )
+    ).run(sights)
     assert not found.refusals
     assert found.settings["polarization"] == "linear"
     sigma = dict(

@@ -13,8 +13,9 @@ from scenes import Stack
 from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import load_config
-from iscat_analysis.instrument import crowded
-from iscat_analysis.instrument.learner import OpticsCalibration
+from iscat_analysis.instrument import sources
+from iscat_analysis.instrument.loop import learn
+from iscat_analysis.instrument.result import OpticsCalibration
 
 pytestmark = pytest.mark.large
 
@@ -56,7 +57,8 @@ def _learned(counts: np.ndarray, mode: str, focus_nm: float = -500.0) -> OpticsC
     camera = camera_from_config(config.camera, counts.shape[1:], counts.dtype)
     windows = measure_windows(Stack(counts), camera, (0, FRAMES), (FRAMES, 2 * FRAMES))
     with ThreadPoolExecutor(2) as pool:
-        return crowded.learn_in_field(windows, config, ("focus", "na"), {"movie": "movie"}, pool)
+        field = sources.WholeField(windows, config, pool)
+        return learn(field, config, ("focus", "na"), {"movie": "movie"}, pool.map).outcome
 
 
 @pytest.mark.parametrize("focus_nm", [-500.0, -400.0])
@@ -79,5 +81,5 @@ def test_particles_taken_for_ones_on_the_glass_teach_nothing(
     movie: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Control."""
-    monkeypatch.setattr(crowded, "ROUNDS", 1)
+    monkeypatch.setattr(sources, "ROUNDS", 1)
     assert not _learned(movie[0], "mass").accepted

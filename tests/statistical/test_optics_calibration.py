@@ -13,11 +13,12 @@ from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.learner import Measured, build_microscope, maximise, settings_of
-from iscat_analysis.instrument.learner.estimate import optics_limits
-from iscat_analysis.instrument.learner.measure import HELD_OUT_P, _Search, measure_microscope
-from iscat_analysis.instrument.learner.starts import average_particle_images
-from iscat_analysis.instrument.microscope import calibrate_particle_images, goodness
+from iscat_analysis.instrument.fit_optics import Collected, fit_optics
+from iscat_analysis.instrument.joint_fit import maximise
+from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, OpticsSearch
+from iscat_analysis.instrument.microscope import build_microscope
+from iscat_analysis.instrument.parameters import optics_limits, settings_of
+from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
 
@@ -38,15 +39,8 @@ def _measure(
 ) -> Measured:
     config = configuration() if config is None else config
     sights, _, build = make_sights(changes, count, seed=seed, config=config, **light)
-    return measure_microscope(
-        sights,
-        settings_of(config),
-        build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=free,
-        limits=optics_limits(1.515, 1.515),
-        side=-1,
-        landing=1,
+    return OpticsSearch(settings_of(config), build, free, optics_limits(1.515, 1.515), side=-1).run(
+        sights
     )
 
 
@@ -69,11 +63,9 @@ def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None
 
     _, placed = average_particle_images(sights)
     assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
-    found = measure_microscope(
-        sights, settings_of(config), build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=ROUND, limits=optics_limits(1.515, 1.515), side=-1, landing=1,
-    )  # fmt: skip
+    found = OpticsSearch(
+        settings_of(config), build, ROUND, optics_limits(1.515, 1.515), side=-1
+    ).run(sights)  # fmt: skip
     assert len(found.estimate.sights) >= 6
 
 
@@ -122,6 +114,22 @@ def test_what_may_not_change_is_missed() -> None:
     assert "not fitted" in found.refusals[0]
 
 
+def test_optics_that_make_other_pictures_worse_are_refused() -> None:
+    """Two thirds of the pictures are of another focus; control: they all are of that."""
+    sights, _, build = make_sights({"focus_nm": -340.0}, 18, seed=21)
+    of_configured, _, _ = make_sights({}, 18, seed=21)
+    order = sorted(range(18), key=lambda k: -sights[k].snr)
+    mixed = [
+        replace((of_configured if rank % 3 == 1 else sights)[k], snr=100.0 - rank)
+        for rank, k in enumerate(order)
+    ]
+    configured, limits = settings_of(configuration()), optics_limits(1.515, 1.515)
+    for pictures, refused in ((mixed, True), (sights, False)):
+        found = OpticsSearch(configured, build, ("focus",), limits, side=-1).run(pictures)
+        worse = "the configured optics describe pictures that were not fitted better"
+        assert (worse in found.refusals) == refused
+
+
 def test_weak_particles_below_the_critical_angle_have_a_twin() -> None:
     config = configuration(na=1.2)
     changes = {"z5": 8.0, "focus_nm": -350.0, "reference_phase_deg": 20.0}
@@ -140,28 +148,25 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
 def test_too_few_particles_are_refused_with_what_to_record() -> None:
     sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        calibrate_particle_images(sights, (), configuration(), ROUND, {"movie": "faint.tif"})
+        fit_optics(Collected(configuration(), sights), ROUND, {"movie": "faint.tif"})
 
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
     config = configuration()
     sights, _, build = make_sights({"na": 1.33}, 15, seed=19)
-    found = measure_microscope(
-        sights,
+    found = OpticsSearch(
         settings_of(config),
         build,
-        lambda sight, settings: goodness(sight, build(settings)),
-        free=("focus", "na", "phase"),
-        limits={**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
+        ("focus", "na", "phase"),
+        {**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
         side=-1,
-        landing=1,
-    )
+    ).run(sights)
     assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
 
 
 def test_a_wrong_pixel_size_is_suspected() -> None:
     """Pixels that are said to be 6 % larger than they are look like a smaller aperture."""
-    from iscat_analysis.instrument.learner import OpticsCalibration
+    from iscat_analysis.instrument.result import OpticsCalibration
 
     said, factor = configuration(), 1.06
     pixel = said.camera.pixel_size_nm
@@ -179,12 +184,12 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
         )
         for s in sights
     ]
-    found = calibrate_particle_images(stretched, (), larger, ROUND, {"movie": "m.tif"})
+    found = fit_optics(Collected(larger, stretched), ROUND, {"movie": "m.tif"})
     assert isinstance(found, OpticsCalibration)
     (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
     guess = float(note.partition("pixels of about ")[2].split()[0])
     assert guess == pytest.approx(pixel, rel=0.02)
-    fine = calibrate_particle_images(sights, (), said, ROUND, {"movie": "m.tif"})
+    fine = fit_optics(Collected(said, sights), ROUND, {"movie": "m.tif"})
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 
@@ -194,7 +199,7 @@ def test_what_the_pictures_do_not_tell_is_held() -> None:
     configured = settings_of(configuration())
     names = ("focus_nm", "na", "reference_phase_deg", "z11")
     rough = maximise(truth, build, configured, names, passes=1)
-    search = _Search(configured, build, _never, ROUND, {}, -1, 1, map)
+    search = OpticsSearch(configured, build, ROUND, {}, side=-1)
     found, held = search._identified(rough)
     assert held
     for name in held:
@@ -202,7 +207,3 @@ def test_what_the_pictures_do_not_tell_is_held() -> None:
         assert name not in found.names
     bright = maximise(make_sights({}, 14, seed=18)[1], build, configured, names, passes=1)
     assert not search._identified(bright)[1]
-
-
-def _never(_sight: Any, _settings: Any) -> tuple[float, float]:
-    raise AssertionError

@@ -11,8 +11,7 @@ from skimage.registration import phase_cross_correlation
 
 from iscat_analysis.camera.drift import measure_drift
 from iscat_analysis.inference.noise_models import CONDITIONAL
-from iscat_analysis.instrument.learner.particle_images import ParticleImage
-from iscat_analysis.instrument.learner.starts import average_particle_images
+from iscat_analysis.instrument.particle_image import ParticleImage, average_particle_images
 from iscat_analysis.optics.forward import PixelGrid
 
 FloatArray = NDArray[np.float64]

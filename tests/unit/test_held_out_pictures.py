@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from iscat_analysis.inference.noise_models import POISSON
-from iscat_analysis.instrument.learner.estimate import Estimate
-from iscat_analysis.instrument.learner.measure import _Search
-from iscat_analysis.instrument.learner.particle_images import ParticleImage, Settings
+from iscat_analysis.instrument.joint_fit import Estimate
+from iscat_analysis.instrument.measure import OpticsSearch
+from iscat_analysis.instrument.parameters import Settings
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
 
 HEIGHTS_NM = (0.0, 1000.0)
@@ -30,7 +31,7 @@ def _estimate(sights: Sequence[ParticleImage], values: Settings) -> Estimate:
     )
 
 
-class _Moving(_Search):
+class _Moving(OpticsSearch):
     """Every fit of optics moves all heights by a fringe."""
 
     def _fit(
@@ -45,9 +46,9 @@ class _Moving(_Search):
         return _estimate(moved, start)
 
 
-def _search(kind: type[_Search] = _Search) -> _Search:
+def _search(kind: type[OpticsSearch] = OpticsSearch) -> OpticsSearch:
     values: dict[str, Any] = {"reference_phase_deg": 0.0, "polarization": "linear", "mask_na": 0.0}
-    return kind(values, lambda _: None, lambda *_: (1.0, 0.5), ("phase",), {}, 0, 1)  # type: ignore[arg-type, return-value]
+    return kind(values, lambda _: None, ("phase",), {})  # type: ignore[arg-type, return-value]
 
 
 @pytest.mark.parametrize(("mass", "phase"), [(-400.0, 173.0), (400.0, -7.0)])

@@ -20,9 +20,9 @@ from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument import learning
-from iscat_analysis.instrument.learner import ParticleImage
 from iscat_analysis.instrument.learning import LEAST_TESTED, learn_optics
-from iscat_analysis.instrument.tested_optics import REJECTED_P, median_p
+from iscat_analysis.instrument.microscope import REJECTED_P, median_p
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 
 MOVIE: Any = SimpleNamespace(name="movie.tif", shape=(1000, 64, 64))

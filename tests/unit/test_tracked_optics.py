@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,10 +16,12 @@ from wanderers import SETTINGS, Wanderers, wander
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.instrument.learner.estimate import _excess
-from iscat_analysis.instrument.learner.settings import settings_of, with_settings
-from iscat_analysis.tracking import tracked_optics
-from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.instrument import loop
+from iscat_analysis.instrument.fit_optics import Collected
+from iscat_analysis.instrument.joint_fit import _excess
+from iscat_analysis.instrument.loop import Round, Rounds
+from iscat_analysis.instrument.parameters import settings_of, with_settings
+from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.tracking.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,
@@ -142,12 +144,10 @@ def test_what_pictures_of_one_owner_share_counts() -> None:
     assert _excess(scatter, scores, owners) == pytest.approx((4 + 16) / 8, abs=2.5 * room)
 
 
-@dataclass(frozen=True)
-class _Learned:
-    """As much of a calibration as rounds look at."""
-
-    names: tuple[str, ...]
-    covariance: np.ndarray
+def _learned(names: tuple[str, ...], covariance: np.ndarray) -> OpticsCalibration:
+    """Give as much of a calibration as rounds look at."""
+    found: Any = SimpleNamespace(names=names, covariance=covariance)
+    return cast(OpticsCalibration, found)
 
 
 def _rounds(shares: tuple[float, float], count: int) -> Rounds:
@@ -155,16 +155,17 @@ def _rounds(shares: tuple[float, float], count: int) -> Rounds:
     names = ("focus_nm", "reference_phase_deg")
     error, rounds = np.array([30.0, 9.0]), Rounds()
     wrong = {"focus_nm": -300.0 + error[0], "reference_phase_deg": error[1]}
-    config = Config.model_validate({"optics": wrong})
+    config: Config | None = Config.model_validate({"optics": wrong})
     for _ in range(count):
+        assert config is not None
         values = settings_of(config)
         error = np.array(shares) * np.array(
             [values["focus_nm"] + 300.0, values["reference_phase_deg"]]
         )
         values["focus_nm"], values["reference_phase_deg"] = -300.0 + error[0], error[1]
         after = with_settings(config, values)
-        found = _Learned(names, np.diag([0.4, 0.2]) ** 2)
-        rounds = rounds.with_one(Round(config, after, found))  # type: ignore[arg-type]
+        found = _learned(names, np.diag([0.4, 0.2]) ** 2)
+        rounds = rounds.with_one(Round(Collected(config, ()), True, found, after, after, ""))
         config = rounds.next
     return rounds
 
@@ -175,11 +176,11 @@ def test_rounds_go_on_until_little_is_to_come() -> None:
     assert 3 <= counts[0] <= 8
     rounds = _rounds(shares, counts[0])
     last = rounds.all[-1]
-    wrong = np.array([last.after.optics.focus_nm + 300, last.after.optics.reference_phase_deg])
+    wrong = np.array([last.after["focus_nm"] + 300, last.after["reference_phase_deg"]])
     assert np.abs(wrong / [0.4, 0.2]).max() < 1.5
     # of an early round the error is what came after it
     early = rounds.all[0]
-    was = np.array([early.after.optics.focus_nm + 300, early.after.optics.reference_phase_deg])
+    was = np.array([early.after["focus_nm"] + 300, early.after["reference_phase_deg"]])
     assert rounds.error_of(early) == pytest.approx(-was, abs=0.6)
 
 
@@ -201,26 +202,28 @@ def test_rounds_end_where_the_first_four_describe_nothing(
     described_from: int | None, rounds: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tracks followed with optics of every round are described from one of them on, or never."""
-    measured: list[float] = []
+    seen: list[float] = []
     told: list[str] = []
 
     def begin(config: Config, **_: bool) -> Any:
-        described = described_from is not None and len(measured) % rounds >= described_from
+        described = described_from is not None and len(seen) % rounds >= described_from
         left = LeftOver(share=0.0 if described else 0.2, clear=True, tracks=3)
-        block = SimpleNamespace(noise_differs=False)
-        return SimpleNamespace(config=config, block=block, left=left, described=described)
+        block = SimpleNamespace(noise_differs=False, aligned=None)
+        return SimpleNamespace(
+            config=config, block=block, left=left, described=described, context=None
+        )
 
-    def measure(*_: Any, **__: Any) -> Any:
-        measured.append(-300.0 + 50 * len(measured))
-        settings = SimpleNamespace(settings={"focus_nm": measured[-1]})
-        return SimpleNamespace(names=("focus_nm",), covariance=np.eye(1), measured=settings)
+    def fit(*_: Any, **__: Any) -> Any:
+        seen.append(-300.0 + 50 * len(seen))
+        measured = SimpleNamespace(settings={"focus_nm": seen[-1]}, refusals=["not yet"])
+        return SimpleNamespace(
+            names=("focus_nm",), covariance=np.eye(1), measured=measured, accepted=False
+        )
 
-    monkeypatch.setattr(tracked_optics, "_cause", lambda _: None)
-    monkeypatch.setattr(tracked_optics, "_measured", measure)
-    monkeypatch.setattr(tracked_optics, "usable", lambda *_: (None, "not yet"))
+    monkeypatch.setattr(loop, "fit_optics", fit)
     with ThreadPoolExecutor(1) as pool:
         config = Config.model_validate({"optics": {"calibrate": "auto"}})
         _, summary = learn_from_tracks(config, begin, name="m", pool=pool, warn=told.append)
-    assert len(measured) == 2 * rounds  # of all particles, and of those that stand alone
+    assert len(seen) == 2 * rounds  # of all particles, and of those that stand alone
     assert not summary["calibrated"]
     assert "other optics were not learned: not yet" in told[0]

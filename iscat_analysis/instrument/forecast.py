@@ -24,10 +24,16 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.learner.estimate import prior_range
-from iscat_analysis.instrument.learner.measure import FAINTEST, LEAST_SIGHTS, MOST_SIGHTS
-from iscat_analysis.instrument.learner.null_directions import Hidden, find_hidden
-from iscat_analysis.instrument.learner.settings import FREE, exists, free_groups, settings_of
+from iscat_analysis.instrument.measure import FAINTEST, LEAST_SIGHTS, MOST_SIGHTS
+from iscat_analysis.instrument.parameters import (
+    FREE,
+    Hidden,
+    exists,
+    find_hidden,
+    free_groups,
+    prior_range,
+    settings_of,
+)
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray

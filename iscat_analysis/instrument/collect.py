@@ -30,15 +30,10 @@ from iscat_analysis.instrument.bright import (
     find_bright_places,
     find_bright_steps,
 )
-from iscat_analysis.instrument.learner import (
-    FAINTEST,
-    MOST_SIGHTS,
-    PRIVATE,
-    ParticleImage,
-    build_microscope,
-    heights_free,
-    settings_of,
-)
+from iscat_analysis.instrument.measure import FAINTEST, MOST_SIGHTS
+from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
+from iscat_analysis.instrument.parameters import heights_free, settings_of
+from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
@@ -46,9 +41,6 @@ from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.sliding import stride_of
 from iscat_analysis.search.sliding.chunks import Reader, plan_chunks, reader_of
 from iscat_analysis.threads import over_frames
-
-RINGS_NM = 9000.0
-"""Farther than this from a particle its rings are left out."""
 
 APART_NM = 2000.0
 """Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
@@ -59,15 +51,11 @@ OTHERS_NM = 1700.0
 SAME_NM = 800.0
 """Nearer than this, and at the same time, two steps are one."""
 
-TESTED = 24
-"""Particles on which optics are tested, the brightest."""
-
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 _STANDS_OUT = 5.0
 """Times the median signal-to-noise ratio of the bright particles from which one is no standard."""
 
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
-_SHIFT_NM = 450.0  # how far a particle may lie from the centre of its picture
 
 
 def bright_particle_images(
@@ -400,8 +388,3 @@ def _spot_px(config: Config) -> float:
 def _region(row: int, column: int, side: int) -> tuple[tuple[int, int], tuple[int, int]]:
     first, left = row - side // 2, column - side // 2
     return (first, first + side), (left, left + side)
-
-
-def reach_nm(sight: ParticleImage) -> float:
-    """Distance from a particle, which may move in its picture, to the farthest pixel."""
-    return sight.grid.diagonal_nm / 2 + _SHIFT_NM

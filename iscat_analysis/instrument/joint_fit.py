@@ -17,61 +17,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.likelihood import LEVEL
-from iscat_analysis.instrument.learner.particle_images import (
-    FIELD,
-    FOCUS_DRIFT,
-    FOCUS_STEP,
+from iscat_analysis.instrument.parameters import (
+    MASK_NA,
+    PARAMETERS,
+    Settings,
+    prior_range,
+)
+from iscat_analysis.instrument.particle_image import (
     PRIVATE,
     ROAM_NM,
     Build,
     Microscope,
     ParticleImage,
-    Settings,
+    models_of,
+    with_masses,
 )
-from iscat_analysis.optics.field_map import Spot
 from iscat_analysis.records import FloatArray, Mapper
 
-PRIOR_RANGE = {
-    **{name: 180.0 for name in FIELD if name.endswith("_deg")},
-    **{name: 1000.0 for name in FIELD if name.startswith("focus_")},
-    "focus_nm": 1000.0,
-    "na": 0.05,
-    "reference_phase_deg": 180.0,
-    "mask_na": 0.3,
-    "attenuation": 0.5,
-    "polarization_deg": 90.0,
-    FOCUS_STEP: 50.0,
-    FOCUS_DRIFT: 1000.0,
-}
-"""How far a parameter may plausibly lie from the configured one; what the data leave wider than
-this, they do not tell."""
-
-TERM_RANGE_NM = 100.0
-"""The same for every aberration [nm]."""
-
-_LARGEST_STEP = {
-    **{name: 40.0 for name in FIELD if name.endswith("_deg")},
-    **{name: 120.0 for name in FIELD if name.startswith("focus_")},
-    "focus_nm": 120.0,
-    "na": 0.02,
-    "reference_phase_deg": 40.0,
-    "mask_na": 0.1,
-    "attenuation": 0.1,
-    "polarization_deg": 30.0,
-    FOCUS_STEP: 2.0,
-    FOCUS_DRIFT: 100.0,
-}
-_TERM_STEP_NM = 25.0
 _PLACE_STEP_NM = 60.0
 _HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
 _LEVEL_STEP = 0.5
 _Z = 2  # of what is a sight's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
-_LOWEST_NA = 0.3
-_NA_ROOM = 2e-3  # below the index of the oil
 _FLAT = 1e-10  # share of the largest eigenvalue below which a direction is not determined
 _TOGETHER = 5  # sights of one task; a millisecond each
-_MASK_NA = 0.02  # smallest mask, and the narrowest ring around it
 
 
 @dataclass(frozen=True)
@@ -103,11 +72,6 @@ class Estimate:
         H. White, Econometrica 50, 1 (1982): right where the noise is not quite that of the model.
         """
         return np.asarray(self.bound @ self.scatter @ self.bound)
-
-
-def prior_range(name: str) -> float:
-    """Give the plausible distance of a parameter from the configured value."""
-    return PRIOR_RANGE.get(name, TERM_RANGE_NM)
 
 
 def maximise(
@@ -213,18 +177,8 @@ def _limited(
         low, high = limits.get(name, (-math.inf, math.inf))
         out[name] = float(min(max(values[name] + move, low), high))
     if "mask_na" in names:
-        out["mask_na"] = min(out["mask_na"], out["na"] - _MASK_NA)
+        out["mask_na"] = min(out["mask_na"], out["na"] - MASK_NA)
     return out
-
-
-def optics_limits(n_immersion: float, n_glass: float) -> dict[str, tuple[float, float]]:
-    """Bounds of the parameters of a microscope that can exist."""
-    top = min(n_immersion, n_glass) - _NA_ROOM
-    return {
-        "na": (_LOWEST_NA, top),
-        "mask_na": (_MASK_NA, top - _MASK_NA),
-        "attenuation": (0.005, 1.0),
-    }
 
 
 @dataclass(frozen=True)
@@ -248,16 +202,14 @@ class _Point:
         mapper: Mapper,
     ) -> _Point:
         """Evaluate all sights; an unknown that its wall stops counts as known."""
-        models: dict[Spot, Microscope] = {}
-        for sight in sights:
-            if sight.spot not in models:
-                models[sight.spot] = build(sight.seen_with(values))
+        models = models_of(sights, build, values)
 
         def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
+            these = slice(first, first + _TOGETHER)
             return [
-                _scores(sight, models[sight.spot], names, own)
-                for sight, own in zip(
-                    sights[first : first + _TOGETHER], private[first:], strict=False
+                _scores(sight, model, names, own)
+                for sight, model, own in zip(
+                    sights[these], models[these], private[these], strict=True
                 )
             ]
 
@@ -319,7 +271,7 @@ class _Point:
         k = len(names)
         information, score, inverse = self.reduced(damping)
         shared = _solve(information, score, names, damping)
-        largest = np.array([_LARGEST_STEP.get(name, _TERM_STEP_NM) for name in names])
+        largest = np.array([PARAMETERS[name].largest_step for name in names])
         if k:
             shared = shared / max(1.0, float(np.max(np.abs(shared) / largest)))
         rest = self.score[:, k:] - np.einsum("eij,i->ej", self.fisher[:, :k, k:], shared)
@@ -370,8 +322,8 @@ def _scores(
     x, y, z, mass, level = (float(v) for v in private)
     place = (sight.grid, x, y, z, mass)
     k = len(names)
+    wanted = tuple(dict.fromkeys(base for name in names for base in sight.slopes(name)))
     if names:
-        wanted = tuple(dict.fromkeys(base for n in names for base in sight.slopes(n)))
         signal, own, slopes = model.joint_gradient(*place, wanted)
     else:
         signal, own = model.gradient(*place)
@@ -388,3 +340,59 @@ def _scores(
     weighted = rows * weight.ravel()
     scored = rows * residual.ravel()
     return value + sight.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
+
+
+_NEIGHBOUR_PASSES = 6
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Particles with the rings that they make in one microscope."""
+
+    particles: tuple[ParticleImage, ...]
+    wide: Microscope
+
+    @classmethod
+    def fitted(
+        cls,
+        others: Sequence[ParticleImage],
+        build: Build,
+        build_wide: Build,
+        settings: Settings,
+        mapper: Mapper = map,
+    ) -> Neighbours:
+        """Fit them, and once more among each other's rings."""
+
+        def own(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, ...]:
+            return maximise(
+                sights, build, settings, (), passes=_NEIGHBOUR_PASSES, mapper=mapper
+            ).sights
+
+        first = cls(own(with_masses(others, build, settings)), build_wide(settings))
+        return cls(own(first.around(first.particles, mapper)), first.wide)
+
+    def around(
+        self, sights: Sequence[ParticleImage], mapper: Mapper = map
+    ) -> tuple[ParticleImage, ...]:
+        """Put their rings into what is expected of pictures.
+
+        Every particle is drawn into all pictures at once: its field at its height takes longest.
+        """
+        reached: list[list[tuple[int, float]]] = [[] for _ in self.particles]
+        for index, sight in enumerate(sights):
+            for number, share in sight.neighbours:
+                reached[number].append((index, share))
+
+        def drawn(number: int) -> list[tuple[int, FloatArray]]:
+            other = self.particles[number]
+            place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
+            return [
+                (index, share * self.wide.image(sights[index].grid, *place))
+                for index, share in reached[number]
+            ]
+
+        rings = [np.zeros(sight.grid.shape) for sight in sights]
+        for images in mapper(drawn, range(len(self.particles))):
+            for index, image in images:
+                rings[index] += image
+        return tuple(sight.among(ring) for sight, ring in zip(sights, rings, strict=True))

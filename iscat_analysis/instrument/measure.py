@@ -14,26 +14,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.instrument.learner.estimate import Estimate, maximise
-from iscat_analysis.instrument.learner.neighbours import Neighbours
-from iscat_analysis.instrument.learner.null_directions import find_hidden
-from iscat_analysis.instrument.learner.particle_images import (
-    FIELD,
-    RISES,
-    Build,
-    ParticleImage,
-    Settings,
-)
-from iscat_analysis.instrument.learner.settings import (
+from iscat_analysis.instrument.joint_fit import Estimate, Neighbours, maximise
+from iscat_analysis.instrument.microscope import goodness
+from iscat_analysis.instrument.parameters import (
     FREE,
     HIGHER,
+    PARAMETERS,
     PRIMARY,
     SECONDARY,
+    Settings,
+    find_hidden,
     free_names,
     is_term,
 )
-from iscat_analysis.instrument.learner.starts import average_particle_images, with_masses
-from iscat_analysis.instrument.learner.states import StateSearch, same_state
+from iscat_analysis.instrument.particle_image import (
+    Build,
+    ParticleImage,
+    average_particle_images,
+    with_masses,
+)
+from iscat_analysis.instrument.starts import StateSearch, same_state
+from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.threads import one_thread_algebra
 
@@ -52,6 +53,10 @@ HELD_OUT = 3
 TWIN_GAP = math.log(1000.0)
 """Log-likelihood by which a twin must be worse to be ruled out: odds of 1000."""
 
+WORSE_GAP = 20.0
+"""Log-likelihood by which the configured optics may describe pictures that were not fitted better:
+the noise of the fitted parameters costs less."""
+
 HELD_OUT_P = 1e-3
 """Below this chance the p-values of pictures that were not fitted are not uniform."""
 
@@ -65,9 +70,6 @@ _CONTAMINATED_SHARE = 0.25  # more than this is the model's fault
 _TRIAL_PASSES = 12  # of a second microscope on all pictures
 _TWIN_PASSES = 4  # after which a twin is far nearer than _CLOSE
 _CLOSE = 0.01  # states whose average is explained this much worse are tried on all pictures
-
-Judge = Callable[[ParticleImage, Settings], tuple[float, float]]
-"""Goodness of fit of a sight in a microscope: reduced χ² and p-value."""
 
 
 @dataclass(frozen=True)
@@ -110,38 +112,20 @@ class Measured:
 
 
 def judge(
-    sights: Sequence[ParticleImage], settings: Settings, judge_one: Judge, mapper: Mapper = map
+    sights: Sequence[ParticleImage],
+    build: Callable[[Settings], ForwardModel],
+    settings: Settings,
+    mapper: Mapper = map,
 ) -> Judgement:
     """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
 
-    found = np.array(list(mapper(lambda sight: judge_one(sight, settings), sights)))
+    def one(sight: ParticleImage) -> tuple[float, float]:
+        return goodness(sight, build(sight.seen_with(settings)))
+
+    found = np.array(list(mapper(one, sights)))
     p_values = found[:, 1]
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
-
-
-@one_thread_algebra()
-def measure_microscope(
-    sights: Sequence[ParticleImage],
-    configured: Settings,
-    build: Build,
-    judge_one: Judge,
-    *,
-    free: Sequence[str],
-    limits: Mapping[str, tuple[float, float]],
-    side: int = 0,
-    landing: int = 0,
-    others: Sequence[ParticleImage] = (),
-    build_wide: Build | None = None,
-    known: Settings | None = None,
-    mapper: Mapper = map,
-) -> Measured:
-    """Measure the microscope from pictures of particles."""
-    search = _Search(
-        configured, build, judge_one, tuple(free), limits, side, landing, mapper,
-        tuple(others), build_wide, known,
-    )  # fmt: skip
-    return search.run(sorted(sights, key=lambda sight: -sight.snr))
 
 
 def fitted_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
@@ -155,22 +139,33 @@ def held_out_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
 
 
 @dataclass
-class _Search:
-    """One measurement of the microscope; its steps in order of `run`."""
+class OpticsSearch:
+    """One measurement of the microscope from pictures of particles; its steps in order of `run`."""
 
     configured: Settings
-    build: Build
-    judge_one: Judge
-    free: tuple[str, ...]
-    limits: Mapping[str, tuple[float, float]]
-    side: int
-    landing: int
-    mapper: Mapper = map
-    others: tuple[ParticleImage, ...] = ()
-    build_wide: Build | None = None
-    known: Settings | None = None
+    build: Callable[[Settings], ForwardModel]
+    free: Sequence[str]
+    """Groups of parameters."""
 
+    limits: Mapping[str, tuple[float, float]]
+    side: int = 0
+    """Sign of the focus, where the configuration tells it."""
+
+    others: Sequence[ParticleImage] = ()
+    """Particles whose rings are in the pictures."""
+
+    build_wide: Build | None = None
+    """Makes microscopes whose pictures reach as far as rings do."""
+
+    known: Settings | None = None
+    """A microscope that is near."""
+
+    mapper: Mapper = map
+
+    @one_thread_algebra()
     def run(self, sights: Sequence[ParticleImage]) -> Measured:
+        """Measure the microscope, the brightest pictures first."""
+        sights = sorted(sights, key=lambda sight: -sight.snr)
         if self.known is None:
             best, held_out = self._best_state(*average_particle_images(sights))
         else:
@@ -185,14 +180,14 @@ class _Search:
         best, twin = self._twin(best)
         best, held_out = self._cleared(best, held_out)
         best, held_out = self._signed(best, held_out)
-        held_out = self._own(held_out, best.values)
-        judgement = judge(held_out, best.values, self.judge_one, self.mapper)
-        nominal = with_masses(held_out, self.build, self.configured)
-        configured = judge(
-            self._own(nominal, self.configured), self.configured, self.judge_one, self.mapper
-        )
+        judged = self._fit(held_out, best.values, ())
+        held_out = judged.sights
+        judgement = judge(held_out, self.build, best.values, self.mapper)
+        nominal = self._fit(with_masses(held_out, self.build, self.configured), self.configured, ())
+        configured = judge(nominal.sights, self.build, self.configured, self.mapper)
+        worse = nominal.log_likelihood - judged.log_likelihood > WORSE_GAP
         final = self._fit((*best.sights, *held_out), best.values, best.names)
-        refusals = self._refusals(final, judgement, twin)
+        refusals = self._refusals(final, judgement, twin, worse=worse)
         return Measured(
             settings=final.values, estimate=final, held=held, dropped=dropped,
             undecided=undecided, judgement=judgement, configured=configured, held_out=held_out,
@@ -292,7 +287,7 @@ class _Search:
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Leave out the few pictures in which something else happened, if the others are fine."""
         good = [
-            judge(sights, best.values, self.judge_one, self.mapper).p_values > CONTAMINATED_P
+            judge(sights, self.build, best.values, self.mapper).p_values > CONTAMINATED_P
             for sights in (best.sights, held_out)
         ]
         bad = sum(int(np.sum(~g)) for g in good)
@@ -339,14 +334,11 @@ class _Search:
         if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
             return best, None
         z = best.sights[0].z_nm
-        mirrored = dict(best.values)
+        mirrored = {
+            **best.values,
+            **{n: PARAMETERS[n].mirrored * best.values[n] for n in best.names},
+        }
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
-        mirrored["reference_phase_deg"] = -best.values["reference_phase_deg"]
-        reversed_too = [n for n in (*RISES, *FIELD) if n in best.names and n != "coma_field_nm"]
-        mirrored |= {name: -best.values[name] for name in reversed_too}
-        for name in best.names:
-            if is_term(name) and name not in ("z7", "z8", "z9", "z10"):
-                mirrored[name] = -best.values[name]
         turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
         other = self._fit(turned, mirrored, best.names, _TWIN_PASSES)
         if best.log_likelihood - other.log_likelihood > _CLOSE * best.log_likelihood:
@@ -370,8 +362,8 @@ class _Search:
             return best, tuple(held_out)
         masses = np.array([s.mass_kda for s in best.sights])
         phase = best.values["reference_phase_deg"]
-        if self.landing and abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):
-            flip = np.sign(masses).sum() * self.landing < 0
+        if abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):  # nearly all of them land
+            flip = np.sign(masses).sum() < 0
         else:
             flip = math.cos(math.radians(phase - self.configured["reference_phase_deg"])) < 0
         phase = (phase + 180 * flip + 180) % 360 - 180
@@ -384,8 +376,9 @@ class _Search:
         return replace(best, values=values, sights=turned), judged
 
     def _refusals(
-        self, final: Estimate, judgement: Judgement, twin: Twin | None
+        self, final: Estimate, judgement: Judgement, twin: Twin | None, *, worse: bool
     ) -> tuple[str, ...]:
+        """Say why the microscope may not be used."""
         reasons = []
         if not final.names:
             reasons.append("the pictures determine none of the parameters")
@@ -401,6 +394,8 @@ class _Search:
                 f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
                 f"{float(np.mean(judgement.chi2_reduced)):.3f})"
             )
+        if worse:
+            reasons.append("the configured optics describe pictures that were not fitted better")
         if twin is not None and not self.side:
             reasons.append(
                 "a focus on the other side explains the pictures as well, and optics.focus_nm does "

@@ -1,8 +1,11 @@
-"""Which kind of microscope, on the average picture: polarisation, mask or none, side of focus.
+"""Where the search for the microscope begins: every focus, on the average of all pictures.
 
-Every kind is tried over all foci, in a pupil without aberrations; the most promising starts are
-refined with the aberrations that a pupil usually has.  A mask hides well behind them: it is looked
-for a second time in the refined pupils, where only its edge and its transmission are missing.
+The pictures are registered on each other, with the sign of each, and averaged; no model takes part
+in that.  For one focus the contrast of a weak particle is linear in the cosine and the sine of the
+reference phase, so that the phase and the amplitude that fit the average best follow from a 2 × 2
+system at every shift of the picture.  Of a strong particle one sees the scattered light itself as
+well, with the square of the amplitude: the best amplitude is then the root of a cubic equation for
+every phase.
 """
 
 from __future__ import annotations
@@ -12,17 +15,151 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from iscat_analysis.instrument.learner.estimate import Estimate, maximise
-from iscat_analysis.instrument.learner.particle_images import Build, ParticleImage, Settings
-from iscat_analysis.instrument.learner.settings import PRIMARY, SECONDARY, free_names
-from iscat_analysis.instrument.learner.starts import (
-    FOCUS_RANGE_NM,
-    FOCUS_STEP_NM,
-    Start,
-    search_starts,
-    turned_starts,
+import numpy as np
+from scipy import fft
+
+from iscat_analysis.instrument.joint_fit import Estimate, maximise
+from iscat_analysis.instrument.parameters import PRIMARY, SECONDARY, Settings, free_names
+from iscat_analysis.instrument.particle_image import (
+    FARTHEST_CENTRE_PX,
+    UNIT_KDA,
+    Build,
+    ParticleImage,
+    best_amplitudes,
+    contrast_of,
 )
-from iscat_analysis.records import Mapper
+from iscat_analysis.records import FloatArray, Mapper
+
+FOCUS_RANGE_NM = 1000.0
+"""How far from the configured focus the search goes."""
+
+FOCUS_STEP_NM = 80.0
+"""Step of the search over focus; a quarter of the depth of field at NA 1.2."""
+_TURNS = 24  # of half a circle of phases, for strong particles
+_FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
+_DIRECTIONS_DEG = (45.0, 90.0, 135.0)
+
+
+@dataclass(frozen=True)
+class Start:
+    """A microscope that resembles the average picture."""
+
+    values: Mapping[str, Any]
+    x_nm: float
+    y_nm: float
+    mass_kda: float
+    explained: float
+
+
+def _quadratures(model: Any, sight: ParticleImage) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Contrast per mass at reference phases 0 and 90°, and scattered light per squared mass.
+
+    The particle is in the centre.
+    """
+    pixels = model.pixels(sight.grid)
+    along, power = np.zeros(sight.grid.shape, complex), np.zeros(sight.grid.shape)
+    for down, high in zip(pixels.offsets, pixels.weights, strict=True):
+        for right, wide in zip(pixels.offsets, pixels.weights, strict=True):
+            dx, dy = np.meshgrid(pixels.x + right, pixels.y + down)
+            field = model.field(dx, dy, sight.z_nm, UNIT_KDA) / UNIT_KDA
+            along += wide * high * field[0]
+            power += wide * high * np.sum(np.abs(field) ** 2, axis=0)
+    return 2 * along.real, 2 * along.imag, power
+
+
+def search_starts(
+    averages: Sequence[ParticleImage],
+    build: Build,
+    candidates: Sequence[Mapping[str, Any]],
+    *,
+    most: int,
+) -> tuple[Start, ...]:
+    """Rank microscopes by how much of the average pictures they explain."""
+    pixel, shape = averages[0].grid.pixel_nm, averages[0].grid.shape
+    spectra = []
+    for average in averages:
+        contrast, variance = contrast_of(average)
+        spectra.append((fft.rfft2(contrast), float(np.median(variance))))
+    reach = math.ceil(FARTHEST_CENTRE_PX / 2)
+    here = np.arange(-reach, reach + 1)
+    found = []
+    for values in candidates:
+        gram, overlaps = np.zeros((3, 3)), np.zeros((3, here.size, here.size))
+        for average, (spectrum, noise) in zip(averages, spectra, strict=True):
+            model = build({**average.seen_with(values), "reference_phase_deg": 0.0})
+            pictures = [picture - picture.mean() for picture in _quadratures(model, average)]
+            gram += np.einsum("iyx,jyx->ij", pictures, pictures) / noise
+            for k, picture in enumerate(pictures):
+                match = fft.irfft2(spectrum * np.conj(fft.rfft2(picture)), s=shape)
+                overlaps[k] += match[np.ix_(here, here)] / noise
+        amplitude, phase, explained = _best_phase(gram, overlaps)
+        row, column = np.unravel_index(int(np.argmax(explained)), explained.shape)
+        found.append(
+            Start(
+                {**values, "reference_phase_deg": math.degrees(phase[row, column])},
+                x_nm=float(here[column]) * pixel,
+                y_nm=float(here[row]) * pixel,
+                mass_kda=float(amplitude[row, column]),
+                explained=float(explained[row, column]),
+            )
+        )
+    found.sort(key=lambda start: -start.explained)
+    kept: list[Start] = []
+    for start in found:
+        near = any(
+            abs(start.values["focus_nm"] - other.values["focus_nm"]) < 1.5 * FOCUS_STEP_NM
+            and all(start.values.get(k) == other.values.get(k) for k in ("polarization", "mask_na"))
+            for other in kept
+        )
+        if not near:
+            kept.append(start)
+        if len(kept) == most:
+            break
+    return tuple(kept)
+
+
+def _best_phase(
+    gram: FloatArray, overlaps: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Amplitude, reference phase and explained χ² at every shift, shape of the last axes.
+
+    `gram` and `overlaps` are of the pictures at phases 0 and 90°, and of the scattered light.
+    """
+    linear = np.einsum("ij,jyx->iyx", np.linalg.pinv(gram[:2, :2]), overlaps[:2])
+    explained = np.einsum("iyx,iyx->yx", linear, overlaps[:2])
+    amplitude, phase = np.hypot(*linear), np.arctan2(linear[1], linear[0])
+    if amplitude.max() ** 4 * gram[2, 2] < _FAINT * explained.max():
+        return amplitude, phase, explained
+    turns = np.concatenate([
+        np.pi * np.arange(_TURNS)[:, None, None] / _TURNS * np.ones_like(phase), phase[None]
+    ])  # fmt: skip
+    way = np.stack([np.cos(turns), np.sin(turns)])
+    tried, gained = best_amplitudes(
+        np.einsum("itab,iab->tab", way, overlaps[:2]),
+        overlaps[2],
+        np.einsum("itab,ij,jtab->tab", way, gram[:2, :2], way),
+        np.einsum("itab,i->tab", way, gram[:2, 2]),
+        gram[2, 2],
+    )
+    best = np.argmax(gained, axis=0)[None]
+    tried, turns, gained = (np.take_along_axis(v, best, 0)[0] for v in (tried, turns, gained))
+    return np.abs(tried), turns + np.pi * (tried < 0), gained
+
+
+def turned_starts(
+    averages: Sequence[ParticleImage], build: Build, starts: Sequence[Start]
+) -> tuple[Start, ...]:
+    """Turn the linear light of every start to the direction that explains most."""
+    out = []
+    for start in starts:
+        if start.values["polarization"] == "linear":
+            first = start.values["polarization_deg"]
+            turns = [{**start.values, "polarization_deg": first + t} for t in _DIRECTIONS_DEG]
+            (best,) = search_starts(averages, build, turns, most=1)
+            start = max(start, best, key=lambda each: each.explained)
+        out.append(start)
+    return tuple(out)
+
 
 _STARTS = 2  # microscopes that are refined, per state
 _FIRST_PASSES, _MORE_PASSES = 6, 10  # of all starts, and of those that lead then

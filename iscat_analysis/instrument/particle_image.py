@@ -1,0 +1,336 @@
+"""The picture of one particle, and pictures registered on their average."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+from scipy import ndimage
+
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
+from iscat_analysis.instrument.parameters import FOCUS_STEP, Settings
+from iscat_analysis.optics.field_map import WEIGHTS, Spot, changes_at
+from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.records import BoolArray, FloatArray
+
+PRIVATE = 5
+"""Unknowns of one sight, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
+background level."""
+
+ROAM_NM = 300.0
+"""Farthest from the centre of a picture that its particle may be, along x and y."""
+
+
+class Microscope(Protocol):
+    """What the estimator asks of a forward model."""
+
+    def image(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> FloatArray:
+        """Signal of one particle."""
+
+    def gradient(
+        self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, mass_kda: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to x, y, z and mass."""
+
+    def joint_gradient(
+        self,
+        grid: PixelGrid,
+        x_nm: float,
+        y_nm: float,
+        z_nm: float,
+        mass_kda: float,
+        names: Sequence[str],
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Signal, and its derivatives with respect to the particle and the named optics."""
+
+
+Build = Callable[[Settings], Microscope]
+"""Makes the microscope of some settings."""
+
+
+@dataclass(frozen=True)
+class ParticleImage:
+    """The picture of one particle: counts of a region, and where the search begins."""
+
+    grid: PixelGrid
+    noise: NoiseModel
+    data: FloatArray
+    x_nm: float
+    y_nm: float
+    z_nm: float
+    mass_kda: float = 0.0
+    level: float = 0.0
+    focus_steps: float = 0.0
+    place: tuple[float, float] = (0.0, 0.0)
+    frames: tuple[float, float] = (0.0, 0.0)
+    snr: float = 0.0
+    neighbours: tuple[tuple[int, float], ...] = ()
+    rings: FloatArray | float = 1.0
+    baseline: float = 0.0
+    owner: int = -1
+    heights_nm: tuple[float, float] | None = None
+
+    @property
+    def private(self) -> FloatArray:
+        """Start of the sight's own unknowns, shape (5,)."""
+        return np.array([self.x_nm, self.y_nm, self.z_nm, self.mass_kda, self.level])
+
+    @property
+    def free(self) -> BoolArray:
+        """Which of its own unknowns are, shape (5,)."""
+        return np.array([True, True, self.heights_nm is not None, True, True])
+
+    def among(self, contrast: FloatArray) -> ParticleImage:
+        """Return the sight with the contrast of its neighbours in its expectation."""
+        rings = 1 + contrast
+        data = self.noise.multiplied(self.data, rings / self.rings)
+        bare = self.noise.multiplied(data, 1 / rings)
+        baseline = self.noise.reference_change(data, bare)
+        return replace(self, data=data, rings=rings, baseline=baseline)
+
+    def seen_with(self, settings: Settings) -> dict[str, Any]:
+        """Return the settings of the microscope in this picture, as keys of ``[optics]``."""
+        own = {k: v for k, v in settings.items() if k not in WEIGHTS and k != FOCUS_STEP}
+        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        for base, change in changes_at(settings, self.spot).items():
+            own[base] = own.get(base, 0.0) + change
+        return own
+
+    @property
+    def spot(self) -> Spot:
+        """Where in the field and when the picture was taken."""
+        return Spot(*self.place, self.focus_steps)
+
+    def slopes(self, name: str) -> Mapping[str, float]:
+        """Give by how much a shared parameter changes those of this picture's optics."""
+        if name == FOCUS_STEP:
+            return {"focus_nm": self.focus_steps}
+        return WEIGHTS[name](self.spot) if name in WEIGHTS else {name: 1.0}
+
+    def moved(self, private: FloatArray) -> ParticleImage:
+        """Return the same pictures with another start."""
+        x, y, z, mass, level = (float(v) for v in private)
+        return replace(self, x_nm=x, y_nm=y, z_nm=z, mass_kda=mass, level=level)
+
+    def placed(self, x_nm: float, y_nm: float) -> ParticleImage:
+        """Return the same picture with another place, or the nearest where it may be."""
+        (low, high), (left, right) = (
+            (float(np.mean(axis)) - ROAM_NM, float(np.mean(axis)) + ROAM_NM)
+            for axis in (self.grid.y_nm, self.grid.x_nm)
+        )
+        x, y = min(max(x_nm, left), right), min(max(y_nm, low), high)
+        return replace(self, x_nm=x, y_nm=y)
+
+    def raised(self, shift_nm: float) -> ParticleImage:
+        """Return the same picture with another height, or the nearest that is possible."""
+        low, high = self.heights_nm or (self.z_nm, self.z_nm)
+        return replace(self, z_nm=min(max(self.z_nm + shift_nm, low), high))
+
+
+def models_of(
+    sights: Sequence[ParticleImage], build: Build, settings: Settings
+) -> list[Microscope]:
+    """Give the microscope of every picture; those alike share one."""
+    models: dict[tuple[Any, ...], Microscope] = {}
+    out = []
+    for sight in sights:
+        own = sight.seen_with(settings)
+        key = tuple(own.items())
+        if key not in models:
+            models[key] = build(own)
+        out.append(models[key])
+    return out
+
+
+UNIT_KDA = 1e3  # at which interference and scattered light are told apart, by their powers
+
+_FOCI = 7  # of a scan, whose averages are searched
+_ROUNDS = 3  # of registration
+_PARTS = 20  # of a pixel, to which it is found
+FARTHEST_CENTRE_PX = 4.0  # a picture's first centre is off by no more
+
+
+def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
+    """Measured contrast of a sight and the variance of its noise.
+
+    Shapes: `contrast, variance` (ny, nx).
+    """
+    terms = sight.noise.terms(sight.data, np.zeros(sight.grid.shape), 0.0)
+    information = terms.information * terms.by_signal**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        contrast = sight.noise.measured_signal(sight.data)
+    used = (information > 0) & np.isfinite(contrast)
+    level = float(np.average(contrast[used], weights=information[used]))
+    variance = 1 / np.where(used, information, 1e-6)
+    return np.where(used, contrast - level, 0.0), variance
+
+
+def with_masses(
+    sights: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
+) -> tuple[ParticleImage, ...]:
+    """Give every sight the mass that fits it best where it stands."""
+    out = []
+    for sight, model in zip(sights, models_of(sights, build, settings), strict=True):
+        parts = _parts(model, sight, (sight.x_nm, sight.y_nm))
+        contrast, variance = contrast_of(sight)
+        weight = 1 / variance
+        pictures = np.array([part - np.average(part, weights=weight) for part in parts])
+        gram = np.einsum("yx,iyx,jyx->ij", weight, pictures, pictures)
+        overlaps = np.einsum("yx,iyx,yx->i", weight, pictures, contrast)
+        mass, _ = best_amplitudes(overlaps[0], overlaps[1], gram[0, 0], gram[0, 1], gram[1, 1])
+        out.append(replace(sight, mass_kda=float(mass)))
+    return tuple(out)
+
+
+def _parts(
+    model: Any, sight: ParticleImage, place: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Contrast per mass, and per square of the mass: interference, and the scattered light."""
+    signal, slopes = model.gradient(sight.grid, *place, sight.z_nm, UNIT_KDA)
+    slope = slopes[3]
+    return (2 * signal - UNIT_KDA * slope) / UNIT_KDA, (UNIT_KDA * slope - signal) / UNIT_KDA**2
+
+
+def best_amplitudes(
+    linear: FloatArray, square: FloatArray, ll: FloatArray, ls: FloatArray, ss: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Best amplitude a of a picture a·L + a²·Q, of either sign, and the χ² that it explains.
+
+    `linear` and `square` are the overlaps of L and Q with the data, `ll`, `ls`, `ss` their own; all
+    broadcast.
+    """
+    linear, square, ll, ls, ss = np.broadcast_arrays(linear, square, ll, ls, ss)
+    weak = linear / ll
+    unit = np.where(weak == 0, 1.0, np.abs(weak))
+    # b + (2 q − ll) a − 3 ls a² − 2 ss a³ = 0, in units in which the weak solution is ±1
+    terms = np.stack([linear, (2 * square - ll) * unit, -3 * ls * unit**2, -2 * ss * unit**3])
+    lead = np.where(np.abs(terms[3]) > 1e-12 * np.abs(terms).max(axis=0), terms[3], np.inf)
+    companion = np.zeros((*weak.shape, 3, 3))
+    companion[..., 1, 0] = companion[..., 2, 1] = 1.0
+    companion[..., :, 2] = -np.moveaxis(terms[:3] / lead, 0, -1)
+    roots = np.linalg.eigvals(companion)
+    real = np.where(np.abs(roots.imag) < 1e-6 * (1 + np.abs(roots.real)), roots.real, 0.0)
+    tried = np.concatenate([real * unit[..., None], weak[..., None]], axis=-1)
+    b, q, g, h, k = (v[..., None] for v in (linear, square, ll, ls, ss))
+    explained = 2 * (b * tried + q * tried**2) - (g * tried**2 + 2 * h * tried**3 + k * tried**4)
+    best = np.argmax(explained, axis=-1)[..., None]
+    return (
+        np.take_along_axis(tried, best, -1)[..., 0],
+        np.take_along_axis(explained, best, -1)[..., 0],
+    )
+
+
+def average_particle_images(
+    sights: Sequence[ParticleImage],
+) -> tuple[tuple[ParticleImage, ...], tuple[ParticleImage, ...]]:
+    """Average the pictures of each focus, registered on each other, with the sign of each."""
+    placed = list(sights)
+    averages = {}
+    for offset in sorted({sight.focus_steps for sight in sights}):
+        members = [i for i, sight in enumerate(sights) if sight.focus_steps == offset]
+        averages[offset], group = _average([sights[i] for i in members])
+        for i, sight in zip(members, group, strict=True):
+            placed[i] = sight
+    offsets = list(averages)
+    chosen = np.unique(np.linspace(0, len(offsets) - 1, min(_FOCI, len(offsets))).round())
+    return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
+
+
+def _average(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, list[ParticleImage]]:
+    """Average pictures of one focus; their places are those of the average's centre."""
+    contrasts, variances = zip(*(contrast_of(sight) for sight in sights), strict=True)
+    pixel = sights[0].grid.pixel_nm
+    shifts = np.array([
+        (
+            (sight.y_nm - float(np.mean(sight.grid.y_nm))) / pixel,
+            (sight.x_nm - float(np.mean(sight.grid.x_nm))) / pixel,
+        )
+        for sight in sights
+    ])  # fmt: skip
+    template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
+    variance = np.full(template.shape, float(np.median(variances[0])))
+    for _ in range(_ROUNDS if len(sights) > 1 else 0):
+        total, weight = np.zeros_like(template), np.zeros_like(template)
+        for index, (contrast, noise) in enumerate(zip(contrasts, variances, strict=True)):
+            shifts[index] = _register(contrast, template, shifts[index])
+            moved = ndimage.shift(contrast, -shifts[index], order=3, mode="nearest")
+            noise = float(np.median(noise))
+            scale = float(np.vdot(moved, template) / np.vdot(template, template))
+            total += scale * moved / noise
+            weight += scale**2 / noise
+        template, variance = total / weight, 1 / weight
+    data = np.zeros((4, *template.shape))
+    counts = 2 / variance
+    data[0], data[2], data[3] = counts * (1 + template), 1.0, 1.0
+    data[1] = counts + data[0]
+    grid = PixelGrid.centred(template.shape[0], pixel)
+    average = ParticleImage(
+        grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
+        focus_steps=sights[0].focus_steps,
+    )  # fmt: skip
+    placed = [
+        replace(
+            sight,
+            x_nm=float(np.mean(sight.grid.x_nm) + dx * pixel),
+            y_nm=float(np.mean(sight.grid.y_nm) + dy * pixel),
+        )
+        for sight, (dy, dx) in zip(sights, shifts, strict=True)
+    ]
+    return average, placed
+
+
+def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> FloatArray:
+    """Shift of a picture from a template of either sign; the last one, where it is far from that.
+
+    A window about the last shift would leave neighbours out, and the rings that tell aberrations.
+    """
+    from skimage.registration import phase_cross_correlation  # only the learner needs it
+
+    found, *_ = phase_cross_correlation(
+        template, contrast, normalization=None, upsample_factor=_PARTS
+    )
+    near = np.abs(found + shift).max() <= FARTHEST_CENTRE_PX
+    return np.asarray(-found if near else shift)
+
+
+def place_particle_images(
+    sights: Sequence[ParticleImage], nominal: ForwardModel
+) -> list[ParticleImage]:
+    """Register pictures on their average, and say how much of it each shows."""
+    (average,), placed = average_particle_images(sights)
+    scale = peak_per_amplitude(nominal)
+    shown = average.data[0] / (average.data[1] - average.data[0]) - 1
+    top = float(np.abs(shown).max())
+    out = []
+    for sight in placed:
+        rows, columns = (
+            (axis[:, None] - at) / sight.grid.pixel_nm + (n - 1) / 2
+            for axis, at, n in (
+                (sight.grid.y_nm, sight.y_nm, shown.shape[0]),
+                (sight.grid.x_nm, sight.x_nm, shown.shape[1]),
+            )
+        )
+        places = np.broadcast_arrays(rows, columns.T)
+        moved = ndimage.map_coordinates(shown, places, order=3, mode="nearest") / top
+        contrast, weight = signal_of(sight, nominal, np.zeros(sight.grid.shape))
+        moved = moved - np.average(moved, weights=weight)
+        strength = np.sum(weight * moved * contrast) / np.sum(weight * moved**2)
+        out.append(replace(sight, mass_kda=float(strength) / scale))
+    return out
+
+
+def signal_of(
+    sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Measured signal of a picture and its information, 0 where masked; the model takes no part.
+
+    Shapes: `signal` (ny, nx), both results (ny, nx).
+    """
+    likelihood = Likelihood(nominal, sight.grid, sight.noise, sight.data)
+    return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)
