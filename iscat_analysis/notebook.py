@@ -14,12 +14,12 @@ import pandas as pd
 
 from iscat_analysis.answers.calibrations import optics_calibration
 from iscat_analysis.bounds import bounds_report
+from iscat_analysis.bounds.optics_forecast import EVENTS, OpticsForecast
+from iscat_analysis.bounds.optics_forecast import forecast_optics as _forecast
 from iscat_analysis.config import Config, configure
 from iscat_analysis.config.values import LARGEST_NM
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import number_in, path_in
-from iscat_analysis.instrument.forecast import EVENTS, OpticsForecast
-from iscat_analysis.instrument.forecast import forecast_optics as _forecast
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import ArrayLike, open_stack

@@ -12,10 +12,10 @@ from iscat_analysis.config import Config, parse_config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.parameters import settings_of
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import settings_of
 
 PIXEL_NM = 84.4
 GRID = PixelGrid.centred(28, PIXEL_NM)

@@ -30,13 +30,12 @@ from iscat_analysis.instrument.bright import (
     find_bright_places,
     find_bright_steps,
 )
-from iscat_analysis.instrument.measure import FAINTEST, MOST_SIGHTS
 from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
-from iscat_analysis.instrument.parameters import heights_free, settings_of
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.parameters import FAINTEST, MOST_SIGHTS, heights_free, settings_of
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.sliding import stride_of
 from iscat_analysis.search.sliding.chunks import Reader, plan_chunks, reader_of

@@ -32,7 +32,6 @@ from iscat_analysis.instrument.learning import (
     why_not,
 )
 from iscat_analysis.instrument.loop import accepted
-from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
     REJECTED_P,
     goodness,
@@ -41,11 +40,11 @@ from iscat_analysis.instrument.microscope import (
     reach_nm,
     with_sign,
 )
-from iscat_analysis.instrument.parameters import FREE, heights_free, settings_of
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.sources import seen_in_field
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
+from iscat_analysis.optics.parameters import FREE, LEAST_SIGHTS, heights_free, settings_of
 from iscat_analysis.threads import threads
 
 NEXT_TO_NONE = 0.3

@@ -11,22 +11,23 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
-from iscat_analysis.instrument.measure import LEAST_SIGHTS, OpticsSearch
+from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm, rings_of
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
+from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
+from iscat_analysis.instrument.starts import FOCUS_STEP_NM
+from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     FREE,
+    LEAST_SIGHTS,
     Settings,
     free_names,
     optics_limits,
     settings_of,
 )
-from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
-from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
-from iscat_analysis.instrument.starts import FOCUS_STEP_NM
-from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.records import Mapper
 from iscat_analysis.units import count
 

@@ -17,12 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.likelihood import LEVEL
-from iscat_analysis.instrument.parameters import (
-    MASK_NA,
-    PARAMETERS,
-    Settings,
-    prior_range,
-)
 from iscat_analysis.instrument.particle_image import (
     PRIVATE,
     ROAM_NM,
@@ -31,6 +25,12 @@ from iscat_analysis.instrument.particle_image import (
     ParticleImage,
     models_of,
     with_masses,
+)
+from iscat_analysis.optics.parameters import (
+    MASK_NA,
+    PARAMETERS,
+    Settings,
+    prior_range,
 )
 from iscat_analysis.records import FloatArray, Mapper
 

@@ -26,7 +26,6 @@ from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.loop import accepted, learn
-from iscat_analysis.instrument.measure import LEAST_SIGHTS
 from iscat_analysis.instrument.microscope import (
     REJECTED_P,
     TESTED,
@@ -34,7 +33,6 @@ from iscat_analysis.instrument.microscope import (
     not_alone,
     refuse_uncalibratable,
 )
-from iscat_analysis.instrument.parameters import FREE, free_groups, heights_free, settings_of
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.sources import StandingAlone, WholeField, seen_in_field
 from iscat_analysis.instrument.uneven import (
@@ -46,6 +44,13 @@ from iscat_analysis.instrument.uneven import (
 )
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import terms_of
+from iscat_analysis.optics.parameters import (
+    FREE,
+    LEAST_SIGHTS,
+    free_groups,
+    heights_free,
+    settings_of,
+)
 from iscat_analysis.records import Progress, Windows, silent
 from iscat_analysis.search.sliding import measure_frames, well_lit
 from iscat_analysis.threads import threads

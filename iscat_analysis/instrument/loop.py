@@ -23,14 +23,14 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.fit_optics import Collected, fit_optics
 from iscat_analysis.instrument.microscope import with_sign
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.optics.parameters import (
     Settings,
     change_of,
     optics_limits,
     settings_of,
     with_settings,
 )
-from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.records import FloatArray, Mapper
 
 SETTLED = 1.0
@@ -202,7 +202,7 @@ class Rounds:
         last, names = self._steps[-1], taken.found.names
         rest = dict(zip(last.found.names, self.to_come.tolist(), strict=True))
         to_come = np.array([rest.get(name, 0.0) for name in names], dtype=float)
-        return change_of(taken.after, last.after, names) + to_come
+        return np.asarray(change_of(taken.after, last.after, names) + to_come)
 
 
 def _kind(settings: Settings) -> tuple[object, ...]:

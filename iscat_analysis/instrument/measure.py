@@ -16,7 +16,15 @@ import numpy as np
 
 from iscat_analysis.instrument.joint_fit import Estimate, Neighbours, maximise
 from iscat_analysis.instrument.microscope import goodness
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.instrument.particle_image import (
+    Build,
+    ParticleImage,
+    average_particle_images,
+    with_masses,
+)
+from iscat_analysis.instrument.starts import StateSearch, same_state
+from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.parameters import (
     FREE,
     HIGHER,
     PARAMETERS,
@@ -27,25 +35,8 @@ from iscat_analysis.instrument.parameters import (
     free_names,
     is_term,
 )
-from iscat_analysis.instrument.particle_image import (
-    Build,
-    ParticleImage,
-    average_particle_images,
-    with_masses,
-)
-from iscat_analysis.instrument.starts import StateSearch, same_state
-from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.threads import one_thread_algebra
-
-LEAST_SIGHTS = 12
-"""Pictures without which nothing is calibrated: eight to fit and four to judge."""
-
-MOST_SIGHTS = 60
-"""Pictures that are used at most, two thirds of them to fit."""
-
-FAINTEST = 8.0
-"""Signal-to-noise ratio below which a picture says too little of the microscope."""
 
 HELD_OUT = 3
 """One picture in so many is not fitted."""
@@ -232,7 +223,9 @@ class OpticsSearch:
         A mask of which the configuration knows nothing must earn its two parameters.
         The pictures that are not fitted come back with their places and masses.
         """
-        states = StateSearch(self.configured, self.build, self.free, self.limits, self.mapper)
+        states = StateSearch(
+            self.configured, self.build, tuple(self.free), self.limits, self.mapper
+        )
         refined = states.run(averages)
         top = refined[0].log_likelihood
         joint: list[tuple[float, Estimate, tuple[ParticleImage, ...]]] = []

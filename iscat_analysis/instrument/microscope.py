@@ -15,7 +15,6 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
-from iscat_analysis.instrument.parameters import Settings, heights_free, settings_of, with_settings
 from iscat_analysis.instrument.particle_image import (
     ParticleImage,
     average_particle_images,
@@ -23,6 +22,7 @@ from iscat_analysis.instrument.particle_image import (
 )
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.optics.parameters import Settings, heights_free, settings_of, with_settings
 from iscat_analysis.records import Mapper
 
 

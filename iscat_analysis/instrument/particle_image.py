@@ -11,10 +11,10 @@ from scipy import ndimage
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
-from iscat_analysis.instrument.parameters import FOCUS_STEP, Settings
 from iscat_analysis.optics.field_map import WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import FOCUS_STEP, Settings
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5

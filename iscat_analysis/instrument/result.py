@@ -14,7 +14,8 @@ from scipy import ndimage
 from iscat_analysis._kernels.zernike import zernike
 from iscat_analysis.config import FIELD_TERMS, Config, OpticsCovariance, toml_value
 from iscat_analysis.instrument.measure import Judgement, Measured
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
+from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
@@ -24,7 +25,6 @@ from iscat_analysis.instrument.parameters import (
     is_term,
     with_settings,
 )
-from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
 from iscat_analysis.records import FloatArray
 from iscat_analysis.text import in_toml
 from iscat_analysis.units import count

@@ -11,7 +11,6 @@ configured optics fit it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -22,10 +21,9 @@ from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.instrument.collect import bright_places, known_places
 from iscat_analysis.instrument.fit_optics import Collected, misfit_of
 from iscat_analysis.instrument.loop import Rounds
-from iscat_analysis.instrument.measure import LEAST_SIGHTS
-from iscat_analysis.instrument.parameters import heights_free, settings_of
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.instrument.uneven import FieldOfView, asked_change, in_uneven_field
+from iscat_analysis.optics.parameters import LEAST_SIGHTS, heights_free, settings_of
 from iscat_analysis.records import Status, Windows
 
 LEAST_ROUGH = 6
@@ -109,7 +107,7 @@ class WholeField:
 
 def seen_in_field(
     windows: Windows, config: Config, pool: ThreadPoolExecutor
-) -> tuple[Sequence[ParticleImage], Sequence[ParticleImage]]:
+) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Fit the field, and cut out the particles that are farthest from others."""
     free = heights_free(config)
     fit = config.fit.model_copy(update={"mode": "joint" if free else "mass"})

@@ -19,7 +19,6 @@ import numpy as np
 from scipy import fft
 
 from iscat_analysis.instrument.joint_fit import Estimate, maximise
-from iscat_analysis.instrument.parameters import PRIMARY, SECONDARY, Settings, free_names
 from iscat_analysis.instrument.particle_image import (
     FARTHEST_CENTRE_PX,
     UNIT_KDA,
@@ -28,6 +27,7 @@ from iscat_analysis.instrument.particle_image import (
     best_amplitudes,
     contrast_of,
 )
+from iscat_analysis.optics.parameters import PRIMARY, SECONDARY, Settings, free_names
 from iscat_analysis.records import FloatArray, Mapper
 
 FOCUS_RANGE_NM = 1000.0

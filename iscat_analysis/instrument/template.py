@@ -30,9 +30,8 @@ from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
-from iscat_analysis.instrument.measure import HELD_OUT_P, LEAST_SIGHTS, Judgement, judge
+from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
 from iscat_analysis.instrument.microscope import reach_nm, refuse_uncalibratable
-from iscat_analysis.instrument.parameters import settings_of
 from iscat_analysis.instrument.particle_image import (
     ParticleImage,
     place_particle_images,
@@ -46,6 +45,7 @@ from iscat_analysis.optics.forward import (
     with_template,
 )
 from iscat_analysis.optics.measured import Template, lattice_step_nm
+from iscat_analysis.optics.parameters import LEAST_SIGHTS, settings_of
 from iscat_analysis.records import FloatArray, Mapper, Progress, silent
 from iscat_analysis.text import in_toml
 from iscat_analysis.threads import threads

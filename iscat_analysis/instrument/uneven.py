@@ -21,19 +21,20 @@ from iscat_analysis.config import Config
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
-from iscat_analysis.instrument.measure import LEAST_SIGHTS, fitted_sights, held_out_sights
+from iscat_analysis.instrument.measure import fitted_sights, held_out_sights
 from iscat_analysis.instrument.microscope import microscopes, reach_nm
-from iscat_analysis.instrument.parameters import (
-    FOCUS_DRIFT,
-    FREE,
-    Settings,
-    free_names,
-    prior_range,
-)
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import centre_of, changes_at
 from iscat_analysis.optics.local import DRIFT_FRAMES
+from iscat_analysis.optics.parameters import (
+    FOCUS_DRIFT,
+    FREE,
+    LEAST_SIGHTS,
+    Settings,
+    free_names,
+    prior_range,
+)
 from iscat_analysis.records import Mapper
 
 KINDS: Mapping[str, tuple[str, ...]] = {

@@ -25,9 +25,8 @@ from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.learning import adopted
 from iscat_analysis.instrument.loop import Rounds, learn
-from iscat_analysis.instrument.measure import MOST_SIGHTS
 from iscat_analysis.instrument.microscope import REJECTED_P
-from iscat_analysis.instrument.parameters import FREE, Settings, heights_free, settings_of
+from iscat_analysis.optics.parameters import FREE, MOST_SIGHTS, Settings, heights_free, settings_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block

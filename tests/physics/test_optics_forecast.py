@@ -9,9 +9,9 @@ import pytest
 from calibrations import GRID, PHOTONS, PIXEL_NM, configuration, make_sights
 
 import iscat_analysis as ia
-from iscat_analysis.instrument.forecast import forecast_optics
+from iscat_analysis.bounds.optics_forecast import forecast_optics
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.parameters import FREE, settings_of
+from iscat_analysis.optics.parameters import FREE, settings_of
 
 REALISTIC: dict[str, Any] = {
     "optics.na": 1.40, "optics.focus_nm": -370.0, "optics.reference_phase_deg": 20.0,
@@ -105,8 +105,8 @@ def test_masses_of_other_particles_err_by_what_was_foreseen() -> None:
     """Microscopes drawn from the forecast's covariance, and one particle fitted in each."""
     from iscat_analysis.inference.likelihood import Likelihood
     from iscat_analysis.inference.noise import asimov_conditional
-    from iscat_analysis.instrument.parameters import with_settings
     from iscat_analysis.optics.forward import forward_model
+    from iscat_analysis.optics.parameters import with_settings
 
     config = ia.configure(settings=REALISTIC | {"fit.roi_nm": 2700.0})
     found = forecast_optics(config, events=60)

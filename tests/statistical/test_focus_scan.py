@@ -10,9 +10,9 @@ from instruments import Instrument, focus_scan, strength_of_sphere
 import iscat_analysis as ia
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.measure import OpticsSearch
-from iscat_analysis.instrument.parameters import optics_limits, settings_of
 from iscat_analysis.instrument.particle_image import best_amplitudes
 from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.optics.parameters import optics_limits, settings_of
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0

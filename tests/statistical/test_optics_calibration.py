@@ -17,10 +17,10 @@ from iscat_analysis.instrument.fit_optics import Collected, fit_optics
 from iscat_analysis.instrument.joint_fit import maximise
 from iscat_analysis.instrument.measure import HELD_OUT_P, Measured, OpticsSearch
 from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.parameters import optics_limits, settings_of
 from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import optics_limits, settings_of
 
 SIGMAS = 4.0
 """A parameter farther from the truth than this many standard errors is wrong: 6e-5 by chance."""

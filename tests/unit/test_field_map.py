@@ -13,11 +13,11 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.inference.noise import asimov_poisson
 from iscat_analysis.instrument.microscope import build_microscope
-from iscat_analysis.instrument.parameters import FIELD, settings_of
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.field_map import WEIGHTS, Spot
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.local import LocalModels
+from iscat_analysis.optics.parameters import FIELD, settings_of
 
 PIXEL_NM = 84.0
 FIELD_PX = (101, 101)

@@ -12,9 +12,9 @@ import pytest
 from iscat_analysis.inference.noise_models import POISSON
 from iscat_analysis.instrument.joint_fit import Estimate
 from iscat_analysis.instrument.measure import OpticsSearch
-from iscat_analysis.instrument.parameters import Settings
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import Settings
 
 HEIGHTS_NM = (0.0, 1000.0)
 

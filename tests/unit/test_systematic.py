@@ -23,8 +23,8 @@ from iscat_analysis.config import (
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL
-from iscat_analysis.instrument.parameters import settings_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.parameters import settings_of
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
 
 NAMES = ("focus_nm", "na", "z8", "z11")

@@ -20,8 +20,8 @@ from iscat_analysis.instrument import loop
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import _excess
 from iscat_analysis.instrument.loop import Round, Rounds
-from iscat_analysis.instrument.parameters import settings_of, with_settings
 from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.optics.parameters import settings_of, with_settings
 from iscat_analysis.tracking.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,

@@ -100,6 +100,15 @@ FREE = {
 """What ``--free`` may name, and the continuous parameters that each stands for; whether light is
 linear or circular is a choice beside them."""
 
+LEAST_SIGHTS = 12
+"""Pictures without which nothing is calibrated: eight to fit and four to judge."""
+
+MOST_SIGHTS = 60
+"""Pictures that are used at most, two thirds of them to fit."""
+
+FAINTEST = 8.0
+"""Signal-to-noise ratio below which a picture says too little of the microscope."""
+
 MASK_NA = 0.02
 """Smallest mask, and the narrowest ring around it."""
 

@@ -24,9 +24,13 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.instrument.measure import FAINTEST, LEAST_SIGHTS, MOST_SIGHTS
-from iscat_analysis.instrument.parameters import (
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.grid import PixelGrid
+from iscat_analysis.optics.parameters import (
+    FAINTEST,
     FREE,
+    LEAST_SIGHTS,
+    MOST_SIGHTS,
     Hidden,
     exists,
     find_hidden,
@@ -34,8 +38,6 @@ from iscat_analysis.instrument.parameters import (
     prior_range,
     settings_of,
 )
-from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.threads import one_thread_algebra
 
