@@ -31,15 +31,13 @@ from iscat_analysis.config.instrument import (
     AUTO,
     LARGEST_SD_NM,
     MEASURABLE,
-    Calibration,
     CameraConfig,
     Optics,
     OpticsCovariance,
     Particle,
-    StandardsCamera,
-    Uncertainty,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
+from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import (
     SIMULATED,

@@ -30,47 +30,7 @@ FIELD_TERMS: Mapping[str, tuple[str, int | None]] = {
 
 
 class FieldTerms(Section):
-    """Spread of the light, and what is not the same everywhere in the field.
-
-    Terms of the field are each the change from its centre to its edge.
-    """
-
-    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = Field(
-        0.0, description="aperture of a cone that is evenly filled with light; 0: one plane wave"
-    )
-    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = Field(
-        0.0, description="full width at half maximum of the spectrum; 0: one wavelength"
-    )
-
-    focus_tilt_nm: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="rise of the focus from the centre of the field to its edge, [x, y]"
-    )
-    focus_curvature_nm: Size = Field(
-        0.0, description="the same, growing with the square of the distance from the centre"
-    )
-    coma_field_nm: Size = Field(
-        0.0, description="coma at the edge of the field, along the radius and growing with it"
-    )
-    astigmatism_field_nm: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="astigmatism at the edge, linear in the field, [x, y]"
-    )
-    phase_tilt_deg: tuple[Size, Size] = Field(
-        (0.0, 0.0), description="change of reference_phase_deg from centre to edge, [x, y]"
-    )
-    phase_curvature_deg: Size = Field(
-        0.0, description="the same, growing with the square of the distance"
-    )
-    reference_tilt: tuple[Share, Share] = Field(
-        (0.0, 0.0), description="change of the reference's amplitude from centre to edge, a share"
-    )
-    reference_curvature: Share = Field(
-        0.0, description="the same, growing with the square of the distance"
-    )
-    field_px: tuple[Finite, Finite, Annotated[Finite, Field(gt=0)]] | None = Field(
-        None,
-        description="centre x, y of the field and half its longer side [pixels], for which these "
-        "terms hold; the movie's where absent",
-    )
+    """Terms of the field by name; each is the change from its centre to its edge."""
 
     def field_term(self, name: str) -> float:
         """Give a coefficient by its own name.

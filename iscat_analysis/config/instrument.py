@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.field import FIELD_TERMS, FieldTerms
+from iscat_analysis.config.field import FIELD_TERMS, FieldTerms, Share, Size
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -33,10 +33,6 @@ LARGEST_SD_NM = 100.0
 
 MOST_PASSES = 3.0
 """Largest attenuation: what passes of the reference against what passes of the scattered light."""
-
-PER_KDA = (1e-7, 0.01)
-"""Magnitudes of a contrast per kDa: a protein has some 1e-5, and of the larger one 100 kDa would
-change all light."""
 
 DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "protein": 1350.0}
 """Densities of the kinds of particles; protein as mass photometry has it."""
@@ -176,6 +172,43 @@ class Optics(FieldTerms):
     )
     calibrate: Literal["auto", "always", "never"] = Field(
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
+    )
+
+    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = Field(
+        0.0, description="aperture of a cone that is evenly filled with light; 0: one plane wave"
+    )
+    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = Field(
+        0.0, description="full width at half maximum of the spectrum; 0: one wavelength"
+    )
+
+    focus_tilt_nm: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="rise of the focus from the centre of the field to its edge, [x, y]"
+    )
+    focus_curvature_nm: Size = Field(
+        0.0, description="the same, growing with the square of the distance from the centre"
+    )
+    coma_field_nm: Size = Field(
+        0.0, description="coma at the edge of the field, along the radius and growing with it"
+    )
+    astigmatism_field_nm: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="astigmatism at the edge, linear in the field, [x, y]"
+    )
+    phase_tilt_deg: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="change of reference_phase_deg from centre to edge, [x, y]"
+    )
+    phase_curvature_deg: Size = Field(
+        0.0, description="the same, growing with the square of the distance"
+    )
+    reference_tilt: tuple[Share, Share] = Field(
+        (0.0, 0.0), description="change of the reference's amplitude from centre to edge, a share"
+    )
+    reference_curvature: Share = Field(
+        0.0, description="the same, growing with the square of the distance"
+    )
+    field_px: tuple[Finite, Finite, Annotated[Finite, Field(gt=0)]] | None = Field(
+        None,
+        description="centre x, y of the field and half its longer side [pixels], for which these "
+        "terms hold; the movie's where absent",
     )
 
     covariance: OpticsCovariance | None = Field(
@@ -421,80 +454,3 @@ class Particle(Section):
     def height_prior_sd_nm(self) -> float:
         """Standard deviation of the prior of heights; wide before a movie has told them."""
         return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
-
-
-class StandardsCamera(Section):
-    """The detector with which the standards of a calibration were recorded."""
-
-    pixel_size_nm: Positive | None = Field(None, description="in the sample plane")
-    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(1, description="per axis")
-    gain_e_per_adu: Positive | None = Field(
-        None, description="photoelectrons per count, where it is one number"
-    )
-    offset_adu: Finite | None = Field(
-        None, description="counts in the dark, where they are one number"
-    )
-
-
-class Calibration(Section):
-    """Contrast against mass; present, it replaces the model's absolute scale.
-
-    Signed peak contrast = gradient·mass + sign(mass)·offset, at the optics of the standards; at
-    other optics the model carries it over.
-    """
-
-    gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
-    offset: Finite = Field(0.0, description="peak contrast at zero mass (odd-symmetric)")
-    gradient_se_per_kda: NonNegative = Field(
-        0.0, description="standard error of gradient_per_kda; 0: not known"
-    )
-    offset_se: NonNegative = Field(0.0, description="standard error of offset")
-    correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
-        0.0, description="of the errors of gradient_per_kda and offset"
-    )
-    dof: Annotated[int, Field(ge=0)] | None = Field(
-        None, description="degrees of freedom of the line: standards beyond two"
-    )
-    optics: Optics | None = Field(
-        None, description="keys of [optics] with which the standards were analysed"
-    )
-    covariance: OpticsCovariance | None = Field(
-        None, description="of these where they were learned, { names, matrix }"
-    )
-    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="particle.height_nm with which the standards were analysed"
-    )
-    camera: StandardsCamera | None = Field(None, description="with which they were recorded")
-    optics_assumed: bool = Field(
-        False, description="true: nobody recorded the optics; those configured are taken"
-    )
-
-    @model_validator(mode="after")
-    def _usable(self) -> Calibration:
-        if self.gradient_per_kda == 0:
-            raise ValueError("gradient_per_kda = 0 says nothing about mass")
-        least, most = PER_KDA
-        if not least <= abs(self.gradient_per_kda) <= most:
-            raise ValueError(
-                f"gradient_per_kda = {self.gradient_per_kda:g} has not between {least:g} and "
-                f"{most:g} of all light per kDa: give contrast per kDa, as -3.1e-5, not in per "
-                "cent or ppm, nor per Da or MDa"
-            )
-        return self
-
-
-class Uncertainty(Section):
-    """Standard deviations of inputs that nobody measured; 0 turns one off.
-
-    Where standards were recorded with the same optics, they share these errors, which cancel.
-    """
-
-    wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
-    n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
-    n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
-    height_nm: NonNegative = Field(
-        2.0, description="of the mean height of particles, where particle.height_nm is fixed"
-    )
-    magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
-        0.005, description="of camera.pixel_size_nm, as a share of it"
-    )
