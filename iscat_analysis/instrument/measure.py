@@ -119,12 +119,12 @@ def judge(
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
 
 
-def fitted_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _fitted(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are fitted."""
     return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
 
 
-def held_out_sights(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _held_out(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are not."""
     return list(sights[1::HELD_OUT])
 
@@ -242,8 +242,8 @@ class OpticsSearch:
             )
             names = free_names(self.free, rough.values, FREE["zernike"])
             tried.append(rough)
-            fit = self._fit(fitted_sights(sights), rough.values, names, _TRIAL_PASSES)
-            judged = self._fit(held_out_sights(sights), fit.values, ())
+            fit = self._fit(_fitted(sights), rough.values, names, _TRIAL_PASSES)
+            judged = self._fit(_held_out(sights), fit.values, ())
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
             earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
             joint.append((earned, fit, judged.sights))
@@ -257,11 +257,11 @@ class OpticsSearch:
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
-        fitted = fitted_sights(sights)
+        fitted = _fitted(sights)
         best = self._fit(fitted, known, names)
         # focus and phase move all heights, those of pictures that were not fitted to other fringes
         rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.sights, fitted, strict=True)])
-        held_out = [s.raised(float(rise)) for s in held_out_sights(sights)]
+        held_out = [s.raised(float(rise)) for s in _held_out(sights)]
         return best, self._own(held_out, best.values)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:

@@ -21,7 +21,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
-from iscat_analysis.instrument.measure import fitted_sights, held_out_sights
+from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.microscope import microscopes, reach_nm
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
@@ -222,35 +222,44 @@ def in_uneven_field(
         return None
     build = microscopes(config, max(map(reach_nm, images)))
     signed = with_masses(images, build, settings)  # what leaves is seen before
-    ordered = sorted(view.placed(signed), key=lambda sight: -sight.snr)
-    held_out = held_out_sights(ordered)
-    shared = free_names(tuple(FREE), settings, FREE["zernike"])
+    pictures = sorted(view.placed(signed), key=lambda sight: -sight.snr)
 
-    def fitted(
-        start: Settings, names: Sequence[str], pictures: Sequence[ParticleImage]
-    ) -> Estimate:
-        return maximise(pictures, build, start, names, passes=_PASSES, mapper=mapper)
+    def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
+        return maximise(some, build, start, names, passes=_PASSES, mapper=mapper)
 
-    def judged(best: Estimate) -> Estimate:
-        return fitted(best.values, (), held_out)
+    def tried(start: Settings, names: Sequence[str]) -> tuple[Settings, float]:
+        """Fit all parts of the pictures but one, which is judged, in turns."""
+        values, total = start, 0.0
+        for part in range(HELD_OUT):
+            fit = fitted([p for k, p in enumerate(pictures) if k % HELD_OUT != part], start, names)
+            total += fitted(pictures[part::HELD_OUT], fit.values, ()).log_likelihood
+            values = fit.values
+        return values, total
 
-    best = fitted(settings, shared, fitted_sights(ordered))
-    before, refused = judged(best), set[str]()
-    kept: list[str] = []
+    names: tuple[str, ...] = free_names(tuple(FREE), settings, FREE["zernike"])
+    values, before = tried(settings, names)
+    kept, refused = list[str](), set[str]()
     while True:
-        wanted = _asked(best.sights, build, best.values, (*shared, *kept), view, mapper)
+        best = fitted(pictures, values, names)
+        wanted = _asked(best.sights, build, best.values, names, view, mapper)
         change = next((each for each in wanted if each.kind not in refused), EVEN)
         if not change.matters:
             break
+        refused.add(change.kind)
         start = {**best.values, **dict.fromkeys(change.terms, 0.0)}
-        trial = fitted(start, (*shared, *kept, *change.terms), best.sights)
-        after = judged(trial)
-        if after.log_likelihood > before.log_likelihood + HELD_OUT_GAIN:
-            best, before = trial, after
-            kept += change.terms
-        else:
-            refused.add(change.kind)
+        trial, after = tried(start, (*names, *change.terms))
+        if after <= before + HELD_OUT_GAIN:
+            continue
+        values, before, names = trial, after, (*names, *change.terms)
+        for kind in kept[:]:  # what was taken for lack of what came later
+            others = tuple(name for name in names if name not in KINDS[kind])
+            rest = {key: value for key, value in values.items() if key not in KINDS[kind]}
+            trial, after = tried(rest, others)
+            if after > before - HELD_OUT_GAIN:
+                values, before, names = trial, after, others
+                kept.remove(kind)
+        kept.append(change.kind)
     if not kept:
         return None
-    together = (*best.sights, *before.sights)
-    return Collected(view.optics(config), together, view.placed(seen.others), near=best.values)
+    others_placed = view.placed(seen.others)
+    return Collected(view.optics(config), best.sights, others_placed, near=best.values)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.optics.field_map import BASES, WEIGHTS, Spot, centre_of
+from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, Spot, centre_of
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
@@ -36,6 +36,7 @@ from iscat_analysis.trust.response import (
     response_of,
     standards_share,
 )
+from iscat_analysis.trust.uneven_reference import reference_map
 
 REJECTED_SHARE = 0.04
 """Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
@@ -101,6 +102,8 @@ def sources_of(
         Source("standards measured with unknown optics", "assumed",
                partial(_of_the_missing_record, scale),
                "calibrate with the folder of the standards' analysis"),
+        Source("amplitude of the reference over the field", "measured", _of_the_reference,
+               "configure it: optics.reference_tilt and optics.reference_curvature"),
         Source("square of the scattered light", "measured", partial(_of_heavy_particles, scale),
                "standards as heavy as the particles"),
     )  # fmt: skip
@@ -228,6 +231,15 @@ def _off_the_line(scale: MassScale, table: pd.DataFrame) -> tuple[FloatArray, Fl
     return np.abs(mass * scale.bend(mass)), np.where(good, sigma, np.nan)
 
 
+def _of_the_reference(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what masses are wrong by where those of the same particles differ over the field."""
+    found = reference_map(config, table)
+    if found is None:
+        return {}
+    mass, x, y = (table[name].to_numpy(float) for name in ("mass_kda", "x_px", "y_px"))
+    return {"mass_kda": np.abs(mass * found.share(x, y))}
+
+
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
     """Give what the line between contrast and mass may be wrong by."""
     line = config.calibration
@@ -276,8 +288,13 @@ def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatAr
     names = errors.names if errors is not None else ()
     if not any(name in WEIGHTS for name in names):
         return _base_shifts(config, model, table, names)
-    bases = tuple(dict.fromkeys(base for name in names for base in BASES.get(name, (name,))))
-    found = _base_shifts(config, model, table, bases)
+    every = dict.fromkeys(base for name in names for base in BASES.get(name, (name,)))
+    bases = tuple(base for base in every if base != REFERENCE)
+    found = np.zeros((len(table), len(COMMON), len(bases) + 1))
+    found[..., :-1] = _base_shifts(config, model, table, bases) if bases else 0.0
+    if _fits_masses(config):  # a brighter reference dims the interference
+        found[:, 3, -1] = -table["mass_kda"].to_numpy(float)
+    bases = (*bases, REFERENCE)
     x, y, half = centre_of(config.optics, (1, 1))
     shifts = np.zeros((len(table), len(COMMON), len(names)))
     for event, place in enumerate(zip(table["x_px"], table["y_px"], strict=True)):
