@@ -92,6 +92,8 @@ def sources_of(
                "more particles for the picture, or standards measured with it"),
         Source("optics that do not describe the pictures", "measured", left_over,
                "find what the model lacks: focus, aperture, aberrations, pixel size"),
+        Source("amplitude of the reference over the field", "measured", _of_the_reference,
+               "configure it: optics.reference_tilt and optics.reference_curvature"),
         *(Source(each.label, "assumed", partial(assumed_error, each.key), each.remedy)
           for each in INPUTS),
     )  # fmt: skip
@@ -102,8 +104,6 @@ def sources_of(
         Source("standards measured with unknown optics", "assumed",
                partial(_of_the_missing_record, scale),
                "calibrate with the folder of the standards' analysis"),
-        Source("amplitude of the reference over the field", "measured", _of_the_reference,
-               "configure it: optics.reference_tilt and optics.reference_curvature"),
         Source("square of the scattered light", "measured", partial(_of_heavy_particles, scale),
                "standards as heavy as the particles"),
     )  # fmt: skip

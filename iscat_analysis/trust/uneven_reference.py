@@ -102,7 +102,7 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     information = -_curvature(mass, sigma, place, terms)
     if not np.all(np.linalg.eigvalsh(information) > 0):
         return None
-    errors = np.sqrt(np.diag(np.linalg.inv(information)))[:-1]
+    errors = np.sqrt(np.diag(np.linalg.inv(information)))
     return ReferenceMap(terms[:-1], np.asarray(errors, dtype=np.float64), field_px)
 
 
@@ -162,12 +162,14 @@ def _agreement(mass: FloatArray, sigma: FloatArray, place: FloatArray, terms: Fl
 def _curvature(
     mass: FloatArray, sigma: FloatArray, place: FloatArray, terms: FloatArray
 ) -> FloatArray:
-    """Second derivatives of the agreement, shape (4, 4).
+    """Second derivatives of the agreement in the coefficients, shape (3, 3).
 
-    Every pair of masses is counted twice, from either side: half of it is what they tell.
+    Every pair of masses is counted twice, from either side: half of it is what they tell.  Kernels
+    are at least as wide as the errors say.
     """
-    steps = _STEP * np.eye(len(terms))
-    out = np.empty((len(terms), len(terms)))
+    terms = np.append(terms[:-1], max(terms[-1], 0.0))
+    steps = _STEP * np.eye(len(terms))[:-1]
+    out = np.empty((len(steps), len(steps)))
     for i, one in enumerate(steps):
         for j, other in enumerate(steps):
             four = [

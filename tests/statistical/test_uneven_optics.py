@@ -28,6 +28,7 @@ from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import FIELD_TERMS, Config, load_config
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.trust.uneven_reference import reference_map
 
 pytestmark = pytest.mark.large
 
@@ -153,3 +154,21 @@ def test_a_cone_of_light_is_fitted_with_where_it_is_configured(cone: float) -> N
     assert np.sqrt(np.mean(with_it.pulls**2)) < 1 + SIGMAS / np.sqrt(2 * with_it.found)
     assert abs(with_it.ratio - 1) < 0.003 + SIGMAS * with_it.ratio_se
     assert abs(without.ratio - 1) > abs(with_it.ratio - 1) + 0.005
+
+
+@pytest.mark.parametrize("tilt", [0.03, 0.05])
+def test_what_is_said_of_the_reference_makes_masses_right(tilt: float) -> None:
+    movie, landings, config = _movie(other_reference(0.0, tilt), 21), _landings(21), _config()
+    camera = camera_from_config(config.camera, SHAPE[1:], movie.dtype)
+    found = analyse_landings(movie, config, camera, warn=lambda _: None, progress=lambda *_: None)
+    said = reference_map(config, found.fits)
+    assert said is not None
+    assert abs(said.terms[0] * SHAPE[1] / 2 / said.field_px[2] - tilt) < SIGMAS * said.errors[0]
+    followed = _config(
+        f"optics.reference_tilt={said.terms[:2].tolist()}",
+        f"optics.reference_curvature={said.terms[2]}", f"optics.field_px={list(said.field_px)}",
+    )  # fmt: skip
+    before, after = (_outcome(movie, each, landings) for each in (config, followed))
+    assert np.sqrt(np.mean(before.pulls**2)) > 1.5
+    assert np.sqrt(np.mean(after.pulls**2)) < 1 + SIGMAS / np.sqrt(2 * after.found)
+    assert abs(after.ratio - 1) < 0.005 + SIGMAS * after.ratio_se
