@@ -22,14 +22,6 @@ from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_
 from iscat_analysis.inference.counts import choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
-from iscat_analysis.instrument.bright import (
-    ALONE_NM,
-    BrightStep,
-    centre_of_energy,
-    energy_of,
-    find_bright_places,
-    find_bright_steps,
-)
 from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie.stack import Stack
@@ -37,6 +29,14 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.parameters import FAINTEST, MOST_SIGHTS, heights_free, settings_of
 from iscat_analysis.records import FloatArray, Windows
+from iscat_analysis.search.bright import (
+    ALONE_NM,
+    BrightStep,
+    centre_of_energy,
+    energy_of,
+    find_bright_places,
+    find_bright_steps,
+)
 from iscat_analysis.search.sliding import stride_of
 from iscat_analysis.search.sliding.chunks import Reader, plan_chunks, reader_of
 from iscat_analysis.threads import over_frames

@@ -19,7 +19,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
-from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.instrument.collect import bright_particle_images
 from iscat_analysis.instrument.fit_optics import Collected, fit_optics, misfit_of
 from iscat_analysis.instrument.learning import (
@@ -106,7 +106,7 @@ def learn_sign(
     camera: Camera,
     *,
     warn: Callable[[str], None],
-    notify: Callable[[str], None] = unheard,
+    notify: Callable[[str], None] = notify_nobody,
     opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""
@@ -130,13 +130,13 @@ def learn_sign(
             if noise_differs(movie, config, camera):
                 raise DataError("the movie does not tell another: " + NOISE)
             if heights_free(config):
-                seen, near = _begun(movie, wrong, camera, pool)
+                seen = _begun(movie, wrong, camera, pool)
             else:
                 images, others = bright_particle_images(movie, config, camera, pool, opening)
-                seen, near = Collected(config, images, others), config
+                seen = Collected(config, images, others)
             if len(seen.images) < LEAST_TESTED:
                 raise DataError(too_few(movie.name, len(seen.images)))
-            median, _ = median_p(list(seen.images), near, seen.others, pool.map)
+            median, _ = median_p(list(seen.images), config, seen.others, pool.map)
             if median >= REJECTED_P:
                 raise DataError("with it the optics describe the particles of the movie")
             found = _found(movie, seen, wrong, camera, pool)
@@ -147,13 +147,11 @@ def learn_sign(
     return adopted(found, config, tested, wrong.said, warn=warn)
 
 
-def _begun(
-    movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor
-) -> tuple[Collected, Config]:
+def _begun(movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecutor) -> Collected:
     """Fit the field with each focus of the right sign, and take what describes most particles."""
     config = wrong.config
     windows = measured_windows(movie, config, camera, *frame_ranges(movie, config))
-    best: tuple[float, Collected, Config] | None = None
+    best: tuple[float, Collected] | None = None
     for start in wrong.starts:
         images, others = seen_in_field(windows, start, pool)
         if len(images) < LEAST_TESTED:
@@ -161,8 +159,8 @@ def _begun(
         model = microscopes(start, max(map(reach_nm, images)))(settings_of(start))
         chi2 = float(np.median([goodness(image, model)[0] for image in images]))
         if best is None or chi2 < best[0]:
-            best = chi2, Collected(config, images, others, settings_of(start)), start
-    return best[1:] if best is not None else (Collected(config, ()), config)
+            best = chi2, Collected(config, images, others, settings_of(start))
+    return best[1] if best is not None else Collected(config, ())
 
 
 def _found(

@@ -1,14 +1,14 @@
 """Which microscope was it?  One loop, whoever the particles are: collect, test, fit, accept, again.
 
-Pictures of particles are collected, it is tested whether the optics with which they were found
-describe them, optics are fitted to them, and accepted or refused.  Pictures that depend on the
-optics are collected again with what was learned, until nothing changes.
+The loop collects pictures of particles, tests whether the optics with which they were found
+describe them, fits optics to them, and accepts or refuses the result.  Where pictures depend on the
+optics, it collects them again with what was learned, until nothing changes.
 
-Those of tracks do.  The light under particles that move is learned with their tracks.  With wrong
-optics it takes up a part of what these leave over, and the pictures show only the rest: what is
-learned from them is nearer to the truth, but not there, though it may describe the pictures.  Each
-round leaves a share of the error of the round before.  The share is seen in how much less a round
-changes than the one before, and with it what is still to come.
+Pictures of tracks do.  The light under particles that move is learned with their tracks.  With
+wrong optics it takes up a part of what they leave over, and the pictures show only the rest: what
+is learned from them is nearer to the truth, but not there, though it may describe the pictures.
+Each round leaves a share of the error of the round before.  The share is seen in how much less a
+round changes than the one before, and with it what is still to come.
 """
 
 from __future__ import annotations

@@ -219,7 +219,7 @@ def in_uneven_field(
     """
     images, config = seen.images, seen.config
     if len(images) < LEAST_SIGHTS:
-        return None
+        return seen  # too few for any optics, which is said where they are fitted
     build = microscopes(config, max(map(reach_nm, images)))
     signed = with_masses(images, build, settings)  # what leaves is seen before
     pictures = sorted(view.placed(signed), key=lambda sight: -sight.snr)

@@ -7,8 +7,8 @@ import pytest
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.instrument.bright import BrightStep, find_bright_steps
 from iscat_analysis.records import FloatArray
+from iscat_analysis.search.bright import BrightStep, find_bright_steps
 from iscat_analysis.search.sliding import STRIDES, Chunk, make_chunk, measure_frames
 
 LEVEL = 4000.0
