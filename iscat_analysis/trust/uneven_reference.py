@@ -40,6 +40,7 @@ _LARGEST = 0.3  # of a coefficient
 _WIDTHS = (0.5, 30.0)  # of a kernel, over the error of a mass
 _SPECIES = 2.0  # width of kernels above which masses are not those of a few species
 _BACKGROUND = 1e-3  # density of masses anywhere, over the logarithm of the mass
+_NEEDED = ("x_px", "y_px", "mass_kda", "sigma_mass_kda", "status")
 _STEP = 1e-3  # of numerical second derivatives
 
 
@@ -80,7 +81,8 @@ def reference_map(config: Config, table: pd.DataFrame) -> ReferenceMap | None:
     configured = any(optics.field_term(name) for name in TERMS)
     if configured or optics.scheme == "darkfield" or config.fit.mode == "track":
         return None
-    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode]:
+    shown = set(_NEEDED) <= set(table.columns)
+    if "mass_kda" not in FREE_PARAMETERS[config.fit.mode] or not shown:
         return None
     good = table[(table["status"] == Status.OK.value) & (table["sigma_mass_kda"] > 0)]
     relative = (good["sigma_mass_kda"] / good["mass_kda"].abs()).sort_values()
