@@ -64,7 +64,7 @@ WEIGHTS: Mapping[str, Callable[[Spot], Mapping[str, float]]] = {
 BASES: Mapping[str, tuple[str, ...]] = {name: tuple(of(Spot())) for name, of in WEIGHTS.items()}
 """The parameters that a coefficient changes."""
 
-STEPS = {"focus_nm": 5.0, "reference_phase_deg": 0.5, "z5": 1.0, "z6": 1.0, "z7": 1.0, "z8": 1.0}
+STEPS = {"focus_nm": 1.0, "reference_phase_deg": 0.5, "z5": 0.5, "z6": 0.5, "z7": 0.5, "z8": 0.5}
 """Changes of neighbouring models; half of one, which is the most that a spot is off, changes a
 picture by a thousandth of its peak."""
 

@@ -18,6 +18,7 @@ from iscat_analysis.optics.field_map import WEIGHTS, Spot
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.local import LocalModels
 from iscat_analysis.optics.parameters import FIELD, settings_of
+from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
 FIELD_PX = (101, 101)
@@ -176,3 +177,21 @@ def test_derivatives_of_partly_coherent_light_are_those_of_its_picture() -> None
         )  # fmt: skip
         slope = (up - down) / (2 * step)
         assert np.abs(change - slope).max() < 1e-5 * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("light", [{}, {"illumination_na": 0.15}])
+def test_a_simulated_particle_is_drawn_with_the_optics_of_its_place(light: dict[str, Any]) -> None:
+    config = _config(
+        "simulation.shape=[41, 41]", "simulation.frames=2", 'simulation.background="flat"',
+        "simulation.power_noise=0", "simulation.photons_per_pixel=1000",
+        "simulation.events=[{frame=1,x_px=35.0,y_px=20.0,mass_kda=480.0,z_nm=5.0}]",
+        "background.frames=[0,1]", focus_tilt_nm="[100, 0]", focus_nm=-300, **light,
+    )  # fmt: skip
+    before, after = Movie(config, 1).expected_frames()
+    grid = PixelGrid.region((0, 41), (0, 41), PIXEL_NM)
+    there = _config(focus_nm=-300 + 100 * 15 / 20.5, **light)
+    place = (35 * PIXEL_NM, 20 * PIXEL_NM, 5.0, 480.0)
+    expected = forward_model(there, 6000.0).image(grid, *place)
+    assert np.abs(after / before - 1 - expected).max() < 0.003 * np.abs(expected).max()
+    even = forward_model(_config(focus_nm=-300, **light), 6000.0).image(grid, *place)
+    assert np.abs(even - expected).max() > 0.05 * np.abs(expected).max()
