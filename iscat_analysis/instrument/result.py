@@ -12,7 +12,13 @@ import pandas as pd
 from scipy import ndimage
 
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.config import FIELD_TERMS, Config, OpticsCovariance, toml_value
+from iscat_analysis.config import (
+    FIELD_TERMS,
+    Config,
+    OpticsCovariance,
+    field_keys,
+    toml_value,
+)
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
 from iscat_analysis.optics.parameters import (
@@ -222,11 +228,9 @@ class OpticsCalibration:
             lines.append(f"{key} = {text}")
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
         lines += [f"aberrations_nm = {{ {terms} }}"]
-        lines += [
-            f"{key} = {toml_value(getattr(optics, key))}"
-            for key in sorted({key for key, _ in FIELD_TERMS.values()} | {"field_px"})
-            if not optics.is_even and getattr(optics, key)
-        ]
+        uneven = {name: optics.field_term(name) for name in FIELD_TERMS if optics.field_term(name)}
+        field = [*field_keys(uneven), *(["field_px"] if uneven else [])]
+        lines += [f"{key} = {toml_value(getattr(optics, key))}" for key in field]
         lines += ["", "[uncertainty]"]
         names, covariance = _of_optics(self.names, self.covariance)
         lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
