@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -64,6 +65,12 @@ def _zernike(j: int, rho: FloatArray, phi: FloatArray) -> FloatArray:
         11: np.sqrt(5) * (6 * rho**4 - 6 * rho**2),
     }
     return forms[j]
+
+
+@lru_cache(maxsize=2)
+def _bessel(argument: bytes, shape: tuple[int, int]) -> FloatArray:
+    """Bessel functions of orders 0 to 8, which microscopes of one aperture share."""
+    return np.array([jv(h, np.frombuffer(argument).reshape(shape)) for h in range(9)])
 
 
 class Pictures:
@@ -125,7 +132,7 @@ class Pictures:
         r = np.arange(0.0, reach_nm, 15.0)
         argument = k * m.n_immersion * sin * r[:, None]
         tables = []
-        whole = [jv(h, argument) * (weight * sin) for h in range(9)]
+        whole = [jh * (weight * sin) for jh in _bessel(argument.tobytes(), argument.shape)]
         for h in self._orders:
             bessel = whole[abs(h)] * (-1 if h < 0 and h % 2 else 1)
             tables.append(1j**h * np.einsum("rt,ct->rc", bessel, harmonics[:, :, h]))
@@ -169,6 +176,14 @@ class Pictures:
         linear, square = self._terms(dx_nm, dy_nm)
         amplitude = mass_kda * self.per_kda
         return amplitude * linear + amplitude**2 * square
+
+    def quadratures(
+        self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float, turn: float
+    ) -> FloatArray:
+        """Interference with a reference that is ahead by an angle."""
+        e = self._field(dx_nm, dy_nm)
+        reference = self._reference * np.exp(1j * turn)
+        return mass_kda * self.per_kda * 2 * np.real(e @ np.conj(reference))
 
     def at_height(self, z_nm: float) -> Pictures:
         """Put the particle at another height, and leave the focus where it was."""

@@ -117,9 +117,10 @@ def _lattice_hessian(
     """Do the same as `signal_hessian` with a lattice."""
     out[:] = 0.0
     offsets, weights = pixels.offsets, pixels.weights
-    e = np.empty(2, dtype=np.complex128)
-    de = np.empty((3, 2), dtype=np.complex128)
-    dde = np.empty((3, 3, 2), dtype=np.complex128)
+    count = lens.components
+    e = np.empty(count, dtype=np.complex128)
+    de = np.empty((3, count), dtype=np.complex128)
+    dde = np.empty((3, 3, count), dtype=np.complex128)
     for row in range(pixels.y.size):
         for i in range(offsets.size):
             dy = pixels.y[row] + offsets[i] - y_p
@@ -281,7 +282,7 @@ def _contract(
     column: int,
 ) -> None:
     """Add weight × signal and derivatives of one point, whose field is known along x and y."""
-    for c in range(2):
+    for c in range(e.size):
         ref = 2 * rho if c == 0 else 0.0
         power = e[c].real ** 2 + e[c].imag ** 2
         out[0, column] += weight * a * (ref * e[c].real + a * power)

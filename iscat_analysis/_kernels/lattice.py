@@ -4,7 +4,7 @@ An aberrated pupil has an azimuthal Fourier series at every polar angle, and so 
 
     E_c(r, φ) = Σ_m e^{imφ} i^m ∫ a_{c,m}(θ) J_m(n_i k r sinθ) dθ.
 
-`radial_waves` sums it along r, `spread` carries it to the nodes of a lattice.  Between the nodes a
+`radial_waves` sums it along r, `sampled` carries it to the nodes of a lattice.  Between the nodes a
 particle's image is a sum of `TAPS`² coefficients with the weights of a Kaiser–Bessel window,
 written as polynomials in the distance to the node, so that value and derivatives come from the same
 expression.  The field is band-limited at k·NA, and the coefficients are its samples after the
@@ -267,16 +267,15 @@ def _sample(waves: FloatArray, inv_step: float, step: float, out: FloatArray) ->
                         out[k, part, left, low] = ce - co + se - so
 
 
-def spread(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) -> FloatArray:
-    """Coefficients of k fields on the lattice.
+def sampled(waves: FloatArray, radial_step_nm: float, step_nm: float, half: int) -> FloatArray:
+    """Values of k fields at the nodes of a lattice, and beyond it as far as the filter needs them.
 
-    Shapes: `waves` (intervals, 6, M + 1, 4, k), result (k, 2, 2·half + 1, 2·half + 1).
+    Shapes: `waves` (intervals, 6, M + 1, 4, k), result (k, 2, side, side), along x and along y.
     """
     side = 2 * (half + FILTER) + 1
     fields = np.empty((waves.shape[4], 2, side, side))
     _sample(waves, 1 / radial_step_nm, step_nm, fields)
-    coefficients = undo_window(fields.reshape(-1, side, side))
-    return coefficients.reshape(-1, 2, 2 * half + 1, 2 * half + 1)
+    return fields
 
 
 def undo_window(samples: FloatArray) -> FloatArray:

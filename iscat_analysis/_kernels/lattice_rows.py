@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-FIELDS = 16
-"""Rows for a row of pixels: the fields (4), their ∂/∂z, slopes along x and slopes along y."""
+MOST = 10
+"""Real and imaginary parts of the most components of a field: see `LatticeLens`."""
+
+FIELDS = 4 * MOST
+"""Rows for a row of pixels: the fields, their ∂/∂z, slopes along x and slopes along y."""
 
 STRIP = 8
 """Columns of pixels that are interpolated together: one cache line."""
@@ -173,9 +176,9 @@ def _add_gradient(
     """Add one component's share of signal and gradient to `out` (5, nx)."""
     a = amplitude
     e_r, e_i = f[part], f[part + 1]
-    z_r, z_i = f[4 + part], f[5 + part]
-    x_r, x_i = f[8 + part], f[9 + part]
-    y_r, y_i = f[12 + part], f[13 + part]
+    z_r, z_i = f[MOST + part], f[MOST + 1 + part]
+    x_r, x_i = f[2 * MOST + part], f[2 * MOST + 1 + part]
+    y_r, y_i = f[3 * MOST + part], f[3 * MOST + 1 + part]
     for j in range(e_r.size):
         g_r, g_i = 2 * weight * a * (rho + a * e_r[j]), 2 * weight * a * a * e_i[j]
         out[1, j] -= g_r * x_r[j] + g_i * x_i[j]
@@ -214,15 +217,15 @@ def lattice_gradient(
             start = FIELDS + sample * 3 * width * rows + top
             for k in range(width):
                 here = start + k * rows
-                _blend_both(f, here, 0, value, slope, f[k], f[12 + k])
+                _blend_both(f, here, 0, value, slope, f[k], f[3 * MOST + k])
                 here += width * rows
-                _blend(f, here, 0, value, f[4 + k])
+                _blend(f, here, 0, value, f[MOST + k])
                 here += width * rows
-                _blend(f, here, 0, value, f[8 + k])
+                _blend(f, here, 0, value, f[2 * MOST + k])
             weight = pixels.weights[i] * pixels.weights[sample]
             _add_gradient(lens.rho, amplitude, weight, f, 0, out)
-            if lens.components == 2:
-                _add_gradient(0.0, amplitude, weight, f, 2, out)
+            for c in range(1, lens.components):
+                _add_gradient(0.0, amplitude, weight, f, 2 * c, out)
 
 
 @kernel(fastmath=FAST)
@@ -261,8 +264,8 @@ def lattice_signal(
                 _blend(f, here, 0, value, f[k])
             weight = pixels.weights[i] * pixels.weights[sample]
             _add_signal(lens.rho, amplitude, weight, f[0], f[1], out)
-            if lens.components == 2:
-                _add_signal(0.0, amplitude, weight, f[2], f[3], out)
+            for c in range(1, lens.components):
+                _add_signal(0.0, amplitude, weight, f[2 * c], f[2 * c + 1], out)
 
 
 @kernel(fastmath=FAST)

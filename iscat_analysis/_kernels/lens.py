@@ -30,7 +30,10 @@ class RoundLens(NamedTuple):
 
 
 class LatticeLens(NamedTuple):
-    """Lens of any pupil, whose fields are on a lattice."""
+    """Lens of any pupil, whose fields are on a lattice.
+
+    The first component interferes with the reference; the light of the others is added to it.
+    """
 
     inv_step: float
     rho: float

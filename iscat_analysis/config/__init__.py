@@ -17,6 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
+from iscat_analysis.config.field import FIELD_TERMS, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
@@ -30,15 +31,13 @@ from iscat_analysis.config.instrument import (
     AUTO,
     LARGEST_SD_NM,
     MEASURABLE,
-    Calibration,
     CameraConfig,
     Optics,
     OpticsCovariance,
     Particle,
-    StandardsCamera,
-    Uncertainty,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
+from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.synthetic import (
     SIMULATED,
@@ -62,6 +61,7 @@ __all__ = [
     "ALL",
     "ASSUMED",
     "AUTO",
+    "FIELD_TERMS",
     "LARGEST_SD_NM",
     "MEASURABLE",
     "PIXEL_NM",
@@ -91,6 +91,7 @@ __all__ = [
     "Uncertainty",
     "config_to_toml",
     "configure",
+    "field_keys",
     "load_config",
     "parse_config",
     "plausible_pixel",

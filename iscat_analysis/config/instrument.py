@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from iscat_analysis.config.field import FIELD_TERMS, FieldTerms, Share, Size
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -32,10 +33,6 @@ LARGEST_SD_NM = 100.0
 
 LARGEST_ATTENUATION = 3.0
 """Largest attenuation: transmitted amplitude of the reference over that of scattered light."""
-
-CONTRAST_PER_KDA = (1e-7, 0.01)
-"""Range of contrast per kDa: a protein has some 1e-5; at the upper limit, the contrast of 100 kDa
-would be 1."""
 
 DENSITIES_KG_M3 = {"gold": 19300.0, "silica": 2200.0, "polystyrene": 1050.0, "protein": 1350.0}
 """Densities of the kinds of particles; for protein, the usual value in mass photometry."""
@@ -85,12 +82,20 @@ class OpticsCovariance(Section):
     names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
     matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
 
+    @property
+    def of_the_middle(self) -> OpticsCovariance:
+        """Errors of the optics in the middle of the field, without those of its terms."""
+        kept = [k for k, name in enumerate(self.names) if name not in FIELD_TERMS]
+        matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
+        return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
+
     @model_validator(mode="after")
     def _symmetric(self) -> OpticsCovariance:
         size = len(self.names)
-        unknown = [name for name in self.names if name not in MEASURABLE]
+        known = (*MEASURABLE, *FIELD_TERMS)
+        unknown = [name for name in self.names if name not in known]
         if unknown:
-            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(MEASURABLE)}")
+            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
         if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
             raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
         for i, row in enumerate(self.matrix):
@@ -103,7 +108,7 @@ class OpticsCovariance(Section):
         return self
 
 
-class Optics(Section):
+class Optics(FieldTerms):
     """The microscope (physics.md, section 1)."""
 
     file: str | None = Field(
@@ -167,6 +172,43 @@ class Optics(Section):
     )
     calibrate: Literal["auto", "always", "never"] = Field(
         "auto", description='"auto" | "always" | "never": learn the optics from the movie'
+    )
+
+    illumination_na: Annotated[Finite, Field(ge=0, le=0.5)] = Field(
+        0.0, description="aperture of a cone that is evenly filled with light; 0: one plane wave"
+    )
+    bandwidth_nm: Annotated[Finite, Field(ge=0, le=100.0)] = Field(
+        0.0, description="full width at half maximum of the spectrum; 0: one wavelength"
+    )
+
+    focus_tilt_nm: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="rise of the focus from the centre of the field to its edge, [x, y]"
+    )
+    focus_curvature_nm: Size = Field(
+        0.0, description="the same, growing with the square of the distance from the centre"
+    )
+    coma_field_nm: Size = Field(
+        0.0, description="coma at the edge of the field, along the radius and growing with it"
+    )
+    astigmatism_field_nm: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="astigmatism at the edge, linear in the field, [x, y]"
+    )
+    phase_tilt_deg: tuple[Size, Size] = Field(
+        (0.0, 0.0), description="change of reference_phase_deg from centre to edge, [x, y]"
+    )
+    phase_curvature_deg: Size = Field(
+        0.0, description="the same, growing with the square of the distance"
+    )
+    reference_tilt: tuple[Share, Share] = Field(
+        (0.0, 0.0), description="change of the reference's amplitude from centre to edge, a share"
+    )
+    reference_curvature: Share = Field(
+        0.0, description="the same, growing with the square of the distance"
+    )
+    field_px: tuple[Finite, Finite, Annotated[Finite, Field(gt=0)]] | None = Field(
+        None,
+        description="centre x, y of the field and half its longer side [pixels], for which these "
+        "terms hold; the movie's where absent",
     )
 
     covariance: OpticsCovariance | None = Field(
@@ -412,80 +454,3 @@ class Particle(Section):
     def height_prior_sd_nm(self) -> float:
         """Standard deviation of the prior of heights; wide before they are learned from a movie."""
         return self.height_sd_nm or (UNKNOWN_SD_NM if self.height_is_open else 0.0)
-
-
-class StandardsCamera(Section):
-    """The detector with which the standards of a calibration were recorded."""
-
-    pixel_size_nm: Positive | None = Field(None, description="in the sample plane")
-    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(1, description="per axis")
-    gain_e_per_adu: Positive | None = Field(
-        None, description="photoelectrons per count, where it is one number"
-    )
-    offset_adu: Finite | None = Field(
-        None, description="counts in the dark, where they are one number"
-    )
-
-
-class Calibration(Section):
-    """Contrast against mass; if present, it replaces the absolute scale of the model.
-
-    Signed peak contrast = gradient·mass + sign(mass)·offset, with the optics of the standards; for
-    other optics the model converts it.
-    """
-
-    gradient_per_kda: Finite = Field(description="signed peak contrast per kDa")
-    offset: Finite = Field(0.0, description="peak contrast at zero mass (odd-symmetric)")
-    gradient_se_per_kda: NonNegative = Field(
-        0.0, description="standard error of gradient_per_kda; 0: not known"
-    )
-    offset_se: NonNegative = Field(0.0, description="standard error of offset")
-    correlation: Annotated[float, Field(ge=-1, le=1)] = Field(
-        0.0, description="of the errors of gradient_per_kda and offset"
-    )
-    dof: Annotated[int, Field(ge=0)] | None = Field(
-        None, description="degrees of freedom of the line: standards beyond two"
-    )
-    optics: Optics | None = Field(
-        None, description="keys of [optics] with which the standards were analysed"
-    )
-    covariance: OpticsCovariance | None = Field(
-        None, description="of these if they were learned, { names, matrix }"
-    )
-    height_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] | None = Field(
-        None, description="particle.height_nm with which the standards were analysed"
-    )
-    camera: StandardsCamera | None = Field(None, description="with which they were recorded")
-    optics_assumed: bool = Field(
-        False, description="true: the optics are not known; those configured are assumed"
-    )
-
-    @model_validator(mode="after")
-    def _usable(self) -> Calibration:
-        if self.gradient_per_kda == 0:
-            raise ValueError("gradient_per_kda = 0 says nothing about mass")
-        least, most = CONTRAST_PER_KDA
-        if not least <= abs(self.gradient_per_kda) <= most:
-            raise ValueError(
-                f"gradient_per_kda = {self.gradient_per_kda:g} is not between {least:g} and "
-                f"{most:g}: give contrast per kDa, as -3.1e-5, not in per cent or ppm, nor per "
-                "Da or MDa"
-            )
-        return self
-
-
-class Uncertainty(Section):
-    """Standard deviations of inputs that were not measured; 0 turns one off.
-
-    If standards were recorded with the same optics, they have the same errors, which cancel.
-    """
-
-    wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
-    n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
-    n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
-    height_nm: NonNegative = Field(
-        2.0, description="of the mean height of particles, if particle.height_nm is fixed"
-    )
-    magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
-        0.005, description="of camera.pixel_size_nm, as a share of it"
-    )

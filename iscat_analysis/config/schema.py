@@ -17,13 +17,8 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.instrument import (
-    Calibration,
-    CameraConfig,
-    Optics,
-    Particle,
-    Uncertainty,
-)
+from iscat_analysis.config.instrument import CameraConfig, Optics, Particle
+from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
 

@@ -9,12 +9,13 @@ from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.moving_focus import MovingFocus, refuse_moving_focus
 from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.local import LocalModels, refuse_moving_focus, refuse_uneven_field
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.search.sliding import CORRELATION
@@ -41,15 +42,15 @@ class AnalysisContext:
     mode: str
     searches: int = 1
     lines: Lines | None = None
-    moving: tuple[MovingFocus, MovingFocus] | None = None
+    local: tuple[LocalModels, LocalModels] | None = None
 
-    def model_at(self, frame: int) -> ForwardModel:
-        """Give the model for fitted regions at a frame of the movie."""
-        return self.model if self.moving is None else self.moving[0].at(frame)
+    def model_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
+        """Give the model for fitted regions at a place, in a frame of the movie."""
+        return self.model if self.local is None else self.local[0].at(x_nm, y_nm, frame)
 
-    def wide_at(self, frame: int) -> ForwardModel:
-        """Give the model for signals far away at a frame of the movie."""
-        return self.wide if self.moving is None else self.moving[1].at(frame)
+    def wide_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
+        """Give the model for signals far away of a particle at a place, in a frame of the movie."""
+        return self.wide if self.local is None else self.local[1].at(x_nm, y_nm, frame)
 
     def height_nm(self, mass_kda: float) -> float:
         """Height at which a particle is expected, where its height is not free."""
@@ -113,6 +114,7 @@ def make_context(
         )
     if not sliding or config.optics.psf == "measured":
         refuse_moving_focus(config)
+    refuse_uneven_field(config)
     model = square_model(config, pixel, roi_px)
     if sliding:
         reach_nm = math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel
@@ -122,14 +124,14 @@ def make_context(
     mode = config.fit.mode
     free_z = "z_nm" in FREE_PARAMETERS[mode] and not sliding
     wide = forward_model(config, reach_nm)
-    moving = None
-    if config.optics.focus_drift_nm:
-        moving = MovingFocus(config, model), MovingFocus(config, wide)
+    local = None
+    if terms_of(config.optics):
+        local = LocalModels(config, model, field_px), LocalModels(config, wide, field_px)
     return AnalysisContext(
         config=config,
         model=model,
         wide=wide,
-        moving=moving,
+        local=local,
         templates=make_templates(
             model,
             search_both(config.detection, searches=searches),

@@ -199,7 +199,7 @@ def add_signal(
         slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
         slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
     )
-    total[inside] += context.wide.image(grid, *place)
+    total[inside] += context.wide_at(x_nm, y_nm).image(grid, *place)
 
 
 def search_field(

@@ -95,7 +95,9 @@ def region_likelihood(
     cut = region.slices
     config = context.config
     grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
-    model = context.model if grid.diagonal_nm <= context.model.reach_nm else context.wide
+    near = grid.diagonal_nm <= context.model.reach_nm
+    middle = (float(np.mean(grid.x_nm)), float(np.mean(grid.y_nm)))
+    model = context.model_at(*middle) if near else context.wide
     before, after, masked = windows.before_e[cut], windows.after_e[cut], windows.masked[cut]
     return counts_likelihood(
         model, grid, before, after, windows.power_ratio,

@@ -82,7 +82,8 @@ class DetectionResult:
 def collected_photons(context: AnalysisContext, event: Event) -> float:
     """Scattered photons that the pupil collected from one particle in the frames after."""
     windows = event.windows
-    area = collected_area_nm2(context.model, event.fit.z_nm, event.fit.mass_kda)
+    model = event.likelihood.model  # that of its place
+    area = collected_area_nm2(model, event.fit.z_nm, event.fit.mass_kda)
     if context.additive:
         per_pixel = photons_scale(context, windows)
     else:

@@ -1,18 +1,16 @@
-"""The optics fitted to pictures: at one height, at heights of their own, in a focus that moves."""
+"""The optics fitted to pictures: at one height, or at heights of their own."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.moving_focus import DRIFT_FRAMES
-from iscat_analysis.instrument.joint_fit import Neighbours, first_step, maximise
+from iscat_analysis.instrument.joint_fit import Neighbours, maximise
 from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm, rings_of
 from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
@@ -20,6 +18,7 @@ from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, m
 from iscat_analysis.instrument.starts import FOCUS_STEP_NM
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
+    FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     FREE,
@@ -27,7 +26,6 @@ from iscat_analysis.optics.parameters import (
     Settings,
     free_names,
     optics_limits,
-    prior_range,
     settings_of,
 )
 from iscat_analysis.records import Mapper
@@ -112,8 +110,8 @@ def _fitted(
         configured[FOCUS_STEP] = seen.focus_step_nm
         low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
-    if seen.near is not None and FOCUS_DRIFT in seen.near:
-        configured[FOCUS_DRIFT] = 0.0
+    near = seen.near or {}
+    configured |= {name: 0.0 for name in (FOCUS_DRIFT, *FIELD) if name in near}
     build = microscopes(config, max(map(reach_nm, images)))
     focus = config.optics.focus_nm
     search = OpticsSearch(
@@ -237,104 +235,3 @@ def _best_heights(
             turned = sight.mass_kda * fit.mass_kda < 0
             of_it.append((turned, goodness(fit, model)[0], fit))
     return [min(fits, key=lambda fit: fit[:2])[1:] for fits in found]
-
-
-MOVES = 5.0
-"""Standard errors from which a focus is said to move."""
-
-LEAST_RISE_NM = 15.0
-"""Rise over the movie below which pictures and masses hardly change."""
-
-LEAST_PICTURES = 6
-"""From fewer it is not known how well they tell a drift."""
-
-_FOCI = 20  # parts of the movie with a focus of their own, in which pictures are looked at
-_DRIFT_PASSES = 10
-
-
-class FocusDrift(NamedTuple):
-    """How the focus of a movie rises."""
-
-    nm: float
-    sigma_nm: float
-    frames: tuple[int, int]
-
-    @property
-    def moves(self) -> bool:
-        """Whether it does, and enough to matter."""
-        return abs(self.nm) > MOVES * self.sigma_nm and abs(self._rise_nm) > LEAST_RISE_NM
-
-    @property
-    def is_plausible(self) -> bool:
-        """Whether a focus can move so far; pictures that no focus describes ask for anything."""
-        farthest = prior_range("focus_nm")
-        return abs(self.nm) < prior_range(FOCUS_DRIFT) and abs(self._rise_nm) < farthest
-
-    @property
-    def said(self) -> str:
-        """Say so, to first order."""
-        return f"the focus moves by about {self._rise_nm:+.0f} nm over the movie"
-
-    @property
-    def _rise_nm(self) -> float:
-        return self.nm * (self.frames[1] - self.frames[0]) / DRIFT_FRAMES
-
-
-STEADY = FocusDrift(0.0, math.inf, (0, 0))
-"""Where nothing is known of a drift."""
-
-
-def focus_drift(
-    sights: Sequence[ParticleImage],
-    config: Config,
-    settings: Settings,
-    frames: tuple[int, int],
-    mapper: Mapper = map,
-) -> FocusDrift:
-    """Measure how the focus rises, to first order."""
-    seen = dated(sights, frames)
-    if len({sight.focus_steps for sight in seen}) < LEAST_PICTURES:
-        return STEADY
-    build = microscopes(config, max(map(reach_nm, sights)))
-    names = ("focus_nm", FOCUS_DRIFT)
-    step, covariance = first_step(seen, build, {**settings, FOCUS_DRIFT: 0.0}, names, mapper)
-    drift = FocusDrift(float(step[1]), math.sqrt(covariance[1, 1]), frames)
-    return drift if drift.is_plausible else STEADY
-
-
-def in_moving_focus(
-    seen: Collected, settings: Settings, drift: FocusDrift, mapper: Mapper = map
-) -> Collected:
-    """Give pictures their times, and a microscope near theirs whose focus rises."""
-    images, frames = seen.images, drift.frames
-    build = microscopes(seen.config, max(map(reach_nm, images)))
-    near: dict[str, object] = {**settings, FOCUS_DRIFT: drift.nm}
-    signed = with_masses(images, build, settings)  # what leaves is seen before
-    placed = with_masses(dated(signed, frames), build, near)
-    fitted = maximise(
-        placed, build, near, ("focus_nm", FOCUS_DRIFT), passes=_DRIFT_PASSES, mapper=mapper
-    )
-    optics = seen.config.optics.model_copy(update={"focus_frame": _middle(frames)})
-    return Collected(
-        seen.config.model_copy(update={"optics": optics}),
-        fitted.sights, dated(seen.others, frames), near=fitted.values,
-    )  # fmt: skip
-
-
-def dated(sights: Sequence[ParticleImage], frames: tuple[int, int]) -> list[ParticleImage]:
-    """Give pictures the time of the frames that show their particle."""
-    part = max((frames[1] - frames[0]) / _FOCI, 1.0)
-    middle = _middle(frames)
-
-    def shown(sight: ParticleImage) -> float:
-        before, after = sight.frames
-        return before if sight.mass_kda < 0 else after
-
-    return [
-        replace(sight, focus_steps=round((shown(sight) - middle) / part) * part / DRIFT_FRAMES)
-        for sight in sights
-    ]
-
-
-def _middle(frames: tuple[int, int]) -> int:
-    return (frames[0] + frames[1]) // 2

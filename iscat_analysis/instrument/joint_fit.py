@@ -39,6 +39,7 @@ _HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
 _LEVEL_STEP = 0.5
 _Z = 2  # of what is a sight's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
+_FLAT = 1e-10  # share of the largest eigenvalue below which a direction is not determined
 _TOGETHER = 5  # sights of one task; a millisecond each
 
 
@@ -117,22 +118,41 @@ def maximise(
     )
 
 
-def first_step(
+@dataclass(frozen=True)
+class Asked:
+    """How the likelihood of pictures changes with parameters of the optics, to second order."""
+
+    names: tuple[str, ...]
+    information: FloatArray
+    score: FloatArray
+    scatter: FloatArray
+
+    def step(self, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Say how far the pictures ask to change some of them, the others held.
+
+        Shapes: `step` (n,), `covariance` (n, n).
+        """
+        chosen = [self.names.index(name) for name in names]
+        both = np.ix_(chosen, chosen)
+        unit = 1 / np.sqrt(np.maximum(np.diag(self.information)[chosen], 1e-300))
+        scaled = self.information[both] * np.outer(unit, unit)
+        bound = np.linalg.pinv(scaled, rcond=_FLAT, hermitian=True) * np.outer(unit, unit)
+        return bound @ self.score[chosen], bound @ self.scatter[both] @ bound
+
+
+def asked_changes(
     sights: Sequence[ParticleImage],
     build: Build,
     settings: Settings,
     names: Sequence[str],
     mapper: Mapper = map,
-) -> tuple[FloatArray, FloatArray]:
-    """Say how far pictures ask to change some parameters, to first order.
-
-    Shapes: `step` (n,), `covariance` (n, n).
-    """
+) -> Asked:
+    """Look how pictures ask to change the optics."""
     private, walls = np.array([sight.private for sight in sights]), _walls(sights)
     at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
     information, score, _ = at.reduced(0.0)
-    bound = np.linalg.pinv(information, hermitian=True)
-    return bound @ score, bound @ at.scatter([sight.owner for sight in sights]) @ bound
+    scatter = at.scatter([sight.owner for sight in sights])
+    return Asked(tuple(names), information, score, scatter)
 
 
 def _walls(sights: Sequence[ParticleImage]) -> FloatArray:
@@ -302,15 +322,17 @@ def _scores(
     x, y, z, mass, level = (float(v) for v in private)
     place = (sight.grid, x, y, z, mass)
     k = len(names)
-    moved = [PARAMETERS[name].moves or name for name in names]
-    wanted = tuple(dict.fromkeys(moved))
+    wanted = tuple(dict.fromkeys(base for name in names for base in sight.slopes(name)))
     if names:
         signal, own, slopes = model.joint_gradient(*place, wanted)
     else:
         signal, own = model.gradient(*place)
     rows = np.empty((k + PRIVATE, signal.size))
-    for row, name, here in zip(rows, names, moved, strict=False):
-        row[:] = sight.share_of(name) * slopes[wanted.index(here)].ravel()
+    for row, name in zip(rows, names, strict=False):
+        row[:] = sum(
+            weight * slopes[wanted.index(base)].ravel()
+            for base, weight in sight.slopes(name).items()
+        )
     rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
     value, residual, weight, of_signal, of_level = sight.noise.terms(sight.data, signal, level)
     rows[:-1] *= of_signal.ravel()

@@ -24,7 +24,7 @@ from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
-from iscat_analysis.instrument.fit_optics import STEADY, Collected, FocusDrift, focus_drift
+from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.loop import accepted, learn
 from iscat_analysis.instrument.microscope import (
     REJECTED_P,
@@ -35,7 +35,15 @@ from iscat_analysis.instrument.microscope import (
 )
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.sources import StandingAlone, WholeField, seen_in_field
+from iscat_analysis.instrument.uneven import (
+    EVEN,
+    Change,
+    FieldOfView,
+    asked_change,
+    in_uneven_field,
+)
 from iscat_analysis.movie import Stack
+from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.parameters import (
     FREE,
     LEAST_SIGHTS,
@@ -77,7 +85,7 @@ def learn_optics(
         reason
         or config.fit.mode == "track"  # which learns from its tracks
         or optics.calibrate == "never"
-        or (optics.calibrate == "auto" and (optics.file is not None or optics.focus_drift_nm))
+        or (optics.calibrate == "auto" and (optics.file is not None or terms_of(optics)))
     ):
         return config, {}
     tested: Tested | None = None
@@ -85,25 +93,30 @@ def learn_optics(
         try:
             tested = tested_optics(movie, config, camera, pool, opening)
             passed = optics.calibrate == "auto" and tested.median_p >= REJECTED_P
-            if passed and not tested.drift.moves:
+            if passed and not tested.change.matters:
                 return config, tested.summary | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
                 reason = f"{NOISE}; the analysis goes on as configured"
                 warn(f"the optics cannot be tested on this movie: {reason}")
                 return config, tested.summary | {"calibrated": False, "reason": reason}
             notify("learning the optics from the particles of the movie, which may take minutes…")
-            drift = tested.drift if passed else STEADY
             origin = {"movie": movie.name}
-            found = learned_from(
-                tested.seen, movie, config, camera, tuple(FREE), origin, pool, drift
-            )
+            if passed:
+                view = FieldOfView.of(movie, config, in_time=background_mode(config) == "sliding")
+                moved = in_uneven_field(tested.seen, settings_of(config), view, pool.map)
+                if moved is None:  # pictures that were not fitted want no change
+                    return config, tested.summary | {"calibrated": False}
+                known = StandingAlone(moved, pool)
+                found = learn(known, config, tuple(FREE), origin, pool.map).outcome
+            else:
+                found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
         except DataError as error:
-            moving = tested is not None and tested.drift.moves
-            reason = f"{error}; {tested.drift.said}" if tested and moving else str(error)
+            changing = tested is not None and tested.change.matters
+            reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
             warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
-            known = tested.summary if tested else {}
-            return config, known | {"calibrated": False, "reason": reason}
-    verdict = tested.drift.said if passed else _verdict(tested)
+            summary = tested.summary if tested else {}
+            return config, summary | {"calibrated": False, "reason": reason}
+    verdict = tested.change.said if passed else _verdict(tested)
     return adopted(found, config, tested.summary, verdict, warn=warn)
 
 
@@ -116,7 +129,8 @@ class Tested:
 
     particles: int
     median_p: float
-    drift: FocusDrift = STEADY
+    change: Change = EVEN
+    """Over the field or in time, that they ask for."""
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -152,20 +166,20 @@ def tested_optics(
         images, others = bright_particle_images(movie, config, camera, pool, opening)
         alone = len(images)
         median, fitted = median_p(images, config, others, pool.map)
-    drift = STEADY
-    if sliding:
-        frames = fitted_frames(movie, config, config.background.recorded)
-        drift = focus_drift(fitted, config, settings_of(config), frames, pool.map)
-    if drift.moves:  # which the first particles of a long movie tell badly
+    change = EVEN
+    if not heights_free(config):
+        view = FieldOfView.of(movie, config, in_time=sliding)
+        change = asked_change(fitted, config, settings_of(config), view, pool.map)
+    if sliding and change.matters:  # which the first particles of a long movie tell badly
         images, others = bright_particle_images(movie, config, camera, pool, opening, whole=True)
         alone = len(images)
-    elif auto and median < REJECTED_P and not heights_free(config):
+    elif auto and median < REJECTED_P and not heights_free(config) and not change.matters:
         pairs, median = not_alone(images, config, others, pool.map)
         images = [image for k, image in enumerate(images) if k not in pairs]
         alone -= sum(k < alone for k in pairs)
         if len(images) < LEAST_TESTED:
             raise DataError(too_few(movie.name, len(images)))
-    return Tested(Collected(config, images[:alone], others), len(images), median, drift)
+    return Tested(Collected(config, images[:alone], others), len(images), median, change)
 
 
 def why_not(config: Config) -> str:
@@ -293,17 +307,14 @@ def learned_from(
     groups: Sequence[str],
     origin: Mapping[str, str],
     pool: ThreadPoolExecutor,
-    drift: FocusDrift = STEADY,
 ) -> OpticsCalibration:
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     scan, way = seen.focus_step_nm is not None, background_mode(config)
     crowded = way == "fixed" and not scan
     if not crowded or len(seen.images) >= LEAST_SIGHTS:
-        landed = way == "sliding" and not scan and "focus" in groups
-        frames = fitted_frames(movie, config) if landed else None
-        found = learn(
-            StandingAlone(seen, pool, frames, drift), config, groups, origin, pool.map
-        ).outcome
+        asked = not scan and not heights_free(config) and set(groups) == set(FREE)
+        view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
+        found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome
         if found.accepted or not crowded:
             return found
     field = WholeField(_summed(movie, config, camera), config, pool)

@@ -48,7 +48,7 @@ def reach_nm(sight: ParticleImage) -> float:
     return sight.grid.diagonal_nm / 2 + _SHIFT_NM
 
 
-_MODELS_KEPT = 24
+_MODELS_KEPT = 64  # as many as there are pictures with optics of their own
 
 
 def refuse_uncalibratable(config: Config) -> None:

@@ -11,9 +11,10 @@ from scipy import ndimage
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise_models import CONDITIONAL, NoiseModel
+from iscat_analysis.optics.field_map import WEIGHTS, Spot, changes_at
 from iscat_analysis.optics.forward import ForwardModel, peak_per_amplitude
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.parameters import PARAMETERS, Settings
+from iscat_analysis.optics.parameters import FOCUS_STEP, Settings
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5
@@ -66,6 +67,7 @@ class ParticleImage:
     mass_kda: float = 0.0
     level: float = 0.0
     focus_steps: float = 0.0
+    place: tuple[float, float] = (0.0, 0.0)
     frames: tuple[float, float] = (0.0, 0.0)
     snr: float = 0.0
     neighbours: tuple[tuple[int, float], ...] = ()
@@ -94,16 +96,22 @@ class ParticleImage:
 
     def seen_with(self, settings: Settings) -> dict[str, Any]:
         """Return the settings of the microscope in this picture, as keys of ``[optics]``."""
-        own = {name: value for name, value in settings.items() if not _moves(name)}
-        for name, value in settings.items():
-            if moved := _moves(name):
-                own[moved] += self.share_of(name) * value
+        own = {k: v for k, v in settings.items() if k not in WEIGHTS and k != FOCUS_STEP}
+        own["focus_nm"] += self.focus_steps * settings.get(FOCUS_STEP, 0.0)
+        for base, change in changes_at(settings, self.spot).items():
+            own[base] = own.get(base, 0.0) + change
         return own
 
-    def share_of(self, name: str) -> float:
-        """By how much of a parameter the one that it moves is moved in this picture."""
-        times = PARAMETERS[name].times if name in PARAMETERS else ""
-        return float(getattr(self, times)) if times else 1.0
+    @property
+    def spot(self) -> Spot:
+        """Where in the field and when the picture was taken."""
+        return Spot(*self.place, self.focus_steps)
+
+    def slopes(self, name: str) -> Mapping[str, float]:
+        """Give by how much a shared parameter changes those of this picture's optics."""
+        if name == FOCUS_STEP:
+            return {"focus_nm": self.focus_steps}
+        return WEIGHTS[name](self.spot) if name in WEIGHTS else {name: 1.0}
 
     def moved(self, private: FloatArray) -> ParticleImage:
         """Return the same pictures with another start."""
@@ -123,11 +131,6 @@ class ParticleImage:
         """Return the same picture with another height, or the nearest that is possible."""
         low, high = self.heights_nm or (self.z_nm, self.z_nm)
         return replace(self, z_nm=min(max(self.z_nm + shift_nm, low), high))
-
-
-def _moves(name: str) -> str:
-    """Name the parameter that another changes from one picture to another."""
-    return PARAMETERS[name].moves if name in PARAMETERS else ""
 
 
 def models_of(

@@ -12,10 +12,17 @@ import pandas as pd
 from scipy import ndimage
 
 from iscat_analysis._kernels.zernike import zernike
-from iscat_analysis.config import Config, OpticsCovariance
+from iscat_analysis.config import (
+    FIELD_TERMS,
+    Config,
+    OpticsCovariance,
+    field_keys,
+    toml_value,
+)
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
 from iscat_analysis.optics.parameters import (
+    FIELD,
     FOCUS_DRIFT,
     FOCUS_STEP,
     RISES,
@@ -175,6 +182,11 @@ class OpticsCalibration:
                 "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
             )
             parts.append(f"{drift} in 1000 frames")
+        parts += [
+            with_error(name_in_words(n), self.value(n), self.sigma(n), n.rsplit("_", 1)[1])
+            for n in self.names
+            if n in FIELD
+        ]
         terms = [n for n in self.names if is_term(n)]
         if terms:
             rms = float(np.sqrt(sum(self.value(n) ** 2 for n in terms)))
@@ -215,7 +227,11 @@ class OpticsCalibration:
             text = said or (f'"{value}"' if isinstance(value, str) else f"{value:.9g}")
             lines.append(f"{key} = {text}")
         terms = ", ".join(f"{n} = {v:.9g}" for n, v in optics.aberrations_nm.items())
-        lines += [f"aberrations_nm = {{ {terms} }}", "", "[uncertainty]"]
+        lines += [f"aberrations_nm = {{ {terms} }}"]
+        uneven = {name: optics.field_term(name) for name in FIELD_TERMS if optics.field_term(name)}
+        field = [*field_keys(uneven), *(["field_px"] if uneven else [])]
+        lines += [f"{key} = {toml_value(getattr(optics, key))}" for key in field]
+        lines += ["", "[uncertainty]"]
         names, covariance = _of_optics(self.names, self.covariance)
         lines += [f"{name} = {self.sigma(name):.6g}" for name in names]
         quoted = ", ".join(f'"{name}"' for name in names)
@@ -377,6 +393,13 @@ def correlation(covariance: FloatArray) -> FloatArray:
     """
     sigma = np.sqrt(np.diag(covariance))
     return np.asarray(covariance / np.outer(sigma, sigma)) if sigma.size else covariance
+
+
+def name_in_words(name: str) -> str:
+    """Say what a coefficient of the field is."""
+    what, *_, last, _ = name.split("_")
+    kind = {"tilt": "tilt", "curvature": "curvature"}.get(name.split("_")[1], "over the field")
+    return f"{what} {kind} along {last}" if last in ("x", "y") else f"{what} {kind}"
 
 
 def with_error(label: str, value: float, sigma: float, unit: str) -> str:

@@ -19,16 +19,10 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.instrument.collect import bright_places, known_places
-from iscat_analysis.instrument.fit_optics import (
-    STEADY,
-    Collected,
-    FocusDrift,
-    focus_drift,
-    in_moving_focus,
-    misfit_of,
-)
+from iscat_analysis.instrument.fit_optics import Collected, misfit_of
 from iscat_analysis.instrument.loop import Rounds
 from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.uneven import FieldOfView, asked_change, in_uneven_field
 from iscat_analysis.optics.parameters import LEAST_SIGHTS, heights_free, settings_of
 from iscat_analysis.records import Status, Windows
 
@@ -48,34 +42,25 @@ fitted with the next ones has a single one."""
 class StandingAlone:
     """Particles that stand alone.
 
-    Landings tell besides whether the focus rises while the movie is recorded: what pictures ask to
-    change about the focus is then a line in their frames.
+    They tell besides whether the optics change over the field or while the movie is recorded.
     """
 
     seen: Collected
     pool: ThreadPoolExecutor
-    landed: tuple[int, int] | None = None
-    """Frames in which particles landed at different times."""
-
-    drift: FocusDrift = STEADY
-    """Of the focus, where it is known to move in the configured optics."""
+    view: FieldOfView | None = None
+    """Where and when they were seen, if that is asked for."""
 
     def collect(self, rounds: Rounds) -> Collected | None:
-        """Give all pictures, and once more with the times at which they show a focus that moves."""
-        drift, settings = self.drift, settings_of(self.seen.config)
-        if rounds.all:
-            if self.drift.moves or self.landed is None or len(rounds.all) > 1:
-                return None
-            found = rounds.all[0].found.measured
-            settings = dict(found.settings)
-            drift = focus_drift(
-                found.estimate.sights, self.seen.config, settings, self.landed, self.pool.map
-            )
-            if not drift.moves:
-                return None
-        if not drift.moves:
+        """Give all pictures, and once more with their places and times where optics change."""
+        if not rounds.all:
             return self.seen
-        return in_moving_focus(self.seen, settings, drift, self.pool.map)
+        if self.view is None or len(rounds.all) > 1:
+            return None
+        found, config = rounds.all[0].found.measured, self.seen.config
+        settings, mapper = found.settings, self.pool.map
+        if not asked_change(found.estimate.sights, config, settings, self.view, mapper).matters:
+            return None
+        return in_uneven_field(self.seen, settings, self.view, mapper)
 
     def describes(self, seen: Collected) -> bool:
         """Say that no optics took part in finding them."""

@@ -95,9 +95,8 @@ class Neighbours:
         grid = PixelGrid.region(sides[0], sides[1], context.pixel_nm)
         pixel = context.pixel_nm
         shown = at.frame + sign * self._window // 2
-        image = context.wide_at(shown).image(
-            grid, start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
-        )
+        place = (start.x_px * pixel, start.y_px * pixel)
+        image = context.wide_at(*place, shown).image(grid, *place, start.z_nm, start.mass_kda)
         corner = sides[0][0], sides[1][0]
         slopes = None if self._pattern is None else derivatives(image)
         return Step(sign, at, start, corner, image, slopes, theta, snr, excess)

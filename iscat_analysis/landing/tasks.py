@@ -120,8 +120,9 @@ class TaskBuilder:
         grid = PixelGrid.region(region.rows, region.columns, context.pixel_nm)
         used = chunk.usable[region.slices]
         shown = second if step.sign > 0 else first
+        place = (step.start.x_px * context.pixel_nm, step.start.y_px * context.pixel_nm)
         likelihood = conditional(
-            context.model_at(sum(shown) // 2), grid, before, after, ratio,
+            context.model_at(*place, sum(shown) // 2), grid, before, after, ratio,
             read_variance_before_e2=variances[0], read_variance_after_e2=variances[1],
             masked=~used,
         )  # fmt: skip

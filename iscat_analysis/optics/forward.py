@@ -29,6 +29,15 @@ from iscat_analysis.optics.aperture import (
     weight_on,
 )
 from iscat_analysis.optics.blur import wiggled
+from iscat_analysis.optics.coherence import (
+    Ray,
+    band_of,
+    cone_of,
+    factor_at,
+    is_coherent,
+    over_spectrum,
+    spectrum,
+)
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
@@ -119,7 +128,7 @@ def forward_model(
     if reference:
         factor *= cmath.exp(-1j * math.radians(optics.reference_phase_deg))
     fixed_oil_nm = -optics.focus_nm if optics.axial == "refocus" else oil_nm
-    wave = _wave(opening, *weight_on(opening, factor, fixed_oil_nm), reach_nm, like)
+    wave = _wave(opening, factor, fixed_oil_nm, reach_nm, like)
     points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,
@@ -173,8 +182,9 @@ def _pupil(
     k = 2 * math.pi / optics.wavelength_nm
     critical = critical_angle(optics)
     aberrations = sum(abs(size) for size in optics.aberrations_nm.values())
-    if aberrations:
+    if aberrations or not is_coherent(optics):
         reach_nm = reach_of_samples(reach_nm, LATTICE_STEP / (k * optics.na))
+    k = max(k, 2 * math.pi / min(each.wavelength_nm for each in spectrum(optics)))
     path = optics.na * reach_nm + sample_nm + oil_nm * (1 - math.cos(alpha)) + 4 * aberrations
     intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
     check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
@@ -190,17 +200,27 @@ def _pupil(
 
 def _wave(
     opening: Aperture,
-    weight: ComplexArray,
-    axial: ComplexArray,
+    factor: complex,
+    oil_nm: float,
     reach_nm: float,
     like: ForwardModel | None,
 ) -> Field:
-    """Tabulate the field of a pupil, as the pupil's symmetry allows."""
+    """Tabulate the field of a pupil, as the pupil's symmetry and the light allow."""
     optics, pupil = opening.optics, opening.pupil
+    if not (opening.is_round and is_coherent(optics)):
+        phi = opening.azimuths()
+        rays = []
+        for each in spectrum(optics):
+            there = opening if each is optics else aperture_on(each, pupil.theta, pupil.weight)
+            weight, axial = weight_on(there, factor_at(factor, each, optics), oil_nm)
+            rays.append(Ray(there.seen(phi)[None], weight, axial, there.pupil.transverse))
+        whole = over_spectrum(rays)
+        series = harmonics(whole.waves[0], np.abs(whole.weight)) * whole.weight
+        return LatticeField(
+            series, whole.axial, whole.transverse, band_of(optics), reach_nm, cone_of(optics)
+        )
+    weight, axial = weight_on(opening, factor, oil_nm)
     band = opening.wavenumber * optics.na
-    if not opening.is_round:
-        series = harmonics(opening.seen(opening.azimuths()), np.abs(weight))
-        return LatticeField(series * weight, axial, pupil.transverse, band, reach_nm)
     turn = np.exp(1j * opening.wavenumber * opening.path_nm(np.zeros(1))[:, 0])
     common = weight / 2 * turn * opening.transmission
     source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])

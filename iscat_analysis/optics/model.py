@@ -22,7 +22,7 @@ from iscat_analysis._kernels.lens import LatticeLens, Lens, RoundLens
 from iscat_analysis._kernels.radial import POWERS, AxialTable, profile_between
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.aperture import Aperture, weight_on
+from iscat_analysis.optics.aperture import Aperture
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import Material
 from iscat_analysis.optics.measured import MeasuredField
@@ -246,7 +246,8 @@ class ForwardModel:
         def at(z_nm: float, names: tuple[str, ...]) -> tuple[LatticeLens, FloatArray]:
             return sensitivity_lattices(
                 self.aperture,
-                lambda opening: weight_on(opening, self.factor, self.oil_nm),
+                self.factor,
+                self.oil_nm,
                 z_nm, names, rho=self.rho, reach_nm=self.reach_nm,
             )  # fmt: skip
 

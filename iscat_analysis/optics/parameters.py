@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import FIELD_TERMS, Config, field_keys
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.field_map import BASES, DRIFT, WEIGHTS
 from iscat_analysis.records import FloatArray
 
 FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
 ``[optics]``."""
 
-FOCUS_DRIFT = "focus_drift_nm"
+FOCUS_DRIFT = DRIFT
 """Rise of the focus in 1000 frames of a movie [nm]."""
 
 RISES = (FOCUS_STEP, FOCUS_DRIFT)
 """What moves the focus from one picture to another, and is no property of the microscope."""
+
+FIELD = tuple(name for name in WEIGHTS if name != DRIFT and not name.startswith("reference_"))
+"""What differs over the field, and shows in the shape of pictures: of the reference's amplitude,
+which shows in their size alone, the pictures of particles of unknown mass say nothing."""
 
 Settings = Mapping[str, Any]
 """Values of ``[optics]`` by key, each aberration under its own name (``z5``…)."""
@@ -56,19 +61,13 @@ class Parameter:
     period: float = math.inf
     """The change that makes no difference."""
 
-    moves: str = ""
-    """The parameter that it changes from one picture to another; empty if all have its value."""
-
-    times: str = ""
-    """What of a `ParticleImage` multiplies it there."""
-
 
 _EVEN, _ODD = (Parameter("zernike", 100.0, 25.0, mirrored=sign) for sign in (-1, 1))
 
 PARAMETERS = {
     "focus_nm": Parameter("focus", 1000.0, 120.0),
-    FOCUS_STEP: Parameter("focus", 50.0, 2.0, -1, moves="focus_nm", times="focus_steps"),
-    FOCUS_DRIFT: Parameter("focus", 1000.0, 100.0, -1, moves="focus_nm", times="focus_steps"),
+    FOCUS_STEP: Parameter("focus", 50.0, 2.0, -1),
+    FOCUS_DRIFT: Parameter("focus", 1000.0, 100.0, -1),
     "na": Parameter("na", 0.05, 0.02),
     "reference_phase_deg": Parameter("phase", 180.0, 40.0, -1, period=360.0),
     "mask_na": Parameter("mask", 0.3, 0.1),
@@ -80,8 +79,19 @@ PARAMETERS = {
     "polarization_deg": Parameter("polarization", 90.0, 30.0, period=180.0),
 }
 """Every continuous parameter, in the order of results.  A new one is a row here, a value in
-`settings_of`, and a derivative of the forward model; one that changes over the field or in time
-says what it moves, and by what of a picture."""
+`settings_of`, and a derivative of the forward model."""
+
+PARAMETERS |= {
+    name: replace(
+        PARAMETERS[base],
+        period=math.inf,
+        mirrored=-1 if base == "focus_nm" else PARAMETERS[base].mirrored,
+    )
+    for name, (base, *_) in BASES.items()
+    if name in FIELD
+}
+"""A coefficient of the field changes the parameters that `WEIGHTS` says, and is as large as these.
+"""
 
 FREE = {
     group: tuple(name for name, parameter in PARAMETERS.items() if parameter.group == group)
@@ -182,13 +192,18 @@ def settings_of(config: Config) -> dict[str, Any]:
     optics = config.optics
     keys = ("focus_nm", "na", "reference_phase_deg", "mask_na", "attenuation",
             "polarization", "polarization_deg", "analyzer")  # fmt: skip
-    terms = dict.fromkeys(FREE["zernike"], 0.0) | dict(optics.aberrations_nm)
+    terms = dict.fromkeys(filter(is_term, FREE["zernike"]), 0.0) | dict(optics.aberrations_nm)
     return {key: getattr(optics, key) for key in keys} | terms
 
 
 def with_settings(config: Config, settings: Settings) -> Config:
     """Put parameters into a configuration."""
-    plain = {k: v for k, v in settings.items() if not is_term(k) and k != FOCUS_STEP}
+    plain = {
+        k: v
+        for k, v in settings.items()
+        if not is_term(k) and k != FOCUS_STEP and k not in FIELD_TERMS
+    }
+    plain |= field_keys({name: settings.get(name, 0.0) for name in FIELD})
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
     optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})
     return config.model_copy(update={"optics": optics})

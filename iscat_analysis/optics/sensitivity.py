@@ -9,7 +9,7 @@ and combined with the field at the pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,14 +21,19 @@ from iscat_analysis._kernels.lens import LatticeLens
 from iscat_analysis._kernels.zernike import zernike
 from iscat_analysis.config import MEASURABLE, Optics
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics
+from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics, weight_on
+from iscat_analysis.optics.coherence import (
+    Ray,
+    band_of,
+    cone_of,
+    factor_at,
+    over_spectrum,
+    spectrum,
+)
 from iscat_analysis.optics.waves import LatticeField
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
-
-Weight = Callable[[Aperture], tuple[ComplexArray, ComplexArray]]
-"""Factor of the field's integral, and phase per height, on any quadrature."""
 
 NEGLIGIBLE_CHANGE = 1e-6
 """Share of the change of light below which its azimuthal harmonics are left out."""
@@ -54,7 +59,8 @@ def check_names(optics: Optics, names: Sequence[str]) -> None:
 
 def sensitivity_lattices(
     opening: Aperture,
-    weight_on: Weight,
+    factor: complex,
+    oil_nm: float,
     z_nm: float,
     names: tuple[str, ...],
     *,
@@ -65,20 +71,47 @@ def sensitivity_lattices(
 
     Shapes: `stack` (2 + len(names).
     """
-    optics = opening.optics
+    optics, phi = opening.optics, opening.azimuths()
+    light = over_spectrum(
+        [
+            _changes(opening, each, factor_at(factor, each, optics), oil_nm, z_nm, names, rho, phi)
+            for each in spectrum(optics)
+        ]
+    )
+    waves = light.waves.reshape(-1, *light.waves.shape[2:])
+    series = harmonics(waves, np.abs(light.weight), NEGLIGIBLE_CHANGE) * light.weight
+    count = light.waves.shape[1]
+    lattice = LatticeField(
+        series[:count], light.axial, light.transverse, band_of(optics), reach_nm, cone_of(optics)
+    )
+    stack = lattice.lattices(series, light.transverse, STEP_RATIO)
+    whole = stack.reshape(2 + len(names), lattice.count, *stack.shape[1:])
+    return lattice.lens(rho), whole
+
+
+def _changes(
+    opening: Aperture,
+    optics: Optics,
+    factor: complex,
+    oil_nm: float,
+    z_nm: float,
+    names: tuple[str, ...],
+    rho: float,
+    phi: FloatArray,
+) -> Ray:
+    """Light of one wavelength in the pupil, how it rises with the height, and its derivatives."""
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
     # two more directions, with zero weight except where an edge moves
     theta = np.concatenate([opening.pupil.theta, [rim, edge]])
     whole = aperture_on(optics, theta, np.concatenate([opening.pupil.weight, [1.0, 1.0]]))
-    weight, axial = weight_on(whole)
+    weight, axial = weight_on(whole, factor, oil_nm)
     weight = weight * np.exp(1j * axial * z_nm)
     inner = np.ones(theta.size)
     inner[-2:] = 0.0
     at_rim, at_edge = np.zeros(theta.size), np.zeros(theta.size)
     at_rim[-2] = 1 / (optics.n_immersion * math.cos(rim))
     at_edge[-1] = 1 / (optics.n_immersion * math.cos(edge)) if optics.mask_na else 0.0
-    phi = opening.azimuths()
-    k = opening.wavenumber
+    k = whole.wavenumber
     seen, clear = whole.seen(phi), whole.seen(phi, masked=False)
     behind = inner * (optics.n_immersion * np.sin(theta) < optics.mask_na)
     field = seen * inner[:, None]
@@ -101,12 +134,8 @@ def sensitivity_lattices(
         return field * (1j * k * path)
 
     lift = field * (1j * axial[:, None])
-    waves = np.concatenate([field, lift, *(change(name) for name in names)])
-    series = harmonics(waves, np.abs(weight), NEGLIGIBLE_CHANGE) * weight
-    count = len(field)
-    lattice = LatticeField(series[:count], axial, whole.pupil.transverse, k * optics.na, reach_nm)
-    stack = lattice.lattices(series, whole.pupil.transverse, STEP_RATIO)
-    return lattice.lens(rho), stack.reshape(2 + len(names), count, *stack.shape[1:])
+    waves = np.stack([field, lift, *(change(name) for name in names)])
+    return Ray(waves, weight, axial, whole.pupil.transverse)
 
 
 def _log_efficiency_slope(optics: Optics) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -18,12 +18,14 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.hessian import ROWS, signal_hessian
 from iscat_analysis._kernels.image import Pixels, signal_image
 from iscat_analysis._kernels.lattice import (
+    FILTER,
     LATTICE_STEP,
     lattice_half,
     radial_waves,
     reach_of_samples,
-    spread,
+    sampled,
     sum_waves,
+    undo_window,
     window,
 )
 from iscat_analysis._kernels.lens import LatticeLens, RoundLens
@@ -36,6 +38,7 @@ from iscat_analysis._kernels.radial import (
     radial_profile,
 )
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.coherence import Cone
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.memoize import memoize
 
@@ -157,6 +160,12 @@ class LatticeField:
     transverse: FloatArray
     band: float
     reach_nm: float
+    cone: Cone = field(default_factory=Cone)
+
+    @property
+    def count(self) -> int:
+        """Components whose light is added up; the first interferes with the reference."""
+        return len(self.harmonics) + self.cone.components
 
     @property
     def step_nm(self) -> float:
@@ -176,11 +185,11 @@ class LatticeField:
     @property
     def width(self) -> int:
         """Numbers in the profile of one order."""
-        return 2 * len(self.harmonics) * (2 * self.half + 1) ** 2
+        return 2 * self.count * (2 * self.half + 1) ** 2
 
     def lens(self, rho: float) -> LatticeLens:
         """How the kernels make a signal of a profile, with the reference ρ."""
-        return LatticeLens(1 / self.step_nm, rho, self.half, len(self.harmonics), window()[0])
+        return LatticeLens(1 / self.step_nm, rho, self.half, self.count, window()[0])
 
     def profile(self, z_nm: float, orders: int) -> FloatArray:
         """Profile at a height, shape (channels, nodes, nodes); the last few are kept."""
@@ -201,15 +210,21 @@ class LatticeField:
             self._stack(heights_nm[i : i + _HEIGHTS_AT_ONCE], 3, kappa)
             for i in range(0, heights_nm.size, _HEIGHTS_AT_ONCE)
         ]
-        return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * len(self.harmonics), -1)
+        return np.concatenate(parts).reshape(heights_nm.size, 3, 2 * self.count, -1)
 
     def lattices(
         self, harmonics: ComplexArray, transverse: FloatArray, coarser: int = 1
     ) -> FloatArray:
-        """Coefficients of any fields in this pupil, shape (k, 2, nodes, nodes)."""
+        """Coefficients of any fields in this pupil, all their components, (k, 2, nodes, nodes)."""
         step = coarser * self.radial_step_nm
         waves = self._waves(harmonics, transverse, step)
-        return spread(waves, step, self.step_nm, self.half)
+        fields = sampled(waves, step, self.step_nm, self.half)
+        side = fields.shape[2]
+        axis = self.step_nm * (np.arange(side, dtype=np.float64) - side // 2)
+        grouped = fields.reshape(-1, len(self.harmonics), 2, side, side)
+        whole = self.cone.added(grouped, axis[:, None], axis)
+        out = undo_window(whole.reshape(-1, side, side))
+        return out.reshape(-1, 2, side - 2 * FILTER, side - 2 * FILTER)
 
     def _waves(
         self, harmonics: ComplexArray, transverse: FloatArray, radial_step_nm: float
@@ -236,7 +251,8 @@ class LatticeField:
         dx, dy = (np.ascontiguousarray(d, dtype=float).ravel() for d in (dx_nm, dy_nm))
         out = np.empty((dx.size, 2, len(self.harmonics)))
         sum_waves(self._waves_at(z_nm), 1 / self.radial_step_nm, dx, dy, out)
-        return (out[:, 0] + 1j * out[:, 1]).T.reshape(-1, *np.shape(dx_nm))
+        parts = self.cone.added(out.transpose(2, 1, 0)[None], dx, dy)[0]
+        return np.asarray(parts[:, 0] + 1j * parts[:, 1]).reshape(-1, *np.shape(dx_nm))
 
     @cached_property
     def _waves_at(self) -> Callable[[float], FloatArray]:

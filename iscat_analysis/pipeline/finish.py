@@ -42,6 +42,7 @@ from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
 from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
+from iscat_analysis.trust.uneven_reference import reference_warning
 
 
 def make_analysis(
@@ -92,6 +93,7 @@ def make_analysis(
         line_warning(config, table),
         nonlinearity_warning(scale, table),
         sign_warning(config, table),
+        reference_warning(config, table),
         landing_rate_warning(table) if ready.background_mode == "sliding" else "",
     ):
         if doubt:

@@ -224,12 +224,9 @@ def draw_particles(
             middle, half = round(centre), round(LARGEST_IMAGE * context.roi_px)
             spans.append((max(middle - half, 0), min(middle + half + 1, size)))
         grid = PixelGrid.region(spans[0], spans[1], context.pixel_nm)
-        image = context.wide_at(int(landing)).image(
-            grid,
-            x * context.pixel_nm,
-            y * context.pixel_nm,
-            context.config.particle.nominal_height_nm,
-            mass,
+        place = (x * context.pixel_nm, y * context.pixel_nm)
+        image = context.wide_at(*place, int(landing)).image(
+            grid, *place, context.config.particle.nominal_height_nm, mass
         )
         frame = int(landing)
         leave = min(frame + stay, frames[1])

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,9 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.optics.collected import photons_per_intensity
+from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.local import LocalModels
 from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.study.movers import MovingParticle, place_movers, track_rows
 from iscat_analysis.study.particles import SimulatedParticle, place_particles
@@ -134,6 +137,14 @@ class Movie:
         self._model = forward_model(
             config, reach, z_max_nm=max([config.particle.nominal_height_nm, *heights])
         )
+        self._local = None
+        if terms_of(config.optics):
+            if not all(p.still for p in self.movers):
+                raise ConfigError(
+                    "optics: particles that move are simulated in a field that is the same "
+                    "everywhere: leave out simulation.movers, or the terms of the field"
+                )
+            self._local = LocalModels(config, self._model, simulation.shape)
         self._camera = camera_from_config(config.camera, simulation.shape, np.uint16)
         self._sample_e = self._background()
         self.background_e = self._sample_e[self._field]
@@ -150,7 +161,7 @@ class Movie:
             (
                 i, p.frame, p.leave, p.x_px, p.y_px, p.x_px * self._pixel_nm,
                 p.y_px * self._pixel_nm, p.z_nm, p.mass_kda,
-                peaks.get((p.z_nm, p.mass_kda)),
+                peaks.get((p.z_nm, p.mass_kda)) if self._local is None else self._peak_of(p),
             )
             for i, p in enumerate(self.particles)
         ]  # fmt: skip
@@ -182,7 +193,7 @@ class Movie:
         """Yield what every frame has in common with the one before, until that changes."""
         q = self._model.samples[1].size
         rows, columns = self._grid.shape
-        field = np.zeros((2, rows * q, columns * q), dtype=complex)
+        field = np.zeros((self._components, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
         particles = [*self.particles, *(self._standing(p) for p in self.movers if p.still)]
         still = None
@@ -255,7 +266,8 @@ class Movie:
 
     def _signal(self, field: ComplexArray) -> FloatArray:
         """Intensity with the reference, of a field that is given on the samples inside pixels."""
-        reference = np.array([self._model.rho, 0.0])[:, None, None]
+        reference = np.zeros((self._components, 1, 1))
+        reference[0] = self._model.rho
         return self._in_pixels(np.sum(np.abs(reference + field) ** 2, axis=0))
 
     def _in_pixels(self, intensity: FloatArray) -> FloatArray:
@@ -269,6 +281,12 @@ class Movie:
         if self._model.rho:
             return np.asarray(self._sample_e * signal)
         return np.asarray(self._sample_e + self._signal_scale * signal)
+
+    @cached_property
+    def _components(self) -> int:
+        """Components of the field whose light is added up, two and what incoherent light adds."""
+        here = self._model.field(np.zeros(1), np.zeros(1), self._model.height_nm, 1.0)
+        return max(2, len(here))
 
     @property
     def _field(self) -> tuple[slice, slice]:
@@ -317,8 +335,9 @@ class Movie:
         x = (self._grid.x_nm[:, None] + offsets).ravel() - x_nm
         y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
         dx, dy = np.meshgrid(x, y)
-        field = np.zeros((2, *dx.shape), dtype=complex)  # an analyser leaves the first alone
-        given = self._model.field(dx, dy, z_nm, mass_kda)
+        field = np.zeros((self._components, *dx.shape), dtype=complex)  # an analyser leaves one
+        model = self._model if self._local is None else self._local.at(x_nm, y_nm)
+        given = model.field(dx, dy, z_nm, mass_kda)
         field[: len(given)] = given
         return field
 
@@ -393,6 +412,14 @@ class Movie:
                 heights = np.linspace(heights[0], heights[-1], _HEIGHTS)
             kinds |= {(float(z), p.mass_kda) for z in heights}
         return {kind: self._model.peak_contrast(*kind) for kind in kinds}
+
+    def _peak_of(self, particle: SimulatedParticle) -> float | None:
+        """Peak contrast of a particle where it lands, in a field that is not even."""
+        if self._local is None or not self._model.rho:
+            return None
+        dy, dx = self.drift_px[particle.frame]
+        place = ((particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm)
+        return self._local.at(*place).peak_contrast(particle.z_nm, particle.mass_kda)
 
     def _check_range(self) -> None:
         camera = self._camera

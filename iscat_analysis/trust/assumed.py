@@ -115,7 +115,8 @@ def _shift(
 
 def _response(config: Config, table: pd.DataFrame) -> Response:
     errors = config.optics.covariance
-    return response_of(config, table, errors.names if errors is not None else ())
+    names = errors.of_the_middle.names if errors is not None else ()
+    return response_of(config, table, names)
 
 
 def _change(

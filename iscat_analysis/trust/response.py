@@ -167,7 +167,7 @@ def standards_share(config: Config) -> bool:
         return False
     if line.optics is None:
         return True
-    names = optics.covariance.names if optics.covariance is not None else ()
+    names = optics.covariance.of_the_middle.names if optics.covariance is not None else ()
     here, there = _settings_of(optics, names), _settings_of(line.optics, names)
     return line.covariance == optics.covariance and np.allclose(here, there, rtol=1e-9, atol=0)
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
+from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, Spot, centre_of
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
@@ -35,6 +36,7 @@ from iscat_analysis.trust.response import (
     response_of,
     standards_share,
 )
+from iscat_analysis.trust.uneven_reference import reference_map
 
 REJECTED_SHARE = 0.04
 """Of the particle's picture, what the model leaves over beyond the noise (root mean square): optics
@@ -91,6 +93,8 @@ def sources_of(
                "more particles for the picture, or standards measured with it"),
         Source("optics that do not describe the pictures", "measured", left_over,
                "find what the model lacks: focus, aperture, aberrations, pixel size"),
+        Source("amplitude of the reference over the field", "measured", _of_the_reference,
+               "configure it: optics.reference_tilt and optics.reference_curvature"),
         *(Source(each.label, "assumed", partial(assumed_error, each.key), each.remedy)
           for each in INPUTS),
     )  # fmt: skip
@@ -230,6 +234,15 @@ def _off_the_line(scale: MassScale, table: pd.DataFrame) -> tuple[FloatArray, Fl
     return np.abs(mass * scale.bend(mass)), np.where(good, sigma, np.nan)
 
 
+def _of_the_reference(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give what masses are wrong by where those of the same particles differ over the field."""
+    found = reference_map(config, table)
+    if found is None:
+        return {}
+    mass, x, y = (table[name].to_numpy(float) for name in ("mass_kda", "x_px", "y_px"))
+    return {"mass_kda": np.abs(mass * found.share(x, y))}
+
+
 def _of_the_line(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
     """Give what the line between contrast and mass may be wrong by."""
     line = config.calibration
@@ -272,11 +285,37 @@ def _is_about_contrast(config: Config) -> bool:
 def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatArray:
     """Shift of x, y, z, mass and contrast of every event per unit of the optics, (n, 5, k).
 
-    D changes smoothly with the amplitude and along z with the fringes: a few amplitudes at each of
-    some heights serve all events.
+    A term of the field shifts an event as the parameters that it changes at the event's place.
     """
     errors = config.optics.covariance
     names = errors.names if errors is not None else ()
+    if not any(name in WEIGHTS for name in names):
+        return _base_shifts(config, model, table, names)
+    every = dict.fromkeys(base for name in names for base in BASES.get(name, (name,)))
+    bases = tuple(base for base in every if base != REFERENCE)
+    found = np.zeros((len(table), len(COMMON), len(bases) + 1))
+    found[..., :-1] = _base_shifts(config, model, table, bases) if bases else 0.0
+    if _fits_masses(config):  # a brighter reference dims the interference
+        found[:, 3, -1] = -table["mass_kda"].to_numpy(float)
+    bases = (*bases, REFERENCE)
+    x, y, half = centre_of(config.optics, (1, 1))
+    shifts = np.zeros((len(table), len(COMMON), len(names)))
+    for event, place in enumerate(zip(table["x_px"], table["y_px"], strict=True)):
+        spot = Spot((place[0] - x) / half, (place[1] - y) / half)
+        for k, name in enumerate(names):
+            for base, weight in WEIGHTS[name](spot).items() if name in WEIGHTS else ((name, 1.0),):
+                shifts[event, :, k] += weight * found[event, :, bases.index(base)]
+    return shifts
+
+
+def _base_shifts(
+    config: Config, model: ForwardModel, table: pd.DataFrame, names: tuple[str, ...]
+) -> FloatArray:
+    """Shift of every event per unit of parameters that have a derivative, (n, 5, k).
+
+    D changes smoothly with the amplitude and along z with the fringes: a few amplitudes at each of
+    some heights serve all events.
+    """
     amplitude = model.scale.amplitudes(table["mass_kda"].to_numpy(float))
     nodes = amplitude_nodes(amplitude, (table["status"] == Status.OK.value).to_numpy())
     respond = response_of(config, table, names, contrast=_is_about_contrast(config))
@@ -309,8 +348,9 @@ def _of_the_standards(config: Config, table: pd.DataFrame) -> Mapping[str, Float
         return {}
     if not _fits_masses(config):
         return {}
-    relative = response_of(at_standards(config), table, line.covariance.names).faint()
-    variance = float(relative @ np.array(line.covariance.matrix) @ relative)
+    middle = line.covariance.of_the_middle
+    relative = response_of(at_standards(config), table, middle.names).faint()
+    variance = float(relative @ np.array(middle.matrix) @ relative)
     return {"mass_kda": np.abs(table["mass_kda"].to_numpy(float)) * math.sqrt(max(variance, 0.0))}
 
 

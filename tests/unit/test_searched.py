@@ -14,7 +14,7 @@ import pytest
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.instrument.fit_optics import FocusDrift
+from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.measured_images import ring_average
@@ -202,6 +202,6 @@ def test_numbers_and_rates_are_for_all_of_field_and_time(tmp_path: Path) -> None
 
 
 def test_a_focus_does_not_move_by_micrometres() -> None:
-    assert FocusDrift(-100.0, 5.0, (0, 1000)).is_plausible
-    assert not FocusDrift(-6705.0, 5.0, (0, 1000)).is_plausible
-    assert not FocusDrift(-500.0, 5.0, (0, 8000)).is_plausible
+    assert is_plausible({"focus_drift_nm": -100.0}, (0, 1000))
+    assert not is_plausible({"focus_drift_nm": -6705.0}, (0, 1000))
+    assert not is_plausible({"focus_drift_nm": -500.0}, (0, 8000))

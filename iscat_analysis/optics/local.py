@@ -1,0 +1,74 @@
+"""Models of a microscope that is not the same everywhere in the field, or in all frames."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from iscat_analysis.config import Config
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.field_map import (
+    REFERENCE,
+    STEPS,
+    Spot,
+    brighter,
+    centre_of,
+    changed,
+    changes_at,
+    terms_of,
+)
+from iscat_analysis.optics.forward import ForwardModel, forward_model
+from iscat_analysis.optics.memoize import memoize
+
+DRIFT_FRAMES = 1000.0
+"""Frames in which the focus rises by ``optics.focus_drift_nm``."""
+
+_KEPT = 64  # models at hand, of some MB each
+
+
+class LocalModels:
+    """Models of one movie, by place and frame; masses have the scale of the field's centre."""
+
+    def __init__(self, config: Config, model: ForwardModel, field_px: tuple[int, int]) -> None:
+        self._optics = optics = config.optics
+        self._terms = terms_of(optics)
+        self._centre_px = centre_of(optics, field_px)
+        self._pixel_nm = config.camera.pixel_size_nm or 1.0
+
+        def moved(steps: tuple[tuple[str, int], ...]) -> ForwardModel:
+            if not steps:
+                return model
+            local = changed(optics, {base: n * STEPS[base] for base, n in steps})
+            there = config.model_copy(update={"optics": local, "calibration": None})
+            return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
+
+        self._moved = memoize(_KEPT, moved)
+
+    def at(self, x_nm: float, y_nm: float, frame: float | None = None) -> ForwardModel:
+        """Give the model of a place, in a frame or in that of which the focus is configured."""
+        x, y, half = self._centre_px
+        first = self._optics.focus_frame
+        time = 0.0 if frame is None else (frame - first) / DRIFT_FRAMES
+        spot = Spot((x_nm / self._pixel_nm - x) / half, (y_nm / self._pixel_nm - y) / half, time)
+        changes = changes_at(self._terms, spot)
+        dimming = changes.pop(REFERENCE, 0.0)
+        steps = ((base, round(change / STEPS[base])) for base, change in changes.items())
+        return brighter(self._moved(tuple(sorted(step for step in steps if step[1]))), dimming)
+
+
+def refuse_moving_focus(config: Config) -> None:
+    """Refuse a focus that moves where pictures are those of one focus."""
+    if config.optics.focus_drift_nm:
+        raise ConfigError(
+            f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g} is known only of landing "
+            'movies (background.method = "sliding") with optics.psf = "model": set it to 0'
+        )
+
+
+def refuse_uneven_field(config: Config) -> None:
+    """Refuse optics that differ over the field where one model serves all of it."""
+    terms = [name for name in terms_of(config.optics) if name != "focus_drift_nm"]
+    if terms and (config.fit.mode == "track" or config.optics.psf == "measured"):
+        raise ConfigError(
+            f"optics: {terms[0]} says that the microscope is not the same over the field, which "
+            'is known only of particles that stay, with optics.psf = "model": set it to 0'
+        )
