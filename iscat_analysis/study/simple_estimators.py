@@ -155,7 +155,9 @@ def matched_filter(before: FloatArray, after: FloatArray, setup: EstimatorSetup)
     """
     images = setup.image(before, after)
     side = min(images.shape[1:]) // 2 * 2 - 1
-    height = float(np.median(setup.start[:, 2]))
+    height = setup.particle.nominal_height_nm
+    if "z_nm" not in setup.free:
+        height = float(np.median(setup.start[:, 2]))
     template = psf(
         setup.optics, setup.particle, setup.camera, pixels=side, z_nm=height,
         calibration=setup.calibration,
