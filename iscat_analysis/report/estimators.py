@@ -19,9 +19,7 @@ from iscat_analysis.report.numbers import LABELS, UNITS, number
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import BLUE, INK, log_y, new_figure, publish
 
-CHALLENGE_NAMES = frozenset(
-    {"challenge.json", "challenge.html", "benchmark.bib", "figures"}
-)
+CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib", "figures"})
 """Everything the score of a challenge leaves in its folder."""
 
 _COLOURS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6A3D9A", "#8A8F96", "#B15928")
@@ -87,9 +85,7 @@ def contest_parts(study: Mapping[str, Any]) -> dict[str, Any]:
     return parts
 
 
-def contest_sections(
-    study: Mapping[str, Any], drawn: Mapping[str, Markup]
-) -> list[dict[str, Any]]:
+def contest_sections(study: Mapping[str, Any], drawn: Mapping[str, Markup]) -> list[dict[str, Any]]:
     """Make the sections of a benchmark that other estimators took part in."""
     sections = [_ranking_section(study)]
     sections += [
@@ -225,7 +221,7 @@ def _row(who: str, e: Mapping[str, Any], part: Mapping[str, Any]) -> list[Any]:
         f"{number(e.get('bias'))} ± {number(e.get('bias_se'), 2)}", number(e.get("rmse")),
         _with(e, "pull_std"), "—" if not _finite(share) else f"{100 * share:.0f} %",
         f"{e['answered']} of {e['answered'] + e['failed']}",
-        number(1000 * seconds) if _finite(seconds) else "—", e.get("verdict", ""),
+        number(1000 * (seconds or math.nan)), e.get("verdict", ""),
     ]  # fmt: skip
 
 
@@ -273,6 +269,7 @@ def _best_table(curves: Mapping[str, Any]) -> dict[str, Any]:
 
 def _table_1(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     names = list(dict.fromkeys(who for row in rows for who in row["achieved"]))
+    columns = ("printed", "QCRB", "CRB", *names)
     return {
         "id": "table-1",
         "title": "Table 1 of Dong et al. (2021)",
@@ -281,7 +278,7 @@ def _table_1(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "tables": [
             {
                 "caption": "Printed, quantum bound, Cramér–Rao bound, and achieved",
-                "columns": ["part", "parameter", *map(_numeric, ("printed", "QCRB", "CRB", *names))],
+                "columns": ["part", "parameter", *map(_numeric, columns)],
                 "rows": [
                     [row["part"].replace("_", " "), LABELS[row["parameter"]],
                      *(number(row[k]) for k in ("printed", "qcrb", "crb")),
@@ -387,7 +384,7 @@ def _points(
 
 
 def _reach(values: np.ndarray[Any, Any], ends: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    return np.nan_to_num(np.maximum(np.stack([values - ends[0], ends[1] - values]), 0.0))
+    return np.asarray(np.nan_to_num(np.maximum([values - ends[0], ends[1] - values], 0.0)))
 
 
 def _legend(figure: Figure) -> None:

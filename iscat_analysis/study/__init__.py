@@ -3,6 +3,10 @@
 `setting` says what is repeated, `trials` repeats it, `scores` sets the estimates beside the bounds,
 `baselines` are the estimators to be beaten, `calibration` asks whether posteriors are right, and
 `study` is all of it for one configuration, written as a folder.
+
+Other people's estimators: `estimators` says what they are given and which there are, `contest` lets
+them see the same counts, `yardstick` scores them, `efficiency` does so for those who simulated by
+themselves, and `challenge` writes movies whose truth is withheld.
 """
 
 from __future__ import annotations

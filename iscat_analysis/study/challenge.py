@@ -45,7 +45,7 @@ _LARGEST = 2_000_000_000
 
 @dataclass(frozen=True)
 class Challenge:
-    """A challenge that was read: its manifest and its truth have been checked against each other."""
+    """A challenge that was read; its files and its truth are those of its manifest."""
 
     folder: Path
     manifest: dict[str, Any]

@@ -70,7 +70,9 @@ _HAZARDS: Values = {
 }  # fmt: skip
 """What is true of the hard preset, and not told."""
 
-_GLASS_NOISE: Values = {"camera": {"gain_e_per_adu": 0.45, "offset_adu": 100.0, "read_noise_e": 2.0}}
+_GLASS_NOISE: Values = {
+    "camera": {"gain_e_per_adu": 0.45, "offset_adu": 100.0, "read_noise_e": 2.0}
+}
 
 _PROTEIN: dict[str, Any] = {"kind": "protein", "mass_kda": 6e4}
 """So heavy that the paper's scattering amplitude gives a thousand photons in ten frames."""
@@ -79,7 +81,7 @@ ABOUT = {
     "easy": "one protein on the glass in each stack, a known microscope, shot noise alone",
     "realistic": "landing movies of three species over a speckled background, a known microscope",
     "hard": "landing movies under a microscope that is not what it is said to be, with drift",
-    "dong2021": "the set-ups of Dong et al. (2021): gold and protein in iSCAT, COBRI and dark field",
+    "dong2021": "the set-ups of Dong et al. (2021): gold and protein; iSCAT, COBRI, dark field",
 }
 
 

@@ -423,12 +423,12 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
     starts[:, 2:] = told.particle.nominal_height_nm, setting.truth[3]
     setting = replace(setting, truth=np.array([*setting.truth[:2], *starts[0, 2:]]))
     noiseless = setting.draw(setting.truth, None)
-    rows = np.flatnonzero(np.isfinite(sums).all(axis=(0, 2, 3)))
-    setup = setup_of(setting, starts[rows])
+    whole = np.flatnonzero(np.isfinite(sums).all(axis=(0, 2, 3)))
+    setup = setup_of(setting, starts[whole])
     known = replace(setup, start=setting.truth[None].copy())
     reference = np.stack([noiseless.before_e, noiseless.after_e])
-    job = Job(sums[0, rows], sums[1, rows], setup, reference, known)
-    return _Cut(job, corners[rows] * pixel, rows, len(events))
+    job = Job(sums[0, whole], sums[1, whole], setup, reference, known)
+    return _Cut(job, corners[whole] * pixel, whole, len(events))
 
 
 def _sha256(path: Path) -> str:

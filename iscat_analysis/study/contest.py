@@ -23,7 +23,13 @@ from iscat_analysis.study.estimators import Estimator, EstimatorSetup
 from iscat_analysis.study.limits import Limits, detection_snr, limits_of_alike
 from iscat_analysis.study.setting import Setting, make_setting
 from iscat_analysis.study.trials import trial_generator
-from iscat_analysis.study.yardstick import paired, power_bound, recall_at, resamples, score_estimates
+from iscat_analysis.study.yardstick import (
+    paired,
+    power_bound,
+    recall_at,
+    resamples,
+    score_estimates,
+)
 
 MODES = ("mass", "localize", "joint")
 
@@ -169,17 +175,15 @@ def compare_estimators(
         out["estimators"][one.name] = _scores(tables, answers[one.name], seed)
         out["estimators"][one.name]["about"] = one.about
     for m, (k, drawn) in zip(tables, enumerate(tables.values()), strict=True):
-        found = {name: given[k] for name, given in answers.items()}
-        out["paired"][m] = _paired(drawn, found, out["estimators"], m, seed)
+        seen = {name: given[k] for name, given in answers.items()}
+        out["paired"][m] = _paired(drawn, seen, out["estimators"], m, seed)
     named = {name: given[len(tables) :] for name, given in answers.items()}
     out["estimator_curves"] = {"mode": mode, "trials": fewer, **_curves(points, named, seed)}
     out["detection"] = _detection(points, named, settings["mass"], rate, seed)
     return out
 
 
-def _scores(
-    tables: Mapping[str, Draws], answers: Sequence[Answer], seed: int
-) -> dict[str, Any]:
+def _scores(tables: Mapping[str, Draws], answers: Sequence[Answer], seed: int) -> dict[str, Any]:
     out: dict[str, Any] = {}
     for (mode, drawn), answer in zip(tables.items(), answers, strict=False):
         count = len(drawn.truths)
@@ -207,7 +211,8 @@ def _paired(
         ranked = {
             who: entry[mode][name]["efficiency_crb"]
             for who, entry in scores.items()
-            if "efficiency_crb" in entry[mode].get(name, {}) and not entry[mode][name]["below_bound"]
+            if "efficiency_crb" in entry[mode].get(name, {})
+            and not entry[mode][name]["below_bound"]
         }
         if not ranked:
             continue
@@ -320,4 +325,3 @@ def _detection(
         "matched_filter": [power_bound(float(s), rate) for s in snr],
         "estimators": found,
     }
-

@@ -119,7 +119,7 @@ def efficiency(
     (1968), section 2.4.2.
     """
     config, free = _resolved(setup, mode)
-    columns, truths = _matched(pd.DataFrame(estimates), pd.DataFrame(truth), config, free)
+    columns, truths = matched(pd.DataFrame(estimates), pd.DataFrame(truth), config, free)
     limits = limits_of_many(config, free, truths)
     weights = resamples(len(truths), seed)
     scored = score_estimates(columns, truths, limits, weights)
@@ -174,7 +174,7 @@ def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
     return config, FREE_PARAMETERS[name]
 
 
-def _matched(
+def matched(
     estimates: pd.DataFrame, truth: pd.DataFrame, config: Config, free: tuple[str, ...]
 ) -> tuple[dict[str, FloatArray], FloatArray]:
     """Put both tables into the rows of the truth.

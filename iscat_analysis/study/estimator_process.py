@@ -103,7 +103,7 @@ def answer(estimate: Estimate, job: Job) -> Answer:
     failures: dict[str, int] = {}
     try:
         columns = checked_table(estimate(job.before, job.after, job.setup), count)
-    except Exception:  # noqa: BLE001
+    except Exception:
         columns = _one_by_one(estimate, job, failures)
     clock, processor = time.perf_counter() - clock, time.process_time() - processor
     for sigma in ("", "sigma_"):
@@ -127,8 +127,10 @@ def _one_by_one(estimate: Estimate, job: Job, failures: dict[str, int]) -> dict[
     for i in range(count):
         part = slice(i, i + 1)
         try:
-            row = checked_table(estimate(job.before[part], job.after[part], job.setup.of(i, i + 1)), 1)
-        except Exception as error:  # noqa: BLE001
+            row = checked_table(
+                estimate(job.before[part], job.after[part], job.setup.of(i, i + 1)), 1
+            )
+        except Exception as error:
             why = f"{type(error).__name__}: {first_line(error)}"
             failures[why] = failures.get(why, 0) + 1
             continue
@@ -142,7 +144,7 @@ def _mass_per_amplitude(estimate: Estimate, job: Job) -> float:
     before, after = job.reference[:1], job.reference[1:]
     try:
         row = checked_table(estimate(before, after, job.reference_setup), 1)
-    except Exception:  # noqa: BLE001
+    except Exception:
         return float("nan")
     amplitude = row.get("amplitude", np.full(1, np.nan))[0]
     return float(job.reference_setup.start[0, 3] / amplitude) if amplitude else float("nan")
@@ -165,7 +167,7 @@ def main(request: str, answers: str) -> int:
     sys.path[:0] = [path for path in paths if path not in sys.path]
     try:
         estimate = estimator.load()
-    except Exception as error:  # noqa: BLE001
+    except Exception as error:
         sys.stderr.write(f"{first_line(error)}\n")
         return 1
     with Path(answers).open("ab") as file:
@@ -176,4 +178,7 @@ def main(request: str, answers: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    # what is pickled has to be of the module that the parent knows, which is not __main__
+    from iscat_analysis.study.estimator_process import main as run
+
+    sys.exit(run(*sys.argv[1:]))

@@ -145,7 +145,7 @@ class Estimator:
             found = import_module(module)
             for part in function.split("."):
                 found = getattr(found, part)
-        except Exception as error:  # noqa: BLE001
+        except Exception as error:
             raise ConfigError(
                 f"estimator {self.name}: {self.target} cannot be imported "
                 f"({type(error).__name__}: {first_line(error)})"

@@ -35,7 +35,8 @@ class Limits:
     @property
     def crb(self) -> FloatArray:
         """Joint Cramér–Rao bounds, shape (n, d)."""
-        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+        variance: FloatArray = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return np.sqrt(variance)
 
     def __len__(self) -> int:
         return len(self.covariance)
@@ -136,4 +137,5 @@ def detection_snr(experiment: Experiment, mass_kda: FloatArray) -> FloatArray:
     """
     limit = detection_limit(experiment)
     amplitude = np.array([experiment.model.scale.amplitude(float(m)) for m in mass_kda])
-    return np.abs(amplitude) * (limit.snr_per_amplitude if limit is not None else math.nan)
+    per_amplitude = limit.snr_per_amplitude if limit is not None else math.nan
+    return np.asarray(np.abs(amplitude) * per_amplitude)

@@ -32,9 +32,7 @@ def picasso_gaussmle(before: FloatArray, after: FloatArray, setup: EstimatorSetu
     return _picasso(before, after, setup, mle=True)
 
 
-def _picasso(
-    before: FloatArray, after: FloatArray, setup: EstimatorSetup, *, mle: bool
-) -> Table:
+def _picasso(before: FloatArray, after: FloatArray, setup: EstimatorSetup, *, mle: bool) -> Table:
     """Show Picasso bright spots: what is darker than the background is turned to be brighter."""
     from picasso.fitting import gaussfit, seeds
 
@@ -111,7 +109,5 @@ def _boxes(images: FloatArray, setup: EstimatorSetup) -> tuple[FloatArray, Float
     limit = np.array(images.shape[1:]) - side
     centre = np.rint(setup.start[:, 1::-1] / setup.pixel_size_nm).astype(int)
     corner = np.clip(centre - side // 2, 0, limit)
-    cut = [
-        image[r : r + side, c : c + side] for image, (r, c) in zip(images, corner, strict=True)
-    ]
+    cut = [image[r : r + side, c : c + side] for image, (r, c) in zip(images, corner, strict=True)]
     return np.ascontiguousarray(np.stack(cut), dtype=np.float32), corner

@@ -27,9 +27,7 @@ def write_scores(document: Mapping[str, Any], folder: Path, *, overwrite: bool =
         (building / "figures").mkdir()
         page = render_challenge(document, folder=building / "figures")
         (building / "challenge.html").write_text(page, encoding="utf-8")
-        (building / "benchmark.bib").write_text(
-            bibtex(document["title"], text), encoding="utf-8"
-        )
+        (building / "benchmark.bib").write_text(bibtex(document["title"], text), encoding="utf-8")
     return folder
 
 
@@ -52,7 +50,7 @@ def bibtex(title: str, document: str) -> str:
 
 
 def write_archive(folder: Path, archive: Path, *, title: str, overwrite: bool = False) -> None:
-    """Pack a folder of scores with what a repository of data asks for; equal scores, equal bytes."""
+    """Pack a folder with what a repository of data asks for; equal scores give equal bytes."""
     if archive.exists() and not overwrite:
         raise DataError(f"{archive}: exists already; give another name, or pass `overwrite`")
     files = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))

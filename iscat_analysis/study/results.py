@@ -7,6 +7,7 @@ never scored as nanometres.
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +55,6 @@ NEAR_NM = 250.0
 NEAR_FRAMES = 10
 """How far a result lies from the event that it is of, at most."""
 
-FACTORS_OF = {"positions": ("px", 1000.0), "masses": ("Da", 1000.0)}
 _FIT = 0.15  # of a median ratio to a factor
 
 
@@ -67,8 +67,11 @@ class Results:
     notes: tuple[str, ...] = field(default=())
 
 
-def read_results(path: Path, pixel_nm: float) -> Results:
-    """Read a table of results: a CSV, or a folder of this program."""
+def read_results(path: Path, pixel_nm: float, *, rows: bool = False) -> Results:
+    """Read a table of results: a CSV, or a folder of this program.
+
+    With `rows`, what a row is of may be said by its place in the table.
+    """
     source = path / "fits.csv" if is_folder(path) else path
     raw = _read(source)
     names = {str(name).strip().strip('"').lower(): name for name in raw.columns}
@@ -100,7 +103,7 @@ def read_results(path: Path, pixel_nm: float) -> Results:
     event = next((names[n] for n in EVENTS if n in names and not _is_text(raw[names[n]])), None)
     if event is not None:
         table["event"] = pd.to_numeric(raw[event], errors="coerce")
-    if "file" not in table and "event" not in table and "frame" not in table:
+    if not rows and not {"file", "event", "frame"} & set(table):
         raise DataError(
             f"{source}: has neither a column that says of which stack a row is (file, or event) "
             "nor a frame, so that its rows belong to nothing; add one"
@@ -134,7 +137,7 @@ def match_stacks(results: Results, events: pd.DataFrame, pixel_nm: float) -> pd.
             "one row of each"
         )
     placed = ours.set_index(rows[ours.index]).reindex(key).reset_index(drop=True)
-    _refuse_other_units(results.name, placed, events, pixel_nm)
+    refuse_other_units(results.name, placed, events, pixel_nm)
     return placed
 
 
@@ -163,7 +166,11 @@ def match_movie(
         )
     table = table.reset_index(drop=True)
     pairs = _assigned(table, events)
-    for factor, said in ((pixel_nm, "pixels"), (1 / pixel_nm, "nm"), (1000.0, "µm")):
+    for factor, said in (
+        (pixel_nm, "pixels"),
+        (1 / pixel_nm, "nm, though called pixels"),
+        (1000.0, "µm"),
+    ):
         scaled = table.assign(x_nm=table["x_nm"] * factor, y_nm=table["y_nm"] * factor)
         better = len(_assigned(scaled, events))
         if better >= 3 and better > 2 * len(pairs):
@@ -172,7 +179,7 @@ def match_movie(
     for row, event in pairs:
         placed.loc[event] = table.loc[row]
     matched = [row for row, _ in pairs]
-    _refuse_other_units(results.name, placed, events, pixel_nm)
+    refuse_other_units(results.name, placed, events, pixel_nm)
     return placed, table.drop(index=matched)
 
 
@@ -194,28 +201,30 @@ def _assigned(table: pd.DataFrame, events: pd.DataFrame) -> list[tuple[int, int]
     return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if not far[r, c]]
 
 
-def _refuse_other_units(
+def refuse_other_units(
     name: str, placed: pd.DataFrame, events: pd.DataFrame, pixel_nm: float
 ) -> None:
     """Refuse values that are the truth times a factor of units."""
+    lengths = ((pixel_nm, "pixels"), (1000.0, "µm"), (1 / pixel_nm, "nm, though called pixels"))
     for column, what, factors in (
-        ("x_nm", "positions", ((pixel_nm, "pixels"), (1000.0, "µm"))),
-        ("y_nm", "positions", ((pixel_nm, "pixels"), (1000.0, "µm"))),
+        ("x_nm", "positions", lengths),
+        ("y_nm", "positions", lengths),
         ("mass_kda", "masses", ((0.001, "Da"), (1000.0, "MDa"))),
     ):
-        if column not in placed:
+        if column not in placed or column not in events:
             continue
         ratio = _median_ratio(placed[column], events[column])
-        for factor, said in (*factors, (1 / pixel_nm, "nm times the pixel size")):
+        for factor, said in factors:
             if abs(ratio * factor - 1) < _FIT and abs(ratio - 1) > _FIT:
                 raise DataError(_units_said(name, what, said, factor))
 
 
 def _units_said(name: str, what: str, said: str, factor: float) -> str:
-    column = "x_px and y_px" if said == "pixels" else "the right unit's name"
+    names = {"pixels": ", or call them x_px and y_px", "nm, though called pixels":
+             ", or call them x_nm and y_nm"}  # fmt: skip
     return (
-        f"{name}: its {what} are in {said}: times {factor:.4g} they fit the truth; convert them, "
-        f"or call the columns {column}"
+        f"{name}: its {what} are in {said}: times {factor:.4g} they fit the truth; convert them"
+        f"{names.get(said, '')}"
     )
 
 
@@ -238,8 +247,6 @@ def _read(path: Path) -> pd.DataFrame:
     between = separator(lines[0])
     first = [name.strip().strip('"').lower() for name in lines[0].split(between)]
     refuse_twice(first, {name for names in NAMES.values() for name, _ in names}, path)
-    import io
-
     try:
         return pd.read_csv(
             io.StringIO("\n".join(lines)), sep=between, decimal=decimal_mark(between),

@@ -14,8 +14,12 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.signal import fftconvolve
 
-from iscat_analysis.pieces import fit_rois, psf
-from iscat_analysis.records import PARAMETERS, FloatArray, Status
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.pieces import psf
+from iscat_analysis.pieces.counts import gather
+from iscat_analysis.pieces.setups import config_of
+from iscat_analysis.records import PARAMETERS, Candidate, FloatArray, Status
 from iscat_analysis.study.estimators import EstimatorSetup
 
 REACH_PX = 3.0
@@ -26,26 +30,38 @@ DOG_RATIO = 1.6
 
 CENTROID_PASSES = 10
 
+LOST = {Status.NOT_CONVERGED, Status.AT_BOUND, Status.AMBIGUOUS_Z}
+"""Fits without an estimate that a user would keep."""
+
 _EVALUATIONS = 200
 
 Table = dict[str, FloatArray]
 
 
 def iscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> pd.DataFrame:
-    """Fit the model by maximum likelihood, as `fit_rois` and the movies do.
+    """Fit the model by maximum likelihood from the start, as movies are fitted from detections.
 
     Shapes: `before, after` (n, y, x).
     """
-    table = fit_rois(
-        before, after, setup.optics, setup.particle, setup.camera, mode=setup.mode,
-        n_before=setup.n_before, n_after=setup.n_after, calibration=setup.calibration,
-        power_ratio=setup.n_after / max(setup.n_before, 1), level=setup.level_fitted,
-        z_range_nm=setup.z_range_nm,
+    config = config_of(
+        setup.optics, setup.particle, setup.camera, mode=setup.mode, z_range_nm=setup.z_range_nm,
+        calibration=setup.calibration,
     )  # fmt: skip
-    lost = (Status.NOT_CONVERGED, Status.AT_BOUND, Status.AMBIGUOUS_Z)
-    usable = [not any(str(s) in flags.split(";") for s in lost) for flags in table["flags"]]
-    columns = [*PARAMETERS, *(f"sigma_{name}" for name in PARAMETERS)]
-    return table[columns].assign(index=np.arange(len(table)))[np.array(usable, dtype=bool)]
+    counts = gather(
+        config, before, after, n_before=setup.n_before, n_after=setup.n_after,
+        power_ratio=setup.n_after / max(setup.n_before, 1), level=setup.level_fitted, masked=None,
+    )  # fmt: skip
+    compile_kernels(counts.model, parts_of(setup.free, posteriors=False))
+    pixel = setup.pixel_size_nm
+    rows = np.full((len(before), 8), np.nan)
+    for i, (x, y, z, mass) in enumerate(setup.start.tolist()):
+        begin = Candidate(x / pixel, y / pixel, z, mass, 0.0)
+        fit = fit_particle(
+            counts.likelihood(i), begin, setup.mode, setup.z_range_nm, level=counts.level
+        )
+        if not LOST & set(fit.flags):
+            rows[i] = fit.x_nm, fit.y_nm, fit.z_nm, fit.mass_kda, *fit.sigma
+    return pd.DataFrame(rows, columns=[*PARAMETERS, *(f"sigma_{name}" for name in PARAMETERS)])
 
 
 def gauss_ls(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:
@@ -195,7 +211,8 @@ def centroid(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
     images = setup.polarity * setup.image(before, after)
     images = images - np.median(images, axis=(1, 2), keepdims=True)
     pixel = setup.pixel_size_nm
-    y, x = np.indices(images.shape[1:])
+    rows, columns = images.shape[1:]
+    y, x = np.mgrid[:rows, :columns]
     reach = max(2.0, 2.5 * setup.psf_sigma_nm / pixel)
     out = np.full((len(images), 3), np.nan)
     for i, image in enumerate(images):
@@ -246,9 +263,7 @@ def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup
     return {"x_nm": out[:, 0], "y_nm": out[:, 1]}
 
 
-def _around(
-    image: FloatArray, start_px: FloatArray, setup: EstimatorSetup
-) -> tuple[slice, slice]:
+def _around(image: FloatArray, start_px: FloatArray, setup: EstimatorSetup) -> tuple[slice, slice]:
     """Cut a square of about two widths of the spot around a start."""
     half = max(2, round(setup.optics.wavelength_nm / setup.optics.na / setup.pixel_size_nm))
     rows, columns = image.shape
@@ -285,9 +300,11 @@ def _highest(
 ) -> Table:
     """Find the maximum near each start, between pixels by parabolas."""
     pixel = setup.pixel_size_nm
-    y, x = np.indices(images.shape[1:])
+    rows, columns = images.shape[1:]
+    y, x = np.mgrid[:rows, :columns]
     out = np.full((len(images), 3), np.nan)
-    for i, image in enumerate(polarity * images):
+    turned: FloatArray = polarity * images
+    for i, image in enumerate(turned):
         column, row = setup.start[i, :2] / pixel
         near = np.where(np.hypot(x - column, y - row) <= REACH_PX, image, -np.inf)
         down, across = (int(k) for k in np.unravel_index(np.argmax(near), near.shape))

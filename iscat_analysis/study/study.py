@@ -93,7 +93,6 @@ def run_benchmark(
         progress, len(MODES) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
     )
     study: dict[str, Any] = {}
-    parts: dict[str, Any] = {}
     curves: dict[str, dict[str, Any]] = {"photons": {}, "z": {}}
     histograms: dict[str, dict[str, Any]] = {"pulls": {}, "ranks": {}}
     for number, (mode, setting) in enumerate(settings.items()):
@@ -138,15 +137,23 @@ def run_benchmark(
         )  # fmt: skip
         curves["z"][mode]["bounds"] = _bounds_along(config, setting)
     if estimators:
-        found = compare_estimators(
-            config, estimators, trials=trials, seed=seed, time_limit_s=time_limit_s,
+        others = compare_estimators(
+            config,
+            estimators,
+            trials=trials,
+            seed=seed,
+            time_limit_s=time_limit_s,
             progress=progress,
-        )  # fmt: skip
-        for mode, setting in settings.items():
-            bounds = {name: {} for name in setting.free}
-            parts[mode] = {"bounds": bounds, "trials": trials, "estimators": {
-                who: entry[mode] for who, entry in found["estimators"].items()}}
-        study |= {**found, "ranking": ranking(parts)}
+        )
+        parts = {
+            mode: {
+                "bounds": dict.fromkeys(setting.free),
+                "trials": trials,
+                "estimators": {who: entry[mode] for who, entry in others["estimators"].items()},
+            }
+            for mode, setting in settings.items()
+        }
+        study |= {**others, "ranking": ranking(parts)}
     return {
         **study,
         "curves": curves,

@@ -202,9 +202,7 @@ def paired(
     }
 
 
-def recall_at(
-    empty: FloatArray, signal: FloatArray, rate: float, seed: int
-) -> dict[str, Any]:
+def recall_at(empty: FloatArray, signal: FloatArray, rate: float, seed: int) -> dict[str, Any]:
     """Tell how many particles exceed what noise does in a share `rate` of empty regions.
 
     Shapes: `empty` (m,), `signal` (n,).
