@@ -15,7 +15,7 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from iscat_analysis.report.numbers import LABELS, UNITS, number
+from iscat_analysis.report.numbers import LABELS, UNITS, number, percent
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import BLUE, INK, log_y, new_figure, publish
 
@@ -215,13 +215,14 @@ def _scored(part: Mapping[str, Any], parameter: str) -> list[tuple[str, Mapping[
 def _row(who: str, e: Mapping[str, Any], part: Mapping[str, Any]) -> list[Any]:
     seconds = part["estimators"][who].get("seconds_per_fit")
     share = e.get("coverage68")
+    share = math.nan if share is None else float(share)
     return [
         who, _with(e, "efficiency_crb"), _with(e, "spread_over_crb"),
         number(e.get("spread_over_holevo")), number(e.get("spread_over_qcrb")),
         f"{number(e.get('bias'))} ± {number(e.get('bias_se'), 2)}", number(e.get("rmse")),
-        _with(e, "pull_std"), "—" if not _finite(share) else f"{100 * share:.0f} %",
+        _with(e, "pull_std"), percent(share),
         f"{e['answered']} of {e['answered'] + e['failed']}",
-        number(1000 * (seconds or math.nan)), e.get("verdict", ""),
+        number(None if seconds is None else 1000 * seconds), e.get("verdict", ""),
     ]  # fmt: skip
 
 
@@ -256,8 +257,8 @@ def _best_table(curves: Mapping[str, Any]) -> dict[str, Any]:
             row: list[Any] = [label, number(at)]
             for p in LABELS:
                 known = {
-                    who: lines[p]["efficiency_crb"][k]
-                    for who, lines in curve["estimators"].items()
+                    who: float(lines[p]["efficiency_crb"][k])
+                    for who, lines in (curve or {"estimators": {}})["estimators"].items()
                     if p in lines and _finite(lines[p]["efficiency_crb"][k])
                 }
                 best = max(known, key=lambda who: known[who]) if known else None
