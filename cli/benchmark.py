@@ -100,7 +100,7 @@ def benchmark(
                 raise ConfigError("--truth and --results belong together: give both")
             from iscat_analysis.study.own_simulation import score_own
 
-            scores = score_own(truth, results, resolved, command=context.obj, seed=seed)
+            scores = score_own(truth, results, resolved, command=context.obj)
             publish_scores(scores, out, archive, messages, overwrite=overwrite, as_json=as_json)
             return
         if out is None:

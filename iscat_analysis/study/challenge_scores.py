@@ -28,7 +28,7 @@ from iscat_analysis.study.efficiency import limits_of_many
 from iscat_analysis.study.estimator_process import Answer, Job, run_estimator
 from iscat_analysis.study.estimators import Estimator
 from iscat_analysis.study.limits import Limits
-from iscat_analysis.study.results import Results, match_movie, match_stacks, read_results
+from iscat_analysis.study.results import Results, match_movie, match_stacks, read_results, stem
 from iscat_analysis.study.setting import make_setting
 from iscat_analysis.study.trials import trial_generator
 from iscat_analysis.study.yardstick import (
@@ -72,11 +72,10 @@ def score_challenge(
         events, limits = known[group]
         entries: dict[str, Any] = {}
         columns: dict[str, dict[str, FloatArray]] = {}
-        for path in results:
-            read = read_results(path, pixel[group])
+        for read, names in _participants(results, pixel[group], events):
             entry, found = _of_results(read, about, events, limits, challenge.told(parts[0]))
             if entry is not None:
-                used.add(path.name)
+                used |= names
                 entries[read.name], columns[read.name] = entry, found
         for estimator in estimators:
             answer = answers[estimator.name][group]
@@ -190,6 +189,26 @@ def table_1(parts: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
+def _participants(
+    results: Sequence[Path], pixel_nm: float, events: pd.DataFrame
+) -> list[tuple[Results, set[str]]]:
+    """Read tables; those that are called as movies are, one for each, are one participant's."""
+    movies = {stem(file) for file in events["file"]}
+    out, own = [], []
+    for path in results:
+        read = read_results(path, pixel_nm)
+        if read.name in movies and "file" not in read.table:
+            own.append((replace(read, table=read.table.assign(file=read.name)), path))
+        else:
+            out.append((read, {path.name}))
+    if own:
+        tables = pd.concat([read.table for read, _ in own], ignore_index=True)
+        notes = tuple(dict.fromkeys(note for read, _ in own for note in read.notes))
+        name = own[0][1].resolve().parent.name
+        out.append((Results(name, tables, notes), {path.name for _, path in own}))
+    return out
+
+
 def _groups(challenge: Challenge) -> dict[str, list[str]]:
     """Put movies of one kind together."""
     out: dict[str, list[str]] = {}
@@ -231,6 +250,8 @@ def _of_results(
         placed = match_stacks(read, events, pixel)
         if placed.notna().sum().sum() == 0:
             return None, {}
+    elif "file" not in read.table and "frame" not in read.table:
+        return None, {}  # numbers of stacks
     else:
         files = list(dict.fromkeys(events["file"]))
         matched, alarms = [], []

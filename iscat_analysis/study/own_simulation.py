@@ -11,15 +11,13 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.executors import versions
 from iscat_analysis.hashing import sha256_of_files
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
+from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.study.challenge_scores import score_tables
 from iscat_analysis.study.efficiency import limits_of_many, matched
 from iscat_analysis.study.results import read_results, refuse_other_units
 
 
-def score_own(
-    truth: Path, results: Path, config: Config, *, command: str = "", seed: int = 1
-) -> dict[str, Any]:
+def score_own(truth: Path, results: Path, config: Config, *, command: str = "") -> dict[str, Any]:
     """Score one table against another, row by row or by event."""
     pixel = config.camera.pixel_size_nm
     if pixel is None:
@@ -45,6 +43,4 @@ def score_own(
         "command": command,
         "versions": versions(),
         **scored,
-        "seed": seed,
-        "parameters": list(PARAMETERS),
     }

@@ -99,7 +99,7 @@ def read_results(path: Path, pixel_nm: float, *, rows: bool = False) -> Results:
         )
     file = next((names[n] for n in FILES if n in names and _is_text(raw[names[n]])), None)
     if file is not None:
-        table["file"] = raw[file].map(lambda name: _stem(str(name)))
+        table["file"] = raw[file].map(lambda name: stem(str(name)))
     event = next((names[n] for n in EVENTS if n in names and not _is_text(raw[names[n]])), None)
     if event is not None:
         table["event"] = pd.to_numeric(raw[event], errors="coerce")
@@ -113,13 +113,13 @@ def read_results(path: Path, pixel_nm: float, *, rows: bool = False) -> Results:
         if lost.any():
             notes.append(f"{count(int(lost.sum()), 'row')} without a usable estimate left out")
         table = table[~lost]
-    return Results(_stem(path.name), table.reset_index(drop=True), tuple(notes))
+    return Results(stem(path.name), table.reset_index(drop=True), tuple(notes))
 
 
 def match_stacks(results: Results, events: pd.DataFrame, pixel_nm: float) -> pd.DataFrame:
     """Put results into the rows of the events of stacks, by file or number."""
     table = results.table
-    stems = events["file"].map(_stem)
+    stems = events["file"].map(stem)
     if "file" in table:
         rows, key = table["file"], stems
     elif "event" in table:
@@ -147,8 +147,8 @@ def match_movie(
     """Put results into the rows of a movie's events; the rest of them are false alarms."""
     table = results.table
     if "file" in table:
-        table = table[table["file"] == _stem(movie)]
-    elif results.name != _stem(movie) and movies > 1:
+        table = table[table["file"] == stem(movie)]
+    elif results.name != stem(movie) and movies > 1:
         return table.iloc[:0].reindex(range(len(events))), table.iloc[:0]
     if len(table) and "frame" not in table:
         raise DataError(
@@ -260,6 +260,6 @@ def _is_text(column: pd.Series) -> bool:
     return not pd.api.types.is_numeric_dtype(column)
 
 
-def _stem(name: str) -> str:
+def stem(name: str) -> str:
     """Name a file without its folder and what follows the dot."""
     return name.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1].partition(".")[0]

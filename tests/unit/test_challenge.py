@@ -235,6 +235,13 @@ def test_false_alarms_and_misses_are_counted(challenge, estimates, tmp_path) -> 
     assert "stack" not in [p for p, part in found["parts"].items() if part["estimators"]]
 
 
+def test_a_table_that_is_called_as_a_movie_is_of_that_movie(challenge, estimates, tmp_path) -> None:
+    table = estimates[estimates["file"].str.startswith("movies")].drop(columns=["event", "file"])
+    (tmp_path / "somebody").mkdir()
+    found = _scored(challenge, table, tmp_path / "somebody" / "movie.csv")
+    assert found["parts"]["movie"]["estimators"]["somebody"]["failed"] == 0
+
+
 def test_built_in_estimators_are_run_on_a_challenge(challenge) -> None:
     names = ("iscat", "peak")
     found = score_challenge(challenge, [], [find_estimator(name) for name in names])

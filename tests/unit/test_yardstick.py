@@ -13,9 +13,10 @@ from iscat_analysis.config import Config
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 from iscat_analysis.study.contest import draw
 from iscat_analysis.study.efficiency import limits_of_many
-from iscat_analysis.study.estimator_process import run_estimator
+from iscat_analysis.study.estimator_process import answer, run_estimator
 from iscat_analysis.study.estimators import (
     BUILT_IN,
+    Estimate,
     checked_table,
     find_estimator,
     known_estimators,
@@ -239,7 +240,7 @@ def test_an_amplitude_of_any_unit_becomes_a_mass(drawn) -> None:
 
 @pytest.mark.parametrize("name", [one.name for one in BUILT_IN if not one.extra])
 def test_every_built_in_estimator_finds_a_bright_particle(name: str, in_focus) -> None:
-    """Within a fifth of a wavelength, where the spot is round enough for Gaussians and centroids."""
+    """Within a sixth of a wavelength, where the spot is about as round as a Gaussian."""
     found = answer(find_estimator(name).load(), in_focus.job)
     assert not found.failures
     for axis, column in enumerate(("x_nm", "y_nm")):
