@@ -138,7 +138,7 @@ def limits_of_many(
 
     Shapes: `truths` (n, 4).
     """
-    experiment = _experiment(config, float(truths[:, 2].max()))
+    experiment = _experiment(config, float(truths[:, 2].max()) + _Z_STEP_NM)
     height = np.round(truths[:, 2] / _Z_STEP_NM) * _Z_STEP_NM
     with np.errstate(divide="ignore", invalid="ignore"):
         mass = np.exp(np.round(np.log(np.abs(truths[:, 3])) / _MASS_STEP) * _MASS_STEP)

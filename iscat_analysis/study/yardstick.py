@@ -39,6 +39,9 @@ FOLLOWS = 0.2
 VARIED = 1e-6
 """Variation of the truth, in units of the bound, below which there is no gradient to measure."""
 
+PER_SLOPE = 5
+"""Particles for each slope of the line, without which it would go through them by itself."""
+
 _WIDE = float(ndtri(0.975))
 
 
@@ -120,7 +123,9 @@ def _score(
         scored[name] = float(values[0])
         scored[f"{name}_ci95"] = _interval(values)
     scored["bias_se"] = _standard_error(found["bias"])
-    below = _below(found["spread_over_biased_bound"], float(own_bound[0]))
+    below = error.size >= _enough(deviation.shape[1]) and _below(
+        found["spread_over_biased_bound"], float(own_bound[0])
+    )
     return {**scored, "below_bound": below, "verdict": _verdict(scored, below)}
 
 
@@ -131,7 +136,7 @@ def _line(
 
     Shapes: `scaled, constant` (n,), `slopes` (n, d), result (resamples,) and (resamples, d).
     """
-    varied = np.std(slopes, axis=0) > VARIED
+    varied = (np.std(slopes, axis=0) > VARIED) & (len(slopes) >= _enough(slopes.shape[1]))
     features = np.column_stack([constant, slopes[:, varied]])
     size = np.sqrt(np.mean(features**2, axis=0))
     features = features / size
@@ -145,6 +150,11 @@ def _line(
     out = np.zeros((len(w), slopes.shape[1]))
     out[:, varied] = (line / size)[:, 1:]
     return np.sqrt(np.maximum(rest, 0.0) / free), out
+
+
+def _enough(parameters: int) -> int:
+    """Say how many particles it takes to measure gradients of the bias."""
+    return PER_SLOPE * (1 + parameters)
 
 
 def _own_errors(error: FloatArray, sigma: FloatArray, w: FloatArray) -> dict[str, FloatArray]:

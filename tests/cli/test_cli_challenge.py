@@ -21,7 +21,7 @@ SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--set", 
 @pytest.fixture
 def made(sample_configs: dict[str, Path], tmp_path: Path) -> Path:
     folder = tmp_path / "made"
-    arguments = ["--config", str(sample_configs["joint"]), "--out", str(folder), "--stacks", "12"]
+    arguments = ["--config", str(sample_configs["joint"]), "--out", str(folder), "--stacks", "26"]
     fewer = ["--set", "bounds.n_before=4", "--set", "bounds.n_after=4", "--set",
              "simulation.events=[]", *SMALL]  # fmt: skip
     assert main(["challenge", "make", *arguments, *fewer, "--blind", "--quiet"]) == 0
@@ -38,7 +38,6 @@ def _results(folder: Path) -> pd.DataFrame:
 def test_a_blind_challenge_from_making_to_the_page(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "SHA-256 of the truth" in capsys.readouterr().out
     results, out = tmp_path / "r.csv", tmp_path / "scores"
     _results(made).to_csv(results, index=False)
     archive = ["--archive", str(tmp_path / "scores.zip")]

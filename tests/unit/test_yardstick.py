@@ -119,6 +119,13 @@ def test_bounds_are_those_of_the_program(config) -> None:
     assert tuple(ia.bounds_for(config, mode="mass").index) == FREE_PARAMETERS["mass"]
 
 
+def test_a_few_particles_are_no_proof(config, ideal) -> None:
+    truth, estimate = ideal
+    few = ia.efficiency(truth[:10], truth[:10], config)
+    assert not few["below_bound"].any()
+    assert ia.efficiency(estimate[:5], truth[:5], config)["verdict"].str.contains("too few").all()
+
+
 def test_tables_are_matched_by_event_or_refused(config, ideal) -> None:
     truth, estimate = ideal
     numbered = truth.assign(event=range(COUNT))
@@ -238,6 +245,7 @@ def test_an_amplitude_of_any_unit_becomes_a_mass(drawn) -> None:
     assert not found.failures
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of what trackpy asks of pandas
 @pytest.mark.parametrize("name", [one.name for one in BUILT_IN if not one.extra])
 def test_every_built_in_estimator_finds_a_bright_particle(name: str, in_focus) -> None:
     """Within a sixth of a wavelength, where the spot is about as round as a Gaussian."""
