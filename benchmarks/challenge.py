@@ -73,13 +73,15 @@ def table_of(scores: Path) -> pd.DataFrame:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Estimators on the ready challenges.")
     parser.add_argument("presets", nargs="*", default=list(ABOUT))
+    parser.add_argument("--estimator", action="append", help="default: all that are installed")
     options = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     installed = [one.name for one in known_estimators() if not one.missing]
+    chosen = options.estimator or installed
     for preset in options.presets:
         folder, scores = RESULTS / preset, RESULTS / f"{preset}-scores"
         run("iscat", "challenge", "make", "--preset", preset, "--out", folder, "--overwrite")
-        estimators = [part for name in installed for part in ("--estimator", name)]
+        estimators = [part for name in chosen for part in ("--estimator", name)]
         run("iscat", "challenge", "score", folder, *results_of(folder), *estimators,
             "--out", scores, "--overwrite")  # fmt: skip
         table = table_of(scores / "challenge.json")
