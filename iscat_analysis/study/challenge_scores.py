@@ -43,7 +43,10 @@ SEED = 1
 """Of the bootstrap and of the starts of estimators: the same score at any time."""
 
 WINDOW = 60
-"""Frames before and after a landing that estimators are given of a movie."""
+"""Frames before and after a landing that estimators are given of a movie, at most."""
+
+SHORTER = 10
+"""Percent of landings whose frames do not suffice for the window, about."""
 
 
 def score_challenge(
@@ -394,6 +397,7 @@ class _Cut:
     corners_nm: FloatArray
     rows: NDArray[np.int64]
     events: int
+    window: int
 
     def whole(self, answer: Answer) -> Answer:
         """Put an answer into the rows of all events, at places in the whole field."""
@@ -403,7 +407,7 @@ class _Cut:
             columns[name] = np.full(self.events, np.nan)
             columns[name][self.rows] = values + shift
         left = self.events - len(self.rows)
-        short = {f"fewer than {WINDOW} frames": left} if left else {}
+        short = {f"fewer than {self.window} frames": left} if left else {}
         return replace(answer, columns=columns, failures=answer.failures | short)
 
 
@@ -414,7 +418,9 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
     gain, offset = float(camera.gain_e_per_adu), float(camera.offset_adu)
     side = told.fit.roi_px(float(about["pixel_size_nm"]))
     stacks = about["kind"] == "stacks"
-    n_before, n_after = (about["n_before"], about["n_after"]) if stacks else (WINDOW, WINDOW)
+    room = _room(events, about)
+    window = max(1, min(WINDOW, int(np.percentile(room, SHORTER))))
+    n_before, n_after = (about["n_before"], about["n_after"]) if stacks else (window, window)
     sums: FloatArray = np.full((2, len(events), side, side), np.nan)
     corners, starts = np.zeros((len(events), 2)), np.empty((len(events), 4))
     truths = events[list(PARAMETERS)].to_numpy(dtype=float)
@@ -426,6 +432,8 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
                 place = np.rint(truths[i, 1::-1] / pixel + random.uniform(-1, 1, 2)).astype(int)
                 corner = np.clip(place - side // 2, 0, np.array(stack.shape[1:]) - side)
                 first = int(event["frame"])
+                if room[i] < n_after:
+                    continue
                 rows, columns = (slice(c, c + side) for c in corner)
                 for k, (a, b) in enumerate(((first - n_before, first), (first, first + n_after))):
                     if 0 <= a < b <= stack.shape[0]:
@@ -449,7 +457,19 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
     known = replace(setup, start=setting.truth[None].copy())
     reference = np.stack([noiseless.before_e, noiseless.after_e])
     job = Job(sums[0, whole], sums[1, whole], setup, reference, known)
-    return _Cut(job, corners[whole] * pixel, whole, len(events))
+    return _Cut(job, corners[whole] * pixel, whole, len(events), n_after)
+
+
+def _room(events: pd.DataFrame, about: Mapping[str, Any]) -> NDArray[np.int64]:
+    """Count the frames that are there both before an event and with its particle.
+
+    Shapes: result (n,).
+    """
+    if about["kind"] == "stacks":
+        return np.full(len(events), about["n_after"])
+    end = events["leave"].fillna(about["frames"]).to_numpy(dtype=np.int64)
+    first = events["frame"].to_numpy(dtype=np.int64)
+    return np.asarray(np.minimum(first, end - first), dtype=np.int64)
 
 
 def _sha256(path: Path) -> str:
