@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config
+from iscat_analysis.errors import ContrastError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
@@ -254,18 +255,25 @@ def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Poi
     for share in HEIGHTS:
         z_nm = low + share * (high - low)
         add("height", z_nm, made(setting.context, z_nm=z_nm))
-    for focus in FOCI_NM:
-        changed = optics.model_copy(update={"focus_nm": optics.focus_nm + focus})
-        add("focus", changed.focus_nm,
-            make_setting(config.model_copy(update={"optics": changed}), mode))  # fmt: skip
+    for change in FOCI_NM:
+        if (one := _refocused(config, mode, change)) is not None:
+            add("focus", optics.focus_nm + change, one)
     for distance in DISTANCES:
         aside = distance * optics.wavelength_nm / optics.na
         add("neighbour", aside, setting, neighbour_nm=aside)
     for wrong in WRONG_NM:
-        changed = optics.model_copy(update={"focus_nm": optics.focus_nm + wrong})
-        true = make_setting(config.model_copy(update={"optics": changed}), mode)
-        add("wrong_focus", wrong, setting, source=replace(true, truth=setting.truth))
+        if (true := _refocused(config, mode, wrong)) is not None:
+            add("wrong_focus", wrong, setting, source=replace(true, truth=setting.truth))
     return found
+
+
+def _refocused(config: Config, mode: str, change_nm: float) -> Setting | None:
+    """Change the focus; nothing where the calibration's sign does not suit the new one."""
+    changed = config.optics.model_copy(update={"focus_nm": config.optics.focus_nm + change_nm})
+    try:
+        return make_setting(config.model_copy(update={"optics": changed}), mode)
+    except ContrastError:
+        return None
 
 
 def _curves(
