@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from importlib.metadata import EntryPoint
+
 import estimators_for_tests
 import numpy as np
 import pandas as pd
@@ -16,6 +19,7 @@ from iscat_analysis.study.efficiency import limits_of_many
 from iscat_analysis.study.estimator_process import answer, run_estimator
 from iscat_analysis.study.estimators import (
     BUILT_IN,
+    GROUP,
     Estimate,
     checked_table,
     find_estimator,
@@ -185,6 +189,16 @@ def test_estimators_are_found_by_name_or_function(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("iscat_analysis.study.estimators.find_spec", lambda _: None)
     with pytest.raises(ia.ConfigError, match=r"iscat-analysis\[piscat\]"):
         find_estimator("piscat").load()
+
+
+def test_other_packages_offer_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
+    theirs = EntryPoint("theirs", "json:dumps", GROUP)
+    found = {GROUP: [theirs]}
+    monkeypatch.setattr(
+        "iscat_analysis.study.estimators.entry_points", lambda *, group: found[group]
+    )
+    assert known_estimators()[-1].name == "theirs"
+    assert find_estimator("theirs").load() is json.dumps
 
 
 @pytest.fixture(scope="module")
