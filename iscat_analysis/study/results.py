@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.errors import DataError
@@ -180,7 +181,19 @@ def match_movie(
         placed.loc[event] = table.loc[row]
     matched = [row for row, _ in pairs]
     refuse_other_units(results.name, placed, events, pixel_nm)
-    return placed, table.drop(index=matched)
+    rest = table.drop(index=matched)
+    return placed, rest[~_leavings(rest, events)]
+
+
+def _leavings(table: pd.DataFrame, events: pd.DataFrame) -> NDArray[np.bool_]:
+    """Tell which results are of particles that leave: true, and no landings that are scored."""
+    left = events[events["leave"].notna()] if "leave" in events else events.iloc[:0]
+    apart = np.hypot(
+        table["x_nm"].to_numpy()[:, None] - left["x_nm"].to_numpy(),
+        table["y_nm"].to_numpy()[:, None] - left["y_nm"].to_numpy(),
+    )
+    late = np.abs(table["frame"].to_numpy()[:, None] - left["leave"].to_numpy(dtype=float))
+    return np.asarray(np.any((apart <= NEAR_NM) & (late <= NEAR_FRAMES), axis=1))
 
 
 def _assigned(table: pd.DataFrame, events: pd.DataFrame) -> list[tuple[int, int]]:
@@ -190,11 +203,6 @@ def _assigned(table: pd.DataFrame, events: pd.DataFrame) -> list[tuple[int, int]
         table["y_nm"].to_numpy()[:, None] - events["y_nm"].to_numpy(),
     )
     late = np.abs(table["frame"].to_numpy()[:, None] - events["frame"].to_numpy())
-    if "leave" in events:  # a particle that leaves is an event as well
-        leaves = events["leave"].to_numpy(dtype=float)
-        gone = np.abs(table["frame"].to_numpy()[:, None] - leaves)
-        landing = table.get("mass_kda", pd.Series(1.0, index=table.index)).to_numpy() >= 0
-        late = np.where(landing[:, None], late, np.minimum(late, np.nan_to_num(gone, nan=np.inf)))
     cost = apart / NEAR_NM + late / NEAR_FRAMES
     far = ~((apart <= NEAR_NM) & (late <= NEAR_FRAMES))
     rows, columns = linear_sum_assignment(np.where(far, 1e6, cost))

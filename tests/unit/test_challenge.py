@@ -23,7 +23,7 @@ from iscat_analysis.study.challenge_presets import ABOUT, parts_of_config, prese
 from iscat_analysis.study.challenge_scores import score_challenge
 from iscat_analysis.study.estimators import find_estimator
 from iscat_analysis.study.publish_scores import write_archive, write_scores
-from iscat_analysis.study.results import read_results
+from iscat_analysis.study.results import Results, match_movie, read_results
 
 PIXEL_NM = 84.4
 STACKS = 24
@@ -240,6 +240,16 @@ def test_a_table_that_is_called_as_a_movie_is_of_that_movie(challenge, estimates
     (tmp_path / "somebody").mkdir()
     found = _scored(challenge, table, tmp_path / "somebody" / "movie.csv")
     assert found["parts"]["movie"]["estimators"]["somebody"]["failed"] == 0
+
+
+def test_a_leaving_is_neither_a_landing_nor_a_false_alarm() -> None:
+    events = pd.DataFrame({"x_nm": [1e3], "y_nm": [2e3], "frame": [50], "leave": [90],
+                           "mass_kda": [300.0]})  # fmt: skip
+    rows = {"x_nm": [1e3, 1e3, 1e3], "y_nm": [2e3, 2e3, 9e3], "frame": [91, 49, 90]}
+    table = pd.DataFrame({**rows, "mass_kda": [-301.0, 299.0, -200.0]})
+    placed, false = match_movie(Results("movie", table), events, "movie.tif", 1, PIXEL_NM)
+    assert placed["mass_kda"].tolist() == [299.0]
+    assert false["mass_kda"].tolist() == [-200.0]
 
 
 def test_built_in_estimators_are_run_on_a_challenge(challenge) -> None:
