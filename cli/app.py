@@ -29,6 +29,8 @@ from iscat_cli.calibrate import (
     optics,
 )
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
+from iscat_cli.challenge import MAKE_EXAMPLE, SCORE_EXAMPLE, make, score
+from iscat_cli.challenge import SUMMARY as CHALLENGE_SUMMARY
 from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
 from iscat_cli.config import config
 from iscat_cli.console import UNEXPECTED, Messages, silence
@@ -67,7 +69,11 @@ COMMANDS = (
 
 # A command with commands of its own: its name, what it is for, and they.
 _CALIBRATIONS = ((camera, CAMERA_EXAMPLE), (optics, OPTICS_EXAMPLE), (mass, MASS_EXAMPLE))
-GROUPS = (("calibrate", CALIBRATE_SUMMARY, _CALIBRATIONS),)
+_CHALLENGES = ((make, MAKE_EXAMPLE), (score, SCORE_EXAMPLE))
+GROUPS = (
+    ("calibrate", CALIBRATE_SUMMARY, _CALIBRATIONS),
+    ("challenge", CHALLENGE_SUMMARY, _CHALLENGES),
+)
 
 
 def run(program: str, arguments: Sequence[str]) -> int:

@@ -8,15 +8,30 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from iscat_cli.challenge import publish_scores, ranking_table
 from iscat_cli.console import Messages, failures, print_json, print_result, short, table
-from iscat_cli.options import JsonOption, OverwriteOption, SetOption, WorkersOption, command
+from iscat_cli.options import (
+    ArchiveOption,
+    EstimatorOption,
+    JsonOption,
+    OverwriteOption,
+    SetOption,
+    TimeLimitOption,
+    WorkersOption,
+    command,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-EXAMPLE = """Example: a thousand repetitions of one experiment.
+EXAMPLE = """Example: a thousand repetitions of one experiment; then the estimators that can be
+named, and one's own simulation on the scale of the bounds.
 
     iscat benchmark --config setup.toml --out benchmark --trials 1000
+
+    iscat benchmark --list
+
+    iscat benchmark --config setup.toml --truth truth.csv --results results.csv
 """
 
 MODES = ("mass", "localize", "joint")
@@ -27,10 +42,23 @@ def benchmark(
     messages: Messages,
     *,
     config: Annotated[
-        Path,
+        Path | None,
         typer.Option(metavar="C.toml", help="Configuration; [bounds] describes the experiment."),
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder.")],
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="DIR", help="Output folder.")] = None,
+    estimator: EstimatorOption = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="Print the estimators that can be named.")
+    ] = False,
+    truth: Annotated[
+        Path | None,
+        typer.Option(metavar="T.csv", help="Truth of one's own simulation, one row a particle."),
+    ] = None,
+    results: Annotated[
+        Path | None, typer.Option(metavar="R.csv", help="Estimates of it, to be scored.")
+    ] = None,
+    time_limit: TimeLimitOption = 600.0,
+    archive: ArchiveOption = None,
     trials: Annotated[
         int, typer.Option(min=20, metavar="N", help="Repetitions in each mode.")
     ] = 1000,
@@ -56,19 +84,43 @@ def benchmark(
     """Measure spread, bias and coverage of the fits against CRB and QCRB.
 
     Draws synthetic shot noise, fits it in modes mass, localize and joint, and writes
-    benchmark.json, benchmark.html and figures to the output folder.
+    benchmark.json, benchmark.html and figures to the output folder. With --estimator, others see
+    the same counts; each runs in a process of its own.
     """
     with failures(messages):
+        from iscat_analysis.errors import ConfigError
+
+        if listed:
+            print_result(estimators_table())
+            return
+        if config is None:
+            raise ConfigError("--config is missing: give the configuration of the experiment")
         from iscat_analysis.config import load_config
 
         resolved = load_config(config, settings or ())
 
+        if truth is not None or results is not None:
+            if truth is None or results is None:
+                raise ConfigError("--truth and --results belong together: give both")
+            from iscat_analysis.study.own_simulation import score_own
+
+            scores = score_own(truth, results, resolved, command=messages.command)
+            publish_scores(scores, out, archive, messages, overwrite=overwrite, as_json=as_json)
+            return
+        if out is None:
+            raise ConfigError("--out is missing: give the folder that is to be written")
         from iscat_analysis.study import (
             check_benchmark_output,
             run_benchmark,
             write_benchmark,
         )
+        from iscat_analysis.study.estimators import find_estimator
+        from iscat_analysis.study.publish_scores import write_archive
 
+        others = [find_estimator(text) for text in estimator or ()]
+        for one in others:
+            if one.missing:
+                raise ConfigError(f"estimator {one.name}: {one.missing}")
         check_benchmark_output(out, overwrite)
         with messages.progress() as progress:
             study = run_benchmark(
@@ -77,17 +129,35 @@ def benchmark(
                 seed=seed,
                 workers=workers,
                 posterior=posterior,
+                estimators=others,
+                time_limit_s=time_limit,
                 command=messages.command,
                 progress=progress,
             )
         write_benchmark(study, out, overwrite=overwrite)
+        if archive is not None:
+            write_archive(out, archive, title="Benchmark", overwrite=overwrite)
         if as_json:
             print_json("benchmark", study)
         else:
             print_result(benchmark_table(study))
+            if others:
+                print_result(ranking_table(study))
             print_result(f"report: {out / 'benchmark.html'}")
         for note in left_out(study):
             messages.notify(note)
+
+
+def estimators_table() -> Table:
+    """Tabulate the estimators that can be named."""
+    from iscat_analysis.study.estimators import known_estimators
+
+    shown = table("estimator", "what it is", "")
+    for column in shown.columns:
+        column.justify = "left"
+    for one in known_estimators():
+        shown.add_row(one.name, one.about, one.missing)
+    return shown
 
 
 def left_out(study: Mapping[str, Any]) -> list[str]:

@@ -219,7 +219,7 @@ _OPTIONS = {
         name: name
         for name in ("config", "dark", "draws", "free", "hold", "inactive", "inject", "k", "kd",
                      "ladder", "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
-                     "scan", "scheduler", "standards", "steps", "target")
+                     "scan", "scheduler", "standards", "steps", "target", "truth")
     },
     "above_kda": "above",
     "settings": "set",

@@ -86,6 +86,24 @@ SchedulerFileOption = Annotated[
     ),
 ]
 
+EstimatorOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--estimator",
+        metavar="NAME|PACKAGE:FUNCTION",
+        help="One that `iscat benchmark --list` names, or a function; may be repeated.",
+    ),
+]
+
+TimeLimitOption = Annotated[
+    float, typer.Option("--time-limit", min=1.0, metavar="S", help="Of each estimator [s].")
+]
+
+ArchiveOption = Annotated[
+    Path | None,
+    typer.Option("--archive", metavar="OUT.zip", help="Pack the output, ready for a repository."),
+]
+
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
 
 JsonOption = Annotated[

@@ -15,6 +15,11 @@ Pieces, which take arrays and a microscope, and need neither a file nor a movie:
     ia.qcrb(...)                                                # whatever the camera
     ia.fit_diffusion(frames, positions_nm, sigma_nm, frame_rate_hz=331)  # of a track, with its CRB
 
+The yardstick, for whoever simulates and estimates by other means::
+
+    ia.bounds_for("setup.toml")                     # CRB, QCRB and Holevo bound
+    ia.efficiency(estimates, truth, "setup.toml")   # bias, spread, efficiency, each with 95 %
+
 Answers, from any table of events::
 
     ia.find_species("movie.iscat", ladder=66)       # masses, fractions, intervals
@@ -121,6 +126,9 @@ if TYPE_CHECKING:
     from iscat_analysis.species import fit_diffusion as fit_diffusion
     from iscat_analysis.species import hydrodynamic_diameter as hydrodynamic_diameter
     from iscat_analysis.species import refractive_index as refractive_index
+    from iscat_analysis.study.efficiency import bounds_for as bounds_for
+    from iscat_analysis.study.efficiency import efficiency as efficiency
+    from iscat_analysis.study.estimators import EstimatorSetup as EstimatorSetup
 
 _HOME = {
     "Optics": "config",
@@ -168,6 +176,9 @@ _HOME = {
     "Comparison": "species",
     "Distribution": "species",
     "compute_bounds": "notebook",
+    "bounds_for": "study.efficiency",
+    "efficiency": "study.efficiency",
+    "EstimatorSetup": "study.estimators",
     "forecast_optics": "notebook",
     "Bounds": "notebook",
     "Config": "config",
@@ -206,6 +217,7 @@ __all__ = [
     "DataError",
     "Diffusion",
     "Distribution",
+    "EstimatorSetup",
     "IscatError",
     "Kinetics",
     "LogLikelihood",
@@ -220,6 +232,7 @@ __all__ = [
     "TrackStatus",
     "anomalous_test",
     "batch",
+    "bounds_for",
     "calibrate_optics",
     "compare_samples",
     "compare_tables",
@@ -228,6 +241,7 @@ __all__ = [
     "configure",
     "confinement_test",
     "crb",
+    "efficiency",
     "find_species",
     "fit_diffusion",
     "fit_kd",

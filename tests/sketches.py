@@ -19,6 +19,7 @@ PAGES = tuple(
         "bounds",
         "calibration",
         "drawing",
+        "estimators",
         "optics",
         "page",
         "paper",

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from iscat_analysis.records import FREE_PARAMETERS
+from iscat_analysis.report.estimators import (
+    contest_figures,
+    contest_parts,
+    contest_sections,
+    part_figures,
+)
 from iscat_analysis.report.numbers import LABELS, UNITS
 from iscat_analysis.report.page import render_page
 from iscat_analysis.report.style import BLUE, INK, VERMILLION, new_figure, publish
 
-BENCHMARK_NAMES = frozenset({"benchmark.json", "benchmark.html", "config.toml", "figures"})
+BENCHMARK_NAMES = frozenset(
+    {"benchmark.json", "benchmark.html", "benchmark.bib", "config.toml", "figures"}
+)
 """Everything `write_benchmark` leaves in its folder."""
 
 ENOUGH_RANKS = 100
@@ -51,8 +60,12 @@ _AXES = {
 
 def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) -> str:
     """Make the page of a study, and write its figures."""
-    drawn = publish(benchmark_figures(study), folder)
-    sections = [_summary(study)]
+    others = "estimators" in study
+    figures = benchmark_figures(study)
+    if others:
+        figures = chain(figures, contest_figures(study), part_figures(_named_parts(study)))
+    drawn = publish(figures, folder)
+    sections = [*(contest_sections(study, drawn) if others else ()), _summary(study)]
     sections += [_mode_section(study, mode, drawn) for mode in MODES if mode in study]
     sections.append(
         {
@@ -92,6 +105,10 @@ def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) ->
             "footer": f"iscat-analysis {study['versions']['iscat-analysis']}",
         },
     )
+
+
+def _named_parts(study: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"estimators-{mode}": part for mode, part in contest_parts(study).items()}
 
 
 def _summary(study: Mapping[str, Any]) -> dict[str, Any]:

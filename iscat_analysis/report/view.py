@@ -9,7 +9,7 @@ from iscat_analysis.reading import is_file, is_folder
 
 PAGES = (
     "report.html", "batch.html", "camera.html", "calibration.html", "optics.html", "template.html",
-    "benchmark.html", "comparison.html",
+    "benchmark.html", "challenge.html", "comparison.html",
 )  # fmt: skip
 """Pages that the commands write."""
 

@@ -29,6 +29,7 @@ _DOCUMENTS: Mapping[str, str] = {
     "bounds": "bounds.Bounds",
     "calibration": "calibration.MassCalibration",
     "camera": "calibration.Camera",
+    "challenge": "study.Challenge",
     "comparison": "bounds.Comparison",
     "fit": "fit.Fit",
     "init": "setup.Init",
@@ -65,9 +66,9 @@ def schema(name: str) -> dict[str, Any]:
         ``"fit"``, ``"init"``, ``"batch"``, ``"simulate"`` or ``"bounds"`` for what the command
         prints with ``--json``, ``"comparison"`` and ``"optics_bounds"`` for ``iscat bounds
         --preset`` and ``--for optics``, ``"species_comparison"`` for ``iscat species`` of several
-        tables; ``"summary"``, ``"benchmark"``, ``"camera"``, ``"optics"``, ``"template"``,
-        ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and what is printed
-        beside it.
+        tables; ``"summary"``, ``"benchmark"``, ``"challenge"``, ``"camera"``, ``"optics"``,
+        ``"template"``, ``"calibration"``, ``"species"`` or ``"kd"`` for the file of that name and
+        what is printed beside it.
 
     Returns
     -------

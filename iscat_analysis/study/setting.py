@@ -65,6 +65,14 @@ class Setting:
         """Bounds over the free parameters, for all frames."""
         return self.experiment.bounds(self.free, level=self.level)
 
+    @property
+    def experiment_in_region(self) -> Experiment:
+        """The experiment with its field where the region is, whose first pixel lies at 0 nm."""
+        grid = PixelGrid.region(self.region.rows, self.region.columns, self.context.pixel_nm)
+        theta = self.experiment.theta.copy()
+        theta[:2] = self.truth[:2]
+        return replace(self.experiment, model=self.context.model, grid=grid, theta=theta)
+
     def level_e(self) -> float:
         """Return the expected background per pixel and frame [e]."""
         if self.context.additive:

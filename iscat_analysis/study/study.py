@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import platform
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,11 @@ from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 from iscat_analysis.schemas import to_json
 from iscat_analysis.study.baselines import Baselines
+from iscat_analysis.study.challenge_scores import ranking
+from iscat_analysis.study.contest import compare_estimators
+from iscat_analysis.study.estimators import Estimator
 from iscat_analysis.study.posteriors import RANKS, PosteriorRanks, calibrate_posterior
+from iscat_analysis.study.publish_scores import bibtex
 from iscat_analysis.study.scores import (
     MIN_TRIALS,
     pull_histogram,
@@ -57,6 +61,9 @@ PRIOR_MASS = 2.0
 
 LEAST_TRIALS = 20
 
+TIME_LIMIT_S = 600.0
+"""Of an estimator, for all that it is asked."""
+
 
 def run_benchmark(
     config: Config,
@@ -65,10 +72,15 @@ def run_benchmark(
     seed: int = 1,
     workers: int | None = None,
     posterior: bool = True,
+    estimators: Sequence[Estimator] = (),
+    time_limit_s: float = TIME_LIMIT_S,
     command: str = "",
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure what the fits achieve, in every mode, on synthetic shot noise."""
+    """Measure what the fits achieve, in every mode, on synthetic shot noise.
+
+    Other estimators then get counts of the same experiments, each the same.
+    """
     if trials < LEAST_TRIALS:
         raise ConfigError(
             f"trials = {trials} say nothing about a spread: give at least {LEAST_TRIALS}"
@@ -124,6 +136,24 @@ def run_benchmark(
             fewer, seed, stream + 40, threads, tally,
         )  # fmt: skip
         curves["z"][mode]["bounds"] = _bounds_along(config, setting)
+    if estimators:
+        others = compare_estimators(
+            config,
+            estimators,
+            trials=trials,
+            seed=seed,
+            time_limit_s=time_limit_s,
+            progress=progress,
+        )
+        parts = {
+            mode: {
+                "bounds": dict.fromkeys(setting.free),
+                "trials": trials,
+                "estimators": {who: entry[mode] for who, entry in others["estimators"].items()},
+            }
+            for mode, setting in settings.items()
+        }
+        study |= {**others, "ranking": ranking(parts)}
     return {
         **study,
         "curves": curves,
@@ -143,11 +173,12 @@ def run_benchmark(
 
 
 def write_benchmark(study: Mapping[str, Any], folder: Path, *, overwrite: bool = False) -> Path:
-    """Write ``benchmark.json``, ``benchmark.html``, ``config.toml`` and ``figures/``."""
+    """Write ``benchmark.json``, its page, ``benchmark.bib``, ``config.toml`` and ``figures/``."""
     with atomic_folder(folder, overwrite, known=BENCHMARK_NAMES) as building:
         text = to_json("benchmark", study)
         (building / "benchmark.json").write_text(text + "\n", encoding="utf-8")
         (building / "config.toml").write_text(study["config"], encoding="utf-8")
+        (building / "benchmark.bib").write_text(bibtex("Benchmark", text), encoding="utf-8")
         (building / "figures").mkdir()
         page = render_benchmark(study, folder=building / "figures")
         (building / "benchmark.html").write_text(page, encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -24,6 +25,8 @@ from walkers import SETUP, fits_of, walk
 from iscat_analysis.config import SIMULATED, Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.species import describe_tracks
+from iscat_analysis.study.challenge import make_challenge
+from iscat_analysis.study.challenge_presets import parts_of_config
 from iscat_cli import console, main, main_fit
 from iscat_cli.app import COMMANDS, GROUPS
 from iscat_cli.console import Messages, duration
@@ -70,6 +73,14 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path
         one.to_csv(folder / f"{number}.csv", index=False)
     rows = pd.DataFrame({"path": ["0.csv", "1.csv"], "concentration_nm": totals[:, 0]})
     rows.to_csv(folder / "series.csv", index=False)
+    make_challenge(parts_of_config(load_config(folder / "setup.toml", ["fit.roi_nm=900"]), 12),
+                   folder / "challenge", name="setup")  # fmt: skip
+    events = json.loads((folder / "challenge/truth.json").read_text(encoding="utf-8"))["events"]
+    truth = pd.DataFrame([one for one in events if one["part"] == "stack"])
+    truth = truth[["event", "x_nm", "y_nm", "mass_kda"]]
+    truth.to_csv(folder / "truth.csv", index=False)
+    noisy = truth.assign(x_nm=truth["x_nm"] + random.normal(0, 9.0, len(truth)))
+    noisy.to_csv(folder / "results.csv", index=False)
     (folder / "moving.iscat").mkdir()
     fits = fits_of([walk(random, 30, 0.3)], random)
     fits.to_csv(folder / "moving.iscat/fits.csv", index=False)
@@ -121,11 +132,12 @@ def test_every_example_runs(
         arguments += ["--free", "focus,phase"]
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
-    if "benchmark" in arguments:
+    if "challenge" in arguments:
+        sketch_figures(monkeypatch)
+    if "--trials" in arguments:
         sketch_figures(monkeypatch)
         arguments += ["--no-posterior", "--set", "fit.roi_nm=900"]
-        if "--trials" in arguments:  # fewer, and no posterior: the shape stays the same
-            arguments[arguments.index("--trials") + 1] = "20"
+        arguments[arguments.index("--trials") + 1] = "20"  # fewer; the shape stays the same
     if "pupil" in arguments:  # test_pupil_search goes the whole way
         arguments += ["--free", "focus,phase", "--set", "bounds.pixels=25"]
     capsys.readouterr()

@@ -1,0 +1,184 @@
+"""Run an estimator in a process of its own, which may fail, hang or grow without harm to others.
+
+The parent writes what is asked for into a file, and starts this module; the child adds an answer
+to another file as soon as a job is done.  What is there when the time is up counts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from iscat_analysis.reading import first_line
+from iscat_analysis.records import FloatArray, Progress, silent
+from iscat_analysis.study.estimators import Estimate, Estimator, EstimatorSetup, checked_table
+
+_MEGABYTE = 2.0**20
+_TOLD = 200  # characters of what a process said last
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Regions to be estimated, and the noiseless image of one particle of known mass.
+
+    Shapes: `before, after` (n, y, x), `reference` (2, y, x).
+    """
+
+    before: FloatArray
+    after: FloatArray
+    setup: EstimatorSetup
+    reference: FloatArray
+    reference_setup: EstimatorSetup
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What an estimator made of one job; `failures` counts regions by what went wrong."""
+
+    columns: dict[str, FloatArray] = field(default_factory=dict)
+    failures: dict[str, int] = field(default_factory=dict)
+    seconds: float = float("nan")
+    processor_seconds: float = float("nan")
+    peak_mb: float = float("nan")
+
+
+def run_estimator(
+    estimator: Estimator,
+    jobs: Sequence[Job],
+    limit_s: float,
+    paths: Sequence[str] = (),
+    progress: Progress = silent,
+) -> list[Answer]:
+    """Let an estimator do jobs in a process of its own, within a time for all of them.
+
+    What it did not answer is counted as failed, with the reason.
+    """
+    del progress
+    with tempfile.TemporaryDirectory(prefix="estimator-") as name:
+        request, answers = Path(name) / "request", Path(name) / "answers"
+        said = Path(name) / "said"
+        request.write_bytes(pickle.dumps((estimator, list(jobs), [*paths])))
+        answers.touch()
+        command = [sys.executable, "-m", __name__, str(request), str(answers)]
+        with said.open("wb") as stream:
+            try:
+                ended = subprocess.run(
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stream,
+                    timeout=limit_s, check=False,
+                )  # fmt: skip
+                lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+                last = f": {lines[-1][-_TOLD:]}" if lines else ""
+                why = f"its process ended with status {ended.returncode}{last}"
+            except subprocess.TimeoutExpired:
+                why = f"no answer within {limit_s:g} s"
+        done = _read(answers)
+    missing = [Answer(failures={why: len(job.before)}) for job in jobs[len(done) :]]
+    return [*done, *missing]
+
+
+def _read(path: Path) -> list[Answer]:
+    """Read the answers that are whole."""
+    found = []
+    with path.open("rb") as file, contextlib.suppress(EOFError, pickle.UnpicklingError):
+        while True:
+            found.append(pickle.load(file))
+    return found
+
+
+def answer(estimate: Estimate, job: Job) -> Answer:
+    """Do one job: the reference, which also compiles what is to be compiled, then all regions."""
+    count = len(job.before)
+    factor = _mass_per_amplitude(estimate, job)
+    clock, processor = time.perf_counter(), time.process_time()
+    failures: dict[str, int] = {}
+    try:
+        columns = checked_table(estimate(job.before, job.after, job.setup), count)
+    except Exception:
+        columns = _one_by_one(estimate, job, failures)
+    clock, processor = time.perf_counter() - clock, time.process_time() - processor
+    for sigma in ("", "sigma_"):
+        amplitude = columns.pop(f"{sigma}amplitude", None)
+        if amplitude is not None and f"{sigma}mass_kda" not in columns:
+            columns[f"{sigma}mass_kda"] = (abs(factor) if sigma else factor) * amplitude
+    raised = sum(failures.values())
+    given = np.zeros(count, dtype=bool)
+    for name, values in columns.items():
+        if not name.startswith("sigma_"):
+            given |= np.isfinite(values)
+    if silent_rows := count - int(given.sum()) - raised:
+        failures["no number"] = silent_rows
+    return Answer(columns, failures, clock, processor, _peak_mb())
+
+
+def _one_by_one(estimate: Estimate, job: Job, failures: dict[str, int]) -> dict[str, FloatArray]:
+    """Give the regions one at a time, so that one that fails costs no other."""
+    count = len(job.before)
+    columns: dict[str, FloatArray] = {}
+    for i in range(count):
+        part = slice(i, i + 1)
+        try:
+            row = checked_table(
+                estimate(job.before[part], job.after[part], job.setup.of(i, i + 1)), 1
+            )
+        except Exception as error:
+            why = f"{type(error).__name__}: {first_line(error)}"
+            failures[why] = failures.get(why, 0) + 1
+            continue
+        for name, value in row.items():
+            columns.setdefault(name, np.full(count, np.nan))[i] = value[0]
+    return columns
+
+
+def _mass_per_amplitude(estimate: Estimate, job: Job) -> float:
+    """Calibrate the amplitude as well as can be: on the noiseless image of a known mass."""
+    before, after = job.reference[:1], job.reference[1:]
+    try:
+        row = checked_table(estimate(before, after, job.reference_setup), 1)
+    except Exception:
+        return float("nan")
+    amplitude = row.get("amplitude", np.full(1, np.nan))[0]
+    return float(job.reference_setup.start[0, 3] / amplitude) if amplitude else float("nan")
+
+
+def _peak_mb() -> float:
+    """Give the most memory that this process ever held; NaN where the system does not tell."""
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return float(kilobytes * (1 if sys.platform == "darwin" else 1024) / _MEGABYTE)
+
+
+def main(request: str, answers: str) -> int:
+    """Do what a file asks for; 1 where the estimator cannot be had."""
+    loaded: Any = pickle.loads(Path(request).read_bytes())
+    estimator, jobs, paths = loaded
+    sys.path[:0] = [path for path in paths if path not in sys.path]
+    try:
+        estimate = estimator.load()
+    except Exception as error:
+        sys.stderr.write(f"{first_line(error)}\n")
+        return 1
+    with Path(answers).open("ab") as file:
+        for job in jobs:
+            file.write(pickle.dumps(answer(estimate, job)))
+            file.flush()
+    return 0
+
+
+if __name__ == "__main__":
+    # what is pickled has to be of the module that the parent knows, which is not __main__
+    from iscat_analysis.study.estimator_process import main as run
+
+    sys.exit(run(*sys.argv[1:]))

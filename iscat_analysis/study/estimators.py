@@ -1,0 +1,233 @@
+"""Estimators that can be compared: what they are given, what they return, and which there are.
+
+An estimator is a function ``(before, after, setup) -> table``.  `before` and `after` are the
+photoelectrons summed over the frames before and with the particle, (n, y, x), and `setup` says what
+is known of the experiment.  The table has any of the columns ``x_nm``, ``y_nm``, ``z_nm``,
+``mass_kda`` or ``amplitude``, and ``sigma_*`` of each; ``index`` says which region a row is of, and
+may be left out where there is a row for each.  An amplitude of any unit becomes a mass by one
+factor, from the noiseless image of a particle of known mass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.metadata import entry_points
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.reading import first_line
+from iscat_analysis.records import PARAMETERS, FloatArray
+
+GROUP = "iscat_analysis.estimators"
+"""Entry points of packages that offer estimators."""
+
+COLUMNS = (*PARAMETERS, "amplitude")
+"""What an estimator may return, each also with ``sigma_`` before its name."""
+
+
+@dataclass(frozen=True, eq=False)
+class EstimatorSetup:
+    """What an estimator knows of the experiment, beside the counts.
+
+    Attributes
+    ----------
+    mode : str
+        What is free, as a key of `FREE_PARAMETERS`.
+    free : tuple of str
+        Names of the free parameters; the others have their values in `start`.
+    optics, particle, camera, calibration
+        The microscope, the particle's material, the camera, and contrast against mass, or None.
+    pixel_size_nm : float
+        Side of a pixel in the sample [nm]; pixel (0, 0) of a region has its centre at (0, 0) nm.
+    photons_per_pixel : float
+        Expected background per pixel and frame [photoelectrons].
+    n_before, n_after : int
+        Frames in the sums; with `n_before` = 0 `before` is the known background of one frame.
+    interferes : bool
+        Whether the light has a reference; False in dark field.
+    polarity : int
+        Sign of the particle's contrast in focus of attention: −1 where it is darker.
+    psf_sigma_nm : float
+        Standard deviation of the Gaussian nearest to the diffraction-limited spot, 0.21 λ/NA [nm].
+    z_range_nm : tuple of float
+        Heights that are possible [nm].
+    level_fitted : bool
+        Whether a common level of the light is unknown.
+    start : ndarray, shape (n, 4)
+        Where a detection would have put each particle: x, y, z [nm] and mass [kDa].
+    """
+
+    mode: str
+    free: tuple[str, ...]
+    optics: Optics
+    particle: Particle
+    camera: CameraConfig
+    calibration: Calibration | None
+    pixel_size_nm: float
+    photons_per_pixel: float
+    n_before: int
+    n_after: int
+    interferes: bool
+    polarity: int
+    psf_sigma_nm: float
+    z_range_nm: tuple[float, float]
+    level_fitted: bool
+    start: FloatArray
+
+    def image(self, before: FloatArray, after: FloatArray) -> FloatArray:
+        """Give the contrast; in dark field, the photoelectrons per frame above the background.
+
+        Parameters
+        ----------
+        before, after : ndarray, shape (n, y, x)
+            Counts as an estimator is given them [photoelectrons].
+
+        Returns
+        -------
+        ndarray, shape (n, y, x)
+            Contrast images.
+        """
+        background = before / max(self.n_before, 1)
+        signal = after / self.n_after - background
+        return signal / background if self.interferes else signal
+
+    def of(self, first: int, last: int) -> EstimatorSetup:
+        """Give the setup of some of the regions.
+
+        Parameters
+        ----------
+        first, last : int
+            Half-open range of regions.
+
+        Returns
+        -------
+        EstimatorSetup
+            The same with fewer starts.
+        """
+        return replace(self, start=self.start[first:last])
+
+
+Estimate = Callable[[FloatArray, FloatArray, EstimatorSetup], Any]
+"""The function itself; it returns a DataFrame, or a mapping of columns."""
+
+
+@dataclass(frozen=True)
+class Estimator:
+    """Where an estimator is found; `module` is what has to be installed for it, if anything."""
+
+    name: str
+    target: str
+    about: str = ""
+    module: str = ""
+    extra: str = ""
+
+    @property
+    def missing(self) -> str:
+        """Say what has to be installed; empty where nothing is missing."""
+        package = self.module.partition(".")[0]
+        if not package or find_spec(package) is not None:
+            return ""
+        return f'not installed: pip install "iscat-analysis[{self.extra}]"'
+
+    def load(self) -> Estimate:
+        """Import the function."""
+        if self.missing:
+            raise ConfigError(f"estimator {self.name}: {self.missing}")
+        module, _, function = self.target.partition(":")
+        try:
+            found = import_module(module)
+            for part in function.split("."):
+                found = getattr(found, part)
+        except Exception as error:
+            raise ConfigError(
+                f"estimator {self.name}: {self.target} cannot be imported "
+                f"({type(error).__name__}: {first_line(error)})"
+            ) from None
+        if not callable(found):
+            raise ConfigError(f"estimator {self.name}: {self.target} is no function")
+        made: Estimate = found
+        return made
+
+
+_OURS = "iscat_analysis.study.simple_estimators"
+_PEERS = "iscat_analysis.study.peer_estimators"
+
+BUILT_IN = (
+    Estimator("iscat", f"{_OURS}:iscat", "this program's fit, in the mode that is studied"),
+    Estimator("gauss-ls", f"{_OURS}:gauss_ls", "Gaussian on the contrast, least squares"),
+    Estimator("gauss-mle", f"{_OURS}:gauss_mle", "Gaussian on the counts, maximum likelihood"),
+    Estimator("matched-filter", f"{_OURS}:matched_filter", "highest correlation with the model"),
+    Estimator("dog", f"{_OURS}:dog", "highest difference of Gaussians"),
+    Estimator("radial-symmetry", f"{_OURS}:radial_symmetry", "centre of the gradients' lines"),
+    Estimator("centroid", f"{_OURS}:centroid", "centre of mass of the contrast"),
+    Estimator("peak", f"{_OURS}:peak", "highest pixel"),
+    Estimator("picasso-gausslq", f"{_PEERS}:picasso_gausslq", "Picasso's Gaussian, least squares",
+              "picasso", "picasso"),
+    Estimator("picasso-gaussmle", f"{_PEERS}:picasso_gaussmle",
+              "Picasso's Gaussian, maximum likelihood", "picasso", "picasso"),
+    Estimator("piscat", f"{_PEERS}:piscat", "PiSCAT's Gaussian, least squares", "piscat", "piscat"),
+    Estimator("trackpy", f"{_PEERS}:trackpy", "trackpy's refined centre of mass", "trackpy"),
+)  # fmt: skip
+"""What can be named without a module; nothing of it is imported before it is run."""
+
+
+def known_estimators() -> tuple[Estimator, ...]:
+    """List the built-in estimators and those that other packages offer."""
+    names = {one.name for one in BUILT_IN}
+    offered = (
+        Estimator(point.name, point.value, f"of {point.dist.name if point.dist else point.module}")
+        for point in entry_points(group=GROUP)
+    )
+    return (*BUILT_IN, *(one for one in offered if one.name not in names))
+
+
+def find_estimator(text: str) -> Estimator:
+    """Find an estimator by its name, or by the PACKAGE:FUNCTION that it is."""
+    known = {one.name: one for one in known_estimators()}
+    if text in known:
+        return known[text]
+    module, colon, function = text.partition(":")
+    named = all(part.isidentifier() for part in (*module.split("."), *function.split(".")))
+    if not colon or not named:
+        raise ConfigError(
+            f"estimator {text!r}: is neither PACKAGE:FUNCTION nor one of {', '.join(known)}"
+        )
+    return Estimator(text, text)
+
+
+def checked_table(table: Any, count: int) -> dict[str, FloatArray]:
+    """Put what an estimator returned into one row for each region; NaN where it gave none.
+
+    Shapes: columns (count,).
+    """
+    if not isinstance(table, (pd.DataFrame, Mapping)):
+        raise ConfigError(f"returned {type(table).__name__}, no table (DataFrame or dict)")
+    columns = {str(name): np.asarray(table[name]).reshape(-1) for name in table}
+    known = [name for name in columns if name.removeprefix("sigma_") in COLUMNS]
+    if not any(name in COLUMNS for name in known):
+        raise ConfigError(f"returned none of the columns {', '.join(COLUMNS)}")
+    lengths = {columns[name].size for name in known}
+    index = columns.get("index", np.arange(count))
+    if lengths != {index.size}:
+        raise ConfigError(
+            f"returned {sorted(lengths)} rows for {count} regions: give one for each, or say which "
+            "in a column index"
+        )
+    rows = np.asarray(index, dtype=np.int64)
+    if np.any(rows != index) or np.any((rows < 0) | (rows >= count)):
+        raise ConfigError(f"returned an index that is not one of 0 … {count - 1}")
+    if np.unique(rows).size != rows.size:
+        raise ConfigError("returned two rows for one region")
+    out = {}
+    for name in known:
+        out[name] = np.full(count, np.nan)
+        out[name][rows] = columns[name].astype(np.float64)
+        out[name][~np.isfinite(out[name])] = np.nan
+    return out

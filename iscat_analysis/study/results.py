@@ -1,0 +1,273 @@
+"""Tables of results, of any program: whose columns they have, in which units, and of which event.
+
+Known are the names of PiSCAT, PhotoMol and Refeyn, Picasso, ThunderSTORM, trackpy and ours.  Units
+that do not fit the truth by a plain factor are refused, with the factor: a position in pixels is
+never scored as nanometres.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
+from iscat_analysis.reading import first_line, is_folder, read_text
+from iscat_analysis.records import FloatArray
+from iscat_analysis.units import count
+
+PX, NM, ANY = "px", "nm", ""
+
+NAMES: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "x_nm": (("x_nm", NM), ("x [nm]", NM), ("x_px", PX), ("x [px]", PX), ("x_coords", PX),
+             ("fit_x-center", PX), ("x", PX)),
+    "y_nm": (("y_nm", NM), ("y [nm]", NM), ("y_px", PX), ("y [px]", PX), ("y_coords", PX),
+             ("fit_y-center", PX), ("y", PX)),
+    "z_nm": (("z_nm", NM), ("z [nm]", NM)),
+    "mass_kda": (("mass_kda", ANY), ("masses_kda", ANY), ("calibrated_values", ANY)),
+    "amplitude": (("amplitude", ANY), ("contrast", ANY), ("contrasts", ANY),
+                  ("fit_amplitude", ANY), ("center_int", ANY), ("center_intensity", ANY),
+                  ("photons", ANY), ("intensity [photon]", ANY), ("signal", ANY), ("mass", ANY)),
+    "sigma_x_nm": (("sigma_x_nm", NM), ("uncertainty_xy [nm]", NM), ("uncertainty [nm]", NM),
+                   ("lpx", PX), ("fit_errors_x-center", PX), ("ep", PX)),
+    "sigma_y_nm": (("sigma_y_nm", NM), ("uncertainty_xy [nm]", NM), ("uncertainty [nm]", NM),
+                   ("lpy", PX), ("fit_errors_y-center", PX), ("ep", PX)),
+    "sigma_z_nm": (("sigma_z_nm", NM), ("uncertainty_z [nm]", NM)),
+    "sigma_mass_kda": (("sigma_mass_kda", ANY),),
+    "frame": (("frame", ANY), ("frame_indices", ANY), ("frames", ANY), ("frame number", ANY)),
+    "score": (("snr", ANY), ("score", ANY), ("net_gradient", ANY)),
+}  # fmt: skip
+"""What each column is called, and its unit; the first that is there is taken."""
+
+FILES = ("file", "stack", "movie", "path", "filename", "image")
+EVENTS = ("event", "id", "index", "stack", "region")
+
+THUNDERSTORM = "x [nm]"
+"""This program counts positions from the corner of the first pixel, and frames from 1."""
+
+NEAR_NM = 250.0
+NEAR_FRAMES = 10
+"""How far a result lies from the event that it is of, at most."""
+
+_FIT = 0.15  # of a median ratio to a factor
+
+
+@dataclass(frozen=True, eq=False)
+class Results:
+    """One table of results, in nm, kDa and zero-based frames; `notes` say what was assumed."""
+
+    name: str
+    table: pd.DataFrame
+    notes: tuple[str, ...] = field(default=())
+
+
+def read_results(path: Path, pixel_nm: float, *, rows: bool = False) -> Results:
+    """Read a table of results: a CSV, or a folder of this program.
+
+    With `rows`, what a row is of may be said by its place in the table.
+    """
+    source = path / "fits.csv" if is_folder(path) else path
+    raw = _read(source)
+    names = {str(name).strip().strip('"').lower(): name for name in raw.columns}
+    known: dict[str, pd.Series] = {}
+    notes = []
+    for column, choices in NAMES.items():
+        found = next(((name, unit) for name, unit in choices if name in names), None)
+        if found is None:
+            continue
+        values = pd.to_numeric(raw[names[found[0]]], errors="coerce")
+        known[column] = values * pixel_nm if found[1] == PX else values
+        if found[0] != column:
+            notes.append(f"{found[0]} → {column}" + (" × pixel size" if found[1] == PX else ""))
+    if THUNDERSTORM in names:
+        for axis in ("x_nm", "y_nm"):
+            known[axis] = known[axis] - pixel_nm / 2
+        if "frame" in known:
+            known["frame"] = known["frame"] - 1
+        notes.append("positions from the corner of the first pixel, frames from 1 (ThunderSTORM)")
+    table = pd.DataFrame(known, index=raw.index)
+    if not {"x_nm", "y_nm", "z_nm", "mass_kda", "amplitude"} & set(table):
+        raise DataError(
+            f"{source}: has none of the columns x_nm, y_nm, z_nm, mass_kda or their names in other "
+            f"programs; its first line names {', '.join(map(str, raw.columns[:8]))}"
+        )
+    file = next((names[n] for n in FILES if n in names and _is_text(raw[names[n]])), None)
+    if file is not None:
+        table["file"] = raw[file].map(lambda name: stem(str(name)))
+    event = next((names[n] for n in EVENTS if n in names and not _is_text(raw[names[n]])), None)
+    if event is not None:
+        table["event"] = pd.to_numeric(raw[event], errors="coerce")
+    if not rows and not {"file", "event", "frame"} & set(table):
+        raise DataError(
+            f"{source}: has neither a column that says of which stack a row is (file, or event) "
+            "nor a frame, so that its rows belong to nothing; add one"
+        )
+    if "status" in names and "flags" in names:  # of this program, which says what it rejects
+        lost = raw[names["status"]].astype(str).isin(["not_converged", "at_bound", "ambiguous_z"])
+        if lost.any():
+            notes.append(f"{count(int(lost.sum()), 'row')} without a usable estimate left out")
+        table = table[~lost]
+    return Results(stem(path.name), table.reset_index(drop=True), tuple(notes))
+
+
+def match_stacks(results: Results, events: pd.DataFrame, pixel_nm: float) -> pd.DataFrame:
+    """Put results into the rows of the events of stacks, by file or number."""
+    table = results.table
+    stems = events["file"].map(stem)
+    if "file" in table:
+        rows, key = table["file"], stems
+    elif "event" in table:
+        rows, key = table["event"], events["event"]
+    else:
+        raise DataError(
+            f"{results.name}: has frames and no file or event, and stacks hold one particle each; "
+            "add a column file"
+        )
+    ours = table[rows.isin(set(key))]
+    twice = rows[ours.index][rows[ours.index].duplicated()]
+    if len(twice):
+        raise DataError(
+            f"{results.name}: has {twice.iloc[0]} twice, and each stack holds one particle; keep "
+            "one row of each"
+        )
+    placed = ours.set_index(rows[ours.index]).reindex(key).reset_index(drop=True)
+    refuse_other_units(results.name, placed, events, pixel_nm)
+    return placed
+
+
+def match_movie(
+    results: Results, events: pd.DataFrame, movie: str, movies: int, pixel_nm: float
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Put results into the rows of a movie's events; the rest of them are false alarms."""
+    table = results.table
+    if "file" in table:
+        table = table[table["file"] == stem(movie)]
+    elif results.name != stem(movie) and movies > 1:
+        return table.iloc[:0].reindex(range(len(events))), table.iloc[:0]
+    if len(table) and "frame" not in table:
+        raise DataError(
+            f"{results.name}: has no column frame, so that nobody knows when its particles of "
+            f"{movie} landed; add it"
+        )
+    if not len(table) or not {"x_nm", "y_nm"} <= set(table):
+        return table.iloc[:0].reindex(range(len(events))), table.iloc[:0]
+    same = table.duplicated(["frame", "x_nm", "y_nm"])
+    if same.any():
+        row = int(table.index[same.to_numpy()][0])
+        raise DataError(
+            f"{results.name}: row {row} repeats an event of {movie} that is there already; keep "
+            "one row of each"
+        )
+    table = table.reset_index(drop=True)
+    pairs = _assigned(table, events)
+    for factor, said in (
+        (pixel_nm, "pixels"),
+        (1 / pixel_nm, "nm, though called pixels"),
+        (1000.0, "µm"),
+    ):
+        scaled = table.assign(x_nm=table["x_nm"] * factor, y_nm=table["y_nm"] * factor)
+        better = len(_assigned(scaled, events))
+        if better >= 3 and better > 2 * len(pairs):
+            raise DataError(_units_said(results.name, "positions", said, factor))
+    placed = table.iloc[:0].reindex(range(len(events)))
+    for row, event in pairs:
+        placed.loc[event] = table.loc[row]
+    matched = [row for row, _ in pairs]
+    refuse_other_units(results.name, placed, events, pixel_nm)
+    rest = table.drop(index=matched)
+    return placed, rest[~_leavings(rest, events)]
+
+
+def _leavings(table: pd.DataFrame, events: pd.DataFrame) -> NDArray[np.bool_]:
+    """Tell which results are of particles that leave: true, and no landings that are scored."""
+    left = events[events["leave"].notna()] if "leave" in events else events.iloc[:0]
+    apart = np.hypot(
+        table["x_nm"].to_numpy()[:, None] - left["x_nm"].to_numpy(),
+        table["y_nm"].to_numpy()[:, None] - left["y_nm"].to_numpy(),
+    )
+    late = np.abs(table["frame"].to_numpy()[:, None] - left["leave"].to_numpy(dtype=float))
+    return np.asarray(np.any((apart <= NEAR_NM) & (late <= NEAR_FRAMES), axis=1))
+
+
+def _assigned(table: pd.DataFrame, events: pd.DataFrame) -> list[tuple[int, int]]:
+    """Pair results and events, the nearest first, none farther than `NEAR_NM`, `NEAR_FRAMES`."""
+    apart = np.hypot(
+        table["x_nm"].to_numpy()[:, None] - events["x_nm"].to_numpy(),
+        table["y_nm"].to_numpy()[:, None] - events["y_nm"].to_numpy(),
+    )
+    late = np.abs(table["frame"].to_numpy()[:, None] - events["frame"].to_numpy())
+    cost = apart / NEAR_NM + late / NEAR_FRAMES
+    far = ~((apart <= NEAR_NM) & (late <= NEAR_FRAMES))
+    rows, columns = linear_sum_assignment(np.where(far, 1e6, cost))
+    return [(int(r), int(c)) for r, c in zip(rows, columns, strict=True) if not far[r, c]]
+
+
+def refuse_other_units(
+    name: str, placed: pd.DataFrame, events: pd.DataFrame, pixel_nm: float
+) -> None:
+    """Refuse values that are the truth times a factor of units."""
+    lengths = ((pixel_nm, "pixels"), (1000.0, "µm"), (1 / pixel_nm, "nm, though called pixels"))
+    for column, what, factors in (
+        ("x_nm", "positions", lengths),
+        ("y_nm", "positions", lengths),
+        ("mass_kda", "masses", ((0.001, "Da"), (1000.0, "MDa"))),
+    ):
+        if column not in placed or column not in events:
+            continue
+        ratio = _median_ratio(placed[column], events[column])
+        for factor, said in factors:
+            if abs(ratio * factor - 1) < _FIT and abs(ratio - 1) > _FIT:
+                raise DataError(_units_said(name, what, said, factor))
+
+
+def _units_said(name: str, what: str, said: str, factor: float) -> str:
+    names = {"pixels": ", or call them x_px and y_px", "nm, though called pixels":
+             ", or call them x_nm and y_nm"}  # fmt: skip
+    return (
+        f"{name}: its {what} are in {said}: times {factor:.4g} they fit the truth; convert them"
+        f"{names.get(said, '')}"
+    )
+
+
+def _median_ratio(estimates: pd.Series, truth: pd.Series) -> float:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.abs(estimates.to_numpy(dtype=float)) / truth.to_numpy(dtype=float)
+    known: FloatArray = ratio[np.isfinite(ratio) & (ratio > 0)]
+    return float(np.median(known)) if known.size else 1.0
+
+
+def _read(path: Path) -> pd.DataFrame:
+    try:
+        lines = [line for line in read_text(path).splitlines() if not line.startswith("#")]
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: is no text file in UTF-8; export the results as CSV") from None
+    if len(lines) < 2:
+        raise DataError(f"{path}: has no rows; a table needs a line of names and its rows")
+    between = separator(lines[0])
+    first = [name.strip().strip('"').lower() for name in lines[0].split(between)]
+    refuse_twice(first, {name for names in NAMES.values() for name, _ in names}, path)
+    try:
+        return pd.read_csv(
+            io.StringIO("\n".join(lines)), sep=between, decimal=decimal_mark(between),
+            skipinitialspace=True,
+        )  # fmt: skip
+    except (ValueError, pd.errors.ParserError) as error:
+        raise DataError(f"{path}: cannot be read as a table ({first_line(error)})") from None
+
+
+def _is_text(column: pd.Series) -> bool:
+    return not pd.api.types.is_numeric_dtype(column)
+
+
+def stem(name: str) -> str:
+    """Name a file without its folder and what follows the dot."""
+    return name.replace("\\", "/").rstrip("/").rsplit("/", 1)[-1].partition(".")[0]
