@@ -1,0 +1,75 @@
+"""The page: its parts as tabs, all about the one movie that is chosen."""
+
+from __future__ import annotations
+
+import html
+from pathlib import Path
+from typing import Any, ClassVar
+
+import panel as pn
+
+from iscat_app.chosen import Chosen, Part
+from iscat_app.files import Files
+from iscat_app.film import Film
+from iscat_app.runs import Queue
+
+STYLE = """
+.notice { padding: 6px 10px; border-left: 4px solid #0072B2; }
+.notice.error { border-left-color: #D55E00; font-weight: 600; }
+table { border-collapse: collapse; }
+h2 { margin: 0; font-size: 1.2rem; overflow-wrap: anywhere; }
+td, th { padding: 3px 10px 3px 0; text-align: left; vertical-align: top; }
+td { overflow-wrap: anywhere; }
+"""
+"""Beside what Panel brings."""
+
+pn.extension(notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
+
+
+class _Template(pn.template.VanillaTemplate):
+    """Panel's plain page, without the font that it would fetch from another server."""
+
+    _resources: ClassVar[dict[str, Any]] = {}
+
+
+def page_of(folder: Path, queue: Queue) -> Any:
+    """Make the page of one browser tab; each has its own."""
+    chosen = Chosen()
+    given = _given("movie")
+    if given:
+        chosen.choose(Path(given))
+    start = folder if chosen.movie is None else chosen.movie.parent
+    parts: list[Part] = [Files(chosen, start), Film(chosen)]
+    tabs = pn.Tabs(
+        *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width"
+    )
+
+    def show(*_: Any) -> None:
+        heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"
+        parts[tabs.active].refresh()
+
+    def remember(*_: Any) -> None:
+        if pn.state.location is not None:
+            pn.state.location.update_query(
+                movie=None if chosen.movie is None else str(chosen.movie)
+            )
+
+    heading = pn.pane.HTML("", sizing_mode="stretch_width")
+    tabs.param.watch(show, "active")
+    chosen.param.watch(lambda *_: (show(), remember()), ["movie", "result", "changed"])
+    template = _Template(
+        title="iSCAT analysis", main=[heading, tabs], header_background="#1B1D21"
+    )
+    show()
+    return template
+
+
+def _given(name: str) -> str:
+    """Read a part of the address."""
+    values = pn.state.session_args.get(name) or [b""]
+    return values[0].decode("utf-8", "replace")
+
+
+def _name_of(chosen: Chosen) -> str:
+    named = chosen.movie or chosen.result
+    return "Choose a movie" if named is None else named.name
