@@ -21,8 +21,8 @@ from iscat_app.chosen import Chosen, Notice
 RATES = (5, 10, 25, 50, 100, 250, 1000)
 """Frames of the movie per second."""
 
-TICK_MS = 20
-"""Between two looks whether the browser has drawn the last frame."""
+SLIDER_S = 0.25
+"""After which the slider of frames follows the film, as it plays."""
 
 SHOWN = 12
 """Frames around its own in which an event of a landing movie is ringed."""
@@ -48,11 +48,11 @@ class Film:
         self._events = pd.DataFrame()
         self._um = 1.0
         self._limits = (0.0, 1.0)
-        self._waits = False  # for the browser to draw
+        self._sent = 0  # pictures
+        self._at = 0  # the frame that is shown
         self._next = 0.0  # where the film is, as it plays
-        self._ticked = 0.0
+        self._ticked = self._slid = 0.0
         self._by_player = False
-        self._timer: Any = None
         self._notice = Notice()
         self._make_figures()
         self._make_widgets()
@@ -60,7 +60,7 @@ class Film:
     # ---- what there is to see ---------------------------------------------------------------
 
     def _make_figures(self) -> None:
-        self._picture = ColumnDataSource({"image": [np.zeros((2, 2), np.uint8)], "frame": [-1],
+        self._picture = ColumnDataSource({"image": [np.zeros((2, 2), np.uint8)], "sent": [0],
                                           "dw": [1.0], "dh": [1.0]})  # fmt: skip
         self._rings = ColumnDataSource({"x": [], "y": [], "colour": [], "text": []})
         self._x, self._y = Range1d(0, 1), Range1d(1, 0)
@@ -89,13 +89,13 @@ class Film:
             "x", "y", text="text", source=self._bar, text_color=_HERE, y_offset=-6,
             text_font_size="12px",
         )  # fmt: skip
-        # The browser says which frame it has drawn, and only then the next one is sent.
-        self._drawn = Spinner(value=-1, visible=False, title="frame drawn")
+        # The browser says which picture it has drawn, and only then the next one is sent.
+        self._drawn = Spinner(value=0, visible=False, title="pictures drawn")
         self._picture.js_on_change(
             "data",
             CustomJS(
                 args={"drawn": self._drawn, "picture": self._picture},
-                code="requestAnimationFrame(() => { drawn.value = picture.data.frame[0] })",
+                code="requestAnimationFrame(() => { drawn.value = picture.data.sent[0] })",
             ),
         )
         self._drawn.on_change("value", self._browser_has_drawn)
@@ -213,7 +213,7 @@ class Film:
         self.window.param.update(end=max(self._film.longest, 2), value=self._film.window)
         self.frame.param.update(end=frames - 1)
         self._fit_limits()
-        self.frame.value = self._film.frames[0]
+        self._shown_by_player(self._film.frames[0])
         self._show()
         light = self._film.light()
         self._trace.data = {name: light[name].to_numpy() for name in light}
@@ -229,35 +229,47 @@ class Film:
             self.play.value = False
         elif event.new:
             self._next, self._ticked = float(self.frame.value), time.monotonic()
-            self._waits = False
-            self._timer = pn.state.add_periodic_callback(self._tick, period=TICK_MS)
-        elif self._timer is not None:
-            self._timer.stop()
-            self._timer = None
+            self._soon()
+        elif self._film is not None:
+            self._shown_by_player(self.frame.value)
 
-    def _tick(self) -> None:
-        """Show the frame that it is time for, once the browser has drawn the last one."""
-        now = time.monotonic()
-        passed = (now - self._ticked) * self.rate.value
-        if self._film is None or self._waits or math.floor(self._next + passed) == self.frame.value:
+    def _soon(self) -> None:
+        """Show the next frame when it is time for it."""
+        document = pn.state.curdoc
+        if document is not None:
+            left = 1.0 / self.rate.value - (time.monotonic() - self._ticked)
+            document.add_timeout_callback(self._step, max(1, round(1000 * left)))
+
+    def _step(self) -> None:
+        """Show the frame that it is time for; where the browser is slow, some are left out."""
+        if self._film is None or not self.play.value:
             return
+        now = time.monotonic()
+        self._next += max((now - self._ticked) * self.rate.value, 1.0)
         self._ticked = now
-        self._next += passed
         first, stop = self._film.frames if self.kind.value == _RATIO else (0, self.frame.end + 1)
-        if self._next >= stop or self._next < first:
+        if not first <= self._next < stop:
             self._next = float(first)
-        self._by_player = True
-        self.frame.value = math.floor(self._next)
-        self._by_player = False
+        self._at = math.floor(self._next)
+        if now - self._slid > SLIDER_S:
+            self._slid = now
+            self._shown_by_player(self._at)
         self._show()
+
+    def _shown_by_player(self, frame: int) -> None:
+        self._by_player = True
+        self.frame.value = self._at = frame
+        self._by_player = False
 
     def _browser_has_drawn(self, attr: str, old: Any, new: Any) -> None:
         del attr, old, new
-        self._waits = False
+        if self.play.value:
+            self._soon()
 
     def _frame_moved(self, _: Any) -> None:
         if not self._by_player:
-            self._next = float(self.frame.value)
+            self._at = self.frame.value
+            self._next = float(self._at)
             self._show()
             if self.search.value:
                 self._look()
@@ -303,15 +315,15 @@ class Film:
         if film is None:
             return
         with self._notice.told():
-            at = self.frame.value
+            at = self._at
             image = film.contrast(at) if self.kind.value == _RATIO else film.raw(at)
             low, high = self._limits
             scaled = np.clip((image - low) * (255.0 / (high - low)), 0, 255)
             rows, columns = image.shape
-            self._waits = True
+            self._sent += 1
             self._picture.data = {
                 "image": [np.nan_to_num(scaled).astype(np.uint8)],
-                "frame": [at],
+                "sent": [self._sent],
                 "dw": [columns * self._um],
                 "dh": [rows * self._um],
             }
@@ -322,7 +334,7 @@ class Film:
     def _ring(self) -> None:
         """Ring what landed or left about this frame."""
         rings: list[tuple[float, float, str, str]] = []
-        at = self.frame.value
+        at = self._at
         if self.events.value and len(self._events):
             near = self._events[
                 (self._events["frame"] - at).abs().le(SHOWN) & self._events["x_px"].notna()
@@ -377,12 +389,12 @@ class Film:
 
     async def _look_now(self) -> None:
         """Search the windows around the frame that is shown."""
-        preview, at = self._preview, self.frame.value
+        preview, at = self._preview, self._at
         if preview is None or self.play.value:
             return
         window = min(self.window.value, preview.longest)
         look = await asyncio.to_thread(self._looked, preview, at, window)
-        if look is not None and at == self.frame.value:
+        if look is not None and at == self._at:
             self._found, self._found_at = look.found(), at
             self.facts.object = (
                 f"<p>{len(self._found)} above {look.threshold:.2f} times the noise, with windows "
