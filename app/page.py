@@ -8,9 +8,16 @@ from typing import Any, ClassVar
 
 import panel as pn
 
+from iscat_app.bounds import Bounds
+from iscat_app.calibrate import Calibrate
 from iscat_app.chosen import Chosen, Part
+from iscat_app.compare import Compare
+from iscat_app.export import Export
 from iscat_app.files import Files
 from iscat_app.film import Film
+from iscat_app.form import Form
+from iscat_app.results import Results
+from iscat_app.run_tab import RunTab
 from iscat_app.runs import Queue
 
 STYLE = """
@@ -39,7 +46,11 @@ def page_of(folder: Path, queue: Queue) -> Any:
     if given:
         chosen.choose(Path(given))
     start = folder if chosen.movie is None else chosen.movie.parent
-    parts: list[Part] = [Files(chosen, start), Film(chosen)]
+    results, runs = Results(chosen), RunTab(chosen, queue)
+    parts: list[Part] = [
+        Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen),
+        Calibrate(chosen), Bounds(chosen), Export(chosen, results),
+    ]  # fmt: skip
     tabs = pn.Tabs(
         *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width"
     )
@@ -61,6 +72,7 @@ def page_of(folder: Path, queue: Queue) -> Any:
         title="iSCAT analysis", main=[heading, tabs], header_background="#1B1D21"
     )
     show()
+    runs.watch()
     return template
 
 
