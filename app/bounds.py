@@ -15,6 +15,8 @@ import iscat_analysis as ia
 from iscat_app.chosen import Chosen, Notice, table_of
 
 _PIXELS = 61
+_PIXEL_NM = 84.4  # where nobody said
+_KINDS = {"crb_single": "CRB, alone", "crb_joint": "CRB, together", "qcrb": "QCRB"}
 _KEYS = {"x_nm": "x [nm]", "y_nm": "y [nm]", "z_nm": "z [nm]", "mass_kda": "mass [kDa]"}
 
 
@@ -27,6 +29,7 @@ class Bounds:
         self._chosen = chosen
         self._notice = Notice()
         self._config: ia.Config | None = None
+        self._computes = self._again = self._seen = False
         slider = pn.widgets.FloatSlider
         self._sliders = {
             "optics.na": slider(name="NA", start=0.8, end=1.48, step=0.01, value=1.42),
@@ -52,7 +55,7 @@ class Bounds:
         self._table = pn.pane.HTML("")
         self._note = pn.pane.HTML("")
         for widget in (*self._sliders.values(), self._mode):
-            widget.param.watch(lambda _: self._compute(), "value")
+            widget.param.watch(self._follow, "value")
         self.body = pn.Column(
             self._notice.pane,
             pn.Row(
@@ -68,33 +71,62 @@ class Bounds:
             self._config = ia.configure(
                 self._chosen.config, settings={"bounds.pixels": _PIXELS, "background.frames": None}
             )
-        self._compute()
+        self._follow()
 
-    def _compute(self) -> None:
-        began = time.perf_counter()
-        self._notice.say("")
-        with self._notice.told():
-            settings: dict[str, Any] = {key: s.value for key, s in self._sliders.items()}
-            settings["fit.mode"] = self._mode.value
-            settings["bounds.n_after"] = int(settings["bounds.n_after"])
-            settings["bounds.n_before"] = settings["bounds.n_after"]
-            if self._config is None or self._config.camera.pixel_size_nm is None:
-                settings["camera.pixel_size_nm"] = 84.4
-            found = ia.compute_bounds(self._config, settings=settings)
-            config = found.config
-            image = ia.psf(config.optics, config.particle, config.camera, pixels=_PIXELS,
-                           calibration=config.calibration)  # fmt: skip
-            most = float(np.abs(image).max()) or 1.0
-            self._mapper.update(low=-most, high=most)
-            self._image.data = {"image": [image]}
-            rows = [
-                (_KEYS[name], *(f"{row[kind]:.4g}" for kind in ("crb_single", "crb_joint", "qcrb")))
-                for name, row in found.actual.iterrows()
-            ]
-            self._table.object = table_of(rows, ("", "CRB, alone", "CRB, together", "QCRB"))
-            took = 1000 * (time.perf_counter() - began)
-            self._note.object = (
-                f"<p>Peak contrast {100 * image.flat[np.abs(image).argmax()]:.3f} %; standard "
-                f"deviations after all frames; pixels of {config.camera.pixel_size_nm:g} nm. "
-                f"<small>Computed in {took:.0f} ms.</small></p>"
-            )
+    def _follow(self, *_: Any) -> None:
+        """Compute, and once more where something has changed meanwhile: sliders move fast."""
+        if self._computes:
+            self._again = True
+            return
+        self._computes, config, settings = True, self._config, self._settings()
+
+        def job() -> tuple[ia.Bounds, np.ndarray[Any, Any], float]:
+            try:
+                return _computed(config, settings)
+            finally:
+                self._computes = False
+
+        self._notice.work("" if self._seen else "Computing, the first time", job, self._show)
+
+    def _settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = {key: s.value for key, s in self._sliders.items()}
+        settings["fit.mode"] = self._mode.value
+        frames = int(settings["bounds.n_after"])
+        settings |= {"bounds.n_after": frames, "bounds.n_before": frames}
+        if self._config is None or self._config.camera.pixel_size_nm is None:
+            settings["camera.pixel_size_nm"] = _PIXEL_NM
+        return settings
+
+    def _show(self, computed: tuple[ia.Bounds, np.ndarray[Any, Any], float]) -> None:
+        found, image, took_s = computed
+        self._seen = True
+        most = float(np.abs(image).max()) or 1.0
+        self._mapper.update(low=-most, high=most)
+        self._image.data = {"image": [image]}
+        rows = [
+            (_KEYS[str(name)], *(f"{row[kind]:.4g}" for kind in _KINDS))
+            for name, row in found.actual.iterrows()
+        ]
+        self._table.object = table_of(rows, ("", *_KINDS.values()))
+        peak = 100 * image.flat[np.abs(image).argmax()]
+        self._note.object = (
+            f"<p>Peak contrast {peak:.3f} %. Standard deviations after all frames, with as many "
+            f"before; pixels of {found.config.camera.pixel_size_nm:g} nm.</p>"
+            f"<p><small>Computed in {1000 * took_s:.0f} ms.</small></p>"
+        )
+        if self._again:
+            self._again = False
+            self._follow()
+
+
+def _computed(
+    config: ia.Config | None, settings: dict[str, Any]
+) -> tuple[ia.Bounds, np.ndarray[Any, Any], float]:
+    """Compute bounds and picture, and say how long that took."""
+    began = time.perf_counter()
+    found = ia.compute_bounds(config, settings=settings)
+    image = ia.psf(
+        found.config.optics, found.config.particle, found.config.camera, pixels=_PIXELS,
+        calibration=found.config.calibration,
+    )  # fmt: skip
+    return found, image, time.perf_counter() - began

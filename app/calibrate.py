@@ -12,6 +12,7 @@ from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import mass_calibration
+from iscat_analysis.calibration.mass import MassCalibration
 from iscat_analysis.movie.addresses import beside
 from iscat_app.chosen import Chosen, Notice, table_of
 from iscat_app.form import add_table
@@ -50,7 +51,7 @@ class Calibrate:
         self._use.on_click(self._put)
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(self._standards, fit, self._use, align="end"),
+            pn.Row(self._standards, fit, self._use, styles={"align-items": "end"}),
             pn.Row(pn.pane.Bokeh(peaks), pn.pane.Bokeh(plot)),
             self._table, self._text,
         )  # fmt: skip
@@ -67,7 +68,7 @@ class Calibrate:
             counts, edges = np.histogram(size, bins=60)
             self._bars.data = {"left": edges[:-1], "right": edges[1:], "top": counts}
 
-    async def _fit(self, _: Any) -> None:
+    def _fit(self, _: Any) -> None:
         result = self._chosen.result
         if result is None:
             return
@@ -78,12 +79,13 @@ class Calibrate:
             return
         out = beside(result, ".calibration")
         notes: list[str] = []
-        found = await self._notice.wait_for(
+        self._notice.work(
             "Fitting",
             lambda: mass_calibration(result, masses, out, overwrite=True, notify=notes.append),
+            lambda found: self._show(found, notes, out),
         )
-        if found is None:
-            return
+
+    def _show(self, found: MassCalibration, notes: list[str], out: Path) -> None:
         rows = found.standards.to_dict("records")
         self._points.data = {
             "mass": [r["mass_kda"] for r in rows],
@@ -93,7 +95,7 @@ class Calibrate:
         }
         self._toml = found.to_toml()
         slope, offset = found.gradient_per_kda, found.offset
-        ends = [0.0, 1.1 * max(masses)]
+        ends = [0.0, 1.1 * max(r["mass_kda"] for r in rows)]
         self._line.data = {"mass": ends, "contrast": [100 * abs(slope * m + offset) for m in ends]}
         self._table.object = table_of(
             [

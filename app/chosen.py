@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import html
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import panel as pn
 import param
@@ -16,6 +16,8 @@ from iscat_analysis.errors import IscatError
 from iscat_analysis.movie.addresses import beside, setup_beside
 
 T = TypeVar("T")
+
+_THREADS = ThreadPoolExecutor(4, thread_name_prefix="page")
 
 
 class Chosen(param.Parameterized):
@@ -64,11 +66,11 @@ class Notice:
 
     def __init__(self) -> None:
         self.pane = pn.pane.HTML("", sizing_mode="stretch_width", visible=False)
-        self.text = ""
+        self.text, self.busy = "", False
 
     def say(self, text: str, kind: str = "info") -> None:
         """Show a text, as text whatever is in it; an empty one hides the line."""
-        self.text = text
+        self.text, self.busy = text, kind == "busy"
         role = "alert" if kind == "error" else "status"
         self.pane.object = f'<div class="notice {kind}" role="{role}">{html.escape(text)}</div>'
         self.pane.visible = bool(text)
@@ -83,18 +85,29 @@ class Notice:
         except (OSError, MemoryError) as error:
             self.say(f"{type(error).__name__}: {error}", "error")
 
-    async def wait_for(self, what: str, work: Callable[..., T], *given: Any) -> T | None:
-        """Do something that takes long in a thread, as the page goes on; None where it fails."""
-        self.say(f"{what} …", "busy")
-        try:
-            with self.told():
-                found = await asyncio.to_thread(work, *given)
-                self.say("")
-                return found
-        except Exception as error:
-            self.say(f"{type(error).__name__}: {error}", "error")
-            raise
-        return None
+    def work(self, what: str, job: Callable[[], T], then: Callable[[T], None]) -> None:
+        """Do something that takes long in a thread, as the page goes on, and then show it."""
+        document = pn.state.curdoc
+        if what:
+            self.say(f"{what} …", "busy")
+
+        def finished(future: Future[T]) -> None:
+            if document.session_context is not None and not document.session_context.destroyed:
+                document.add_next_tick_callback(lambda: self._show(future, then))
+
+        _THREADS.submit(job).add_done_callback(finished)
+
+    def _show(self, future: Future[T], then: Callable[[T], None]) -> None:
+        """Show what a thread has made, as one change of the page."""
+        with self.told():
+            try:
+                found = future.result()
+                if self.busy:
+                    self.say("")
+                then(found)
+            except Exception as error:
+                self.say(f"{type(error).__name__}: {error}", "error")
+                raise
 
 
 def table_of(rows: list[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:

@@ -90,18 +90,21 @@ class Compare:
                 )  # fmt: skip
             self._plot.object = plot
 
-    async def _test(self, _: Any) -> None:
+    def _test(self, _: Any) -> None:
         with self._notice.told():
             named = self._tables()
             if len(named) < 2:
                 self._notice.say("Choose two or more results.", "error")
                 return
-            tables = [table for _, table in named]
-            found = await self._notice.wait_for(
-                "Comparing", lambda: ia.compare_tables(tables)
+            names, tables = zip(*named, strict=True)
+            self._notice.work(
+                "Comparing",
+                lambda: ia.compare_tables(tables),
+                lambda found: self._tell(list(names[1:]), found),
             )
-            if found is not None:
-                self._table.object = table_of(_rows([n for n, _ in named[1:]], found), _HEAD)
+
+    def _tell(self, names: list[str], found: list[ia.Comparison]) -> None:
+        self._table.object = table_of(_rows(names, found), _HEAD)
 
 
 def _rows(names: list[str], found: list[ia.Comparison]) -> list[tuple[str, ...]]:

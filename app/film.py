@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import time
 from typing import Any
@@ -362,54 +361,53 @@ class Film:
     _found_at = -1
     _found = pd.DataFrame()
 
-    async def _search_changed(self, event: Any) -> None:
+    def _search_changed(self, event: Any) -> None:
         if not event.new:
             self._ring()
-            return
-        if self._film is None:
+        elif self._film is None:
             self.search.value = False
-            return
-        if self._preview is None:
-            made = await self._notice.wait_for("Measuring camera and noise", self._make_preview)
-            if made is None:
-                self.search.value = False
-                return
-            self._preview = made
-            offset = made.camera.numbers["offset_adu"].value
-            if isinstance(offset, (int, float)):
-                self._film.offset_adu = float(offset)
-            self.window.value = self._film.window = min(max(made.window, 1), self._film.longest)
-            self._fit_limits()
-            self._show()
+        elif self._preview is not None:
+            self._look()
+        else:
+            movie, config = self._film.movie, self._chosen.config
+            self._notice.work(
+                "Measuring camera and noise",
+                lambda: ia.Preview(movie, ia.configure(config)),
+                self._take_preview,
+            )
+
+    def _take_preview(self, made: ia.Preview) -> None:
+        """Look as the search does: with its window, and over the offset that it found."""
+        if self._film is None or made.steady.path != self._film.movie.path:
+            return  # another movie was chosen meanwhile
+        self._preview = made
+        offset = made.camera.numbers["offset_adu"].value
+        if isinstance(offset, (int, float)):
+            self._film.offset_adu = float(offset)
+        self._film.window = min(max(made.window, 1), self._film.longest)
+        self.window.value = self._film.window
+        self._fit_limits()
+        self._show()
         self._look()
 
-    def _make_preview(self) -> ia.Preview | None:
-        if self._film is None:
-            return None
-        return ia.Preview(self._film.movie, ia.configure(self._chosen.config))
-
     def _look(self) -> None:
-        pn.state.execute(self._look_now)
-
-    async def _look_now(self) -> None:
         """Search the windows around the frame that is shown."""
         preview, at = self._preview, self._at
-        if preview is None or self.play.value:
-            return
-        window = min(self.window.value, preview.longest)
-        look = await asyncio.to_thread(self._looked, preview, at, window)
-        if look is not None and at == self._at:
-            self._found, self._found_at = look.found(), at
-            self.facts.object = (
-                f"<p>{len(self._found)} above {look.threshold:.2f} times the noise, with windows "
-                f"of {window} frames</p>"
+        if preview is not None and not self.play.value:
+            window = min(self.window.value, preview.longest)
+            self._notice.work(
+                "", lambda: preview.look(at, window), lambda look: self._mark(look, at, window)
             )
-            self._ring()
 
-    def _looked(self, preview: ia.Preview, at: int, window: int) -> ia.Look | None:
-        with self._notice.told():
-            return preview.look(at, window)
-        return None
+    def _mark(self, look: ia.Look, at: int, window: int) -> None:
+        if at != self._at:
+            return
+        self._found, self._found_at = look.found(), at
+        self.facts.object = (
+            f"<p>{len(self._found)} above {look.threshold:.2f} times the noise, with windows of "
+            f"{window} frames</p>"
+        )
+        self._ring()
 
     # ---- frames to analyse ------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ import panel as pn
 import iscat_analysis as ia
 from iscat_analysis.config import config_to_toml, parse_config, toml_value
 from iscat_analysis.files import whole_file
-from iscat_analysis.pipeline.setup import write_setup
+from iscat_analysis.pipeline.setup import Setup, write_setup
 from iscat_app.chosen import Chosen, Notice
 
 FIRST = (
@@ -209,7 +209,7 @@ class Form:
             self._notice.say(f"saved as {path}: mode {config.fit.mode}")
             self._show_file()
 
-    async def _propose(self, _: Any) -> None:
+    def _propose(self, _: Any) -> None:
         """Fill the form as `iscat init` would, with what the file and its noise say."""
         movie, path = self._chosen.movie, self._chosen.setup
         if movie is None or path is None:
@@ -219,15 +219,17 @@ class Form:
         answers = {
             key: _number(texts[key]) for key in FIRST if key in texts and key != "fit.mode"
         }  # fmt: skip
-        found = await self._notice.wait_for(
+        self._notice.work(
             "Looking at the movie",
             lambda: write_setup(movie, answers=answers, out=path, overwrite=True),
+            self._proposed,
         )
-        if found is not None:
-            self._chosen.changed += 1
-            self._shown = None
-            self.refresh()
-            self._notice.say(f"saved as {path}; every value has its origin beside it")
+
+    def _proposed(self, found: Setup) -> None:
+        self._chosen.changed += 1
+        self._shown = None
+        self.refresh()
+        self._notice.say(f"saved as {found.out}; every value has its origin beside it")
 
     def _show_file(self) -> None:
         config = self._chosen.config

@@ -30,6 +30,10 @@ td { overflow-wrap: anywhere; }
 """
 """Beside what Panel brings."""
 
+_THEMES = """<nav aria-label="colours">
+<a href="?theme=dark" style="color: white">dark</a> ·
+<a href="?theme=default" style="color: white">light</a></nav>"""
+
 pn.extension(notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
 
 
@@ -46,6 +50,7 @@ def page_of(folder: Path, queue: Queue) -> Any:
     if given:
         chosen.choose(Path(given))
     start = folder if chosen.movie is None else chosen.movie.parent
+    dark = _given("theme") == "dark"
     results, runs = Results(chosen), RunTab(chosen, queue)
     parts: list[Part] = [
         Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen),
@@ -69,8 +74,9 @@ def page_of(folder: Path, queue: Queue) -> Any:
     tabs.param.watch(show, "active")
     chosen.param.watch(lambda *_: (show(), remember()), ["movie", "result", "changed"])
     template = _Template(
-        title="iSCAT analysis", main=[heading, tabs], header_background="#1B1D21"
-    )
+        title="iSCAT analysis", main=[heading, tabs], header=[pn.pane.HTML(_THEMES)],
+        header_background="#1B1D21", theme="dark" if dark else "default", busy_indicator=None,
+    )  # fmt: skip
     show()
     runs.watch()
     return template

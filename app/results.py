@@ -25,6 +25,9 @@ from iscat_analysis.records import Status
 from iscat_app.chosen import Chosen, Notice, table_of
 from iscat_app.rejections import Rejections
 
+DRAWS = 50
+"""Simulated repetitions behind the intervals of the species."""
+
 _BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
 _BRANCHES = {"landing and leaving": "magnitude", "landing": "landing", "leaving": "leaving"}
 _GATE_HEAD = ("gate [kDa]", "events", "95 %", "mean [kDa]", "± SE", "width [kDa]", "fraction", "95 %")
@@ -125,7 +128,7 @@ class Results:
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML("<small>Drag over the histogram for a gate; click a bar, or events below, to select.</small>"),
-                    pn.Row(self.low, self.high, add, drop, align="end"),
+                    pn.Row(self.low, self.high, add, drop, styles={"align-items": "end"}),
                     self._gate_table, self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
                 ),
@@ -161,8 +164,7 @@ class Results:
                 )
             if self.result.summary.get("interrupted"):
                 self._notice.say("The analysis was interrupted: these are the events so far.")
-            masses = np.abs(self.table["mass_kda"].to_numpy(float))
-            width = usual_bin(masses[np.isfinite(masses)])
+            width = usual_bin(self.table)
             self.bin.value, self.kernel.value = width, width
             self._draw()
 
@@ -179,7 +181,8 @@ class Results:
                 self.table, branch=_BRANCHES[self.branch.value], ok_only=not self.flagged.value,
                 rejected=self.rejected,
             )  # fmt: skip
-            self._seen = self.table[counts]
+            if not self.table[counts].equals(self._seen):
+                self._seen, self.species = self.table[counts], None
             seen = self.histogram = mass_histogram(
                 self.masses(), bin_kda=self.bin.value, bandwidth_kda=self.kernel.value
             )
@@ -229,14 +232,18 @@ class Results:
 
     # ---- species ----------------------------------------------------------------------------
 
-    async def _find_species(self, _: Any) -> None:
-        if not len(self._seen):
-            return
+    def _find_species(self, _: Any) -> None:
         seen, branch = self._seen, _BRANCHES[self.branch.value]
-        self.species = await self._notice.wait_for(
-            "Finding species", lambda: ia.find_species(seen, branch=branch, draws=50)
-        )
-        self._draw_species()
+        if len(seen):
+            self._notice.work(
+                "Finding species", lambda: ia.find_species(seen, branch=branch, draws=DRAWS),
+                lambda found: self._take_species(found, seen),
+            )  # fmt: skip
+
+    def _take_species(self, found: ia.Distribution, seen: pd.DataFrame) -> None:
+        if seen is self._seen:  # and not of events that count no more
+            self.species = found
+            self._draw_species()
 
     def species_curve(self) -> tuple[Any, Any] | None:
         """Give the curve of the species, per bar of the histogram."""
@@ -283,7 +290,7 @@ class Results:
         }
         self.which.param.update(options=options, value=next(iter(options.values()), None))
 
-    async def _show_event(self, event: Any) -> None:
+    def _show_event(self, event: Any) -> None:
         """Show the numbers of an event, and then its pictures, which are made of the movie."""
         result, number = self.result, event.new
         if result is None or number is None:
@@ -291,7 +298,11 @@ class Results:
             return
         row = int(np.flatnonzero(self.table["event"] == number)[0])
         self._facts.object = facts_of(self.table.iloc[row])
-        picture = await self._notice.wait_for("Drawing the event", lambda: _png(result, row))
+        self._notice.work(
+            "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, number)
+        )
+
+    def _take(self, picture: bytes, number: int) -> None:
         if self.which.value == number:
             self._picture.object = picture
 
@@ -313,7 +324,6 @@ class Results:
     def _rejected_anew(self) -> None:
         if self.rejections is not None:
             self.rejected = self.rejections.events(self.table)
-            self.species = None  # of other events
             self._draw()
             self._notice.say(f"{len(self.rejected)} rejected by hand: {self.rejections.path.name}")
 

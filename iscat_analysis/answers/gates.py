@@ -27,7 +27,7 @@ MOST_BARS = 2000
 _ENDS = (0.025, 0.975)
 _REACH = 0.99  # quantile of the masses up to which is drawn
 _POINTS = 400
-_BARS = 60  # of which a bar should not be much narrower than one
+_MOST_USUAL = 240  # bars of a histogram whose width nobody chose
 
 
 @dataclass(frozen=True)
@@ -82,26 +82,32 @@ def counted_rows(
     return np.asarray(counts)
 
 
-def usual_bin(masses_kda: FloatArray) -> float:
-    """Choose the width of a bar [kDa]: 1, 2 or 5 times a power of ten (Freedman and Diaconis)."""
-    if masses_kda.size < 2:
+def usual_bin(table: pd.DataFrame) -> float:
+    """Choose the width of a bar [kDa] by the errors of the events: 1, 2 or 5 times a power of ten.
+
+    As Scott's rule has it for three peaks no wider than these errors.
+    """
+    sigma = table["sigma_mass_kda"].to_numpy(float)
+    mass = np.abs(table["mass_kda"].to_numpy(float))
+    mass, sigma = mass[np.isfinite(mass)], sigma[np.isfinite(sigma)]
+    if not mass.size:
         return 10.0
-    first, third = np.quantile(masses_kda, (0.25, 0.75))
-    wanted = 2 * float(third - first) * masses_kda.size ** (-1 / 3)
-    wanted = max(wanted / 2, float(np.quantile(masses_kda, _REACH)) / _BARS, 1e-3)
+    spread = float(np.median(sigma)) if sigma.size else float(np.median(mass)) / 10
+    wanted = 3.49 * spread * max(mass.size / 3, 1.0) ** (-1 / 3)
+    wanted = max(wanted, float(np.quantile(mass, _REACH)) / _MOST_USUAL, 1e-3)
     power = 10.0 ** math.floor(math.log10(wanted))
     return min((power, 2 * power, 5 * power, 10 * power), key=lambda w: abs(w / wanted - 1))
 
 
 def mass_histogram(
-    masses_kda: FloatArray, *, bin_kda: float | None = None, bandwidth_kda: float | None = None
+    masses_kda: FloatArray, *, bin_kda: float, bandwidth_kda: float | None = None
 ) -> MassHistogram:
-    """Count magnitudes of masses in bars, and smooth them with a normal kernel.
+    """Count magnitudes of masses in bars, and smooth them with a normal kernel as wide.
 
     Shapes: `masses_kda` (n,).
     """
     mass = np.abs(np.asarray(masses_kda, dtype=np.float64))
-    width = usual_bin(mass) if bin_kda is None else number_in("`bin_kda`", bin_kda, above=0.0)
+    width = number_in("`bin_kda`", bin_kda, above=0.0)
     kernel = width if bandwidth_kda is None else number_in(
         "`bandwidth_kda`", bandwidth_kda, above=0.0
     )  # fmt: skip
