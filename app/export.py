@@ -115,13 +115,17 @@ class Export:
         result = self._results.result
         if result is None:
             return ""
-        lines = [str(result.summary.get("command") or "")]
-        lines.append(shlex.join(["iscat", "species", str(result.folder)]))
+        folder, movie = result.folder, self._chosen.movie
+        lines = []
+        if movie is not None:
+            again = [str(folder / "config.toml"), "--out", f"{folder.stem}-again.iscat"]
+            lines.append(shlex.join(["iscat-fit", str(movie), "--config", *again]))
+        lines.append(shlex.join(["iscat", "species", str(folder)]))
         rejected = self._results.rejected
         if rejected and self._results.rejections is not None:
             lines.append(f"# {len(rejected)} events were rejected by hand: "
                          f"{self._results.rejections.path}")  # fmt: skip
-        return "\n".join(filter(None, lines))
+        return "\n".join(lines)
 
     def _notebook(self) -> io.BytesIO:
         result = self._results.result

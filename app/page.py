@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 from typing import Any, ClassVar
+from urllib.parse import urlencode
 
 import panel as pn
 
@@ -26,13 +27,11 @@ STYLE = """
 table { border-collapse: collapse; }
 h2 { margin: 0; font-size: 1.2rem; overflow-wrap: anywhere; }
 td, th { padding: 3px 10px 3px 0; text-align: left; vertical-align: top; }
-td { overflow-wrap: anywhere; }
+td:last-child { overflow-wrap: anywhere; }
 """
 """Beside what Panel brings."""
 
-_THEMES = """<nav aria-label="colours">
-<a href="?theme=dark" style="color: white">dark</a> ·
-<a href="?theme=default" style="color: white">light</a></nav>"""
+_TABS = ".bk-tab.bk-active { color: inherit; font-weight: 700; }"  # readable on a dark ground
 
 pn.extension(notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
 
@@ -57,11 +56,13 @@ def page_of(folder: Path, queue: Queue) -> Any:
         Calibrate(chosen), Bounds(chosen), Export(chosen, results),
     ]  # fmt: skip
     tabs = pn.Tabs(
-        *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width"
-    )
+        *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width",
+        stylesheets=[_TABS],
+    )  # fmt: skip
 
     def show(*_: Any) -> None:
         heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"
+        colours.object = _colours(chosen)
         parts[tabs.active].refresh()
 
     def remember(*_: Any) -> None:
@@ -70,11 +71,12 @@ def page_of(folder: Path, queue: Queue) -> Any:
                 movie=None if chosen.movie is None else str(chosen.movie)
             )
 
+    colours = pn.pane.HTML("")
     heading = pn.pane.HTML("", sizing_mode="stretch_width")
     tabs.param.watch(show, "active")
     chosen.param.watch(lambda *_: (show(), remember()), ["movie", "result", "changed"])
     template = _Template(
-        title="iSCAT analysis", main=[heading, tabs], header=[pn.pane.HTML(_THEMES)],
+        title="iSCAT analysis", main=[heading, tabs], header=[colours],
         header_background="#1B1D21", theme="dark" if dark else "default", busy_indicator=None,
     )  # fmt: skip
     show()
@@ -86,6 +88,16 @@ def _given(name: str) -> str:
     """Read a part of the address."""
     values = pn.state.session_args.get(name) or [b""]
     return values[0].decode("utf-8", "replace")
+
+
+def _colours(chosen: Chosen) -> str:
+    """Link to the same page in other colours."""
+    same = {} if chosen.movie is None else {"movie": str(chosen.movie)}
+    links = (
+        f'<a style="color: white" href="?{html.escape(urlencode(same | {"theme": theme}))}">{name}</a>'
+        for name, theme in (("dark", "dark"), ("light", "default"))
+    )
+    return f'<nav aria-label="colours">{" · ".join(links)}</nav>'
 
 
 def _name_of(chosen: Chosen) -> str:
