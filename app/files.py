@@ -97,7 +97,8 @@ class Files:
         self._notice = Notice()
         self._where = pn.widgets.TextInput(name="Folder", sizing_mode="stretch_width")
         self._filter = pn.widgets.TextInput(name="Show names with", width=180)
-        self._list = pn.widgets.Select(
+        # Of many, since a list of one sends its first line where nothing is chosen.
+        self._list = pn.widgets.MultiSelect(
             name="Movies (● analysed, ○ not yet), ◆ results, ▸ folders",
             size=_SHOWN, sizing_mode="stretch_width",
         )  # fmt: skip
@@ -132,7 +133,7 @@ class Files:
             ]  # fmt: skip
             self._entries = {e.label: e for e in entries}
             here = [e.label for e in entries if e.path in (self._chosen.movie, self._chosen.result)]
-            self._list.param.update(options=[*self._entries], value=here[0] if here else None)
+            self._list.param.update(options=[*self._entries], value=here[:1])
             self._show()
 
     def _go(self, event: Any) -> None:
@@ -146,7 +147,7 @@ class Files:
         self.refresh()
 
     def _pick(self, event: Any) -> None:
-        entry = self._entries.get(event.new or "")
+        entry = self._entries.get(event.new[-1]) if event.new else None
         if entry is None or entry.path in (self._chosen.movie, self._chosen.result):
             return
         self._notice.say("")
