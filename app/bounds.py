@@ -33,7 +33,9 @@ class Bounds:
         slider = pn.widgets.FloatSlider
         self._sliders = {
             "optics.na": slider(name="NA", start=0.8, end=1.48, step=0.01, value=1.42),
-            "optics.focus_nm": slider(name="Focus [nm]", start=-1000, end=1000, step=10, value=-300),
+            "optics.focus_nm": slider(
+                name="Focus [nm]", start=-1000, end=1000, step=10, value=-300
+            ),
             "optics.attenuation": slider(name="Attenuation", start=0.02, end=1, step=0.02, value=1),
             "bounds.photons_per_pixel": slider(
                 name="Photoelectrons per pixel and frame", start=1000, end=200_000, step=1000,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,7 +110,7 @@ class Notice:
                 raise
 
 
-def table_of(rows: list[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
+def table_of(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
     """Write a table as HTML; its cells are text."""
 
     def line(cells: tuple[str, ...], tag: str) -> str:

@@ -29,7 +29,7 @@ class Compare:
         self._chosen = chosen
         self._notice = Notice()
         self.samples: list[tuple[str, MassHistogram]] = []
-        self._paths = pn.widgets.MultiSelect(name="Results (Ctrl for several; the first is the reference)",
+        self._paths = pn.widgets.MultiSelect(name="Results (Ctrl for several)",
                                              options=[], size=10, width=430)  # fmt: skip
         self._bin = pn.widgets.FloatInput(name="Bar width [kDa]", value=10.0, start=0.01, width=130)
         self._stacked = pn.widgets.Checkbox(name="one above the other")
@@ -80,7 +80,9 @@ class Compare:
                           tools="xwheel_zoom,pan,reset,save")  # fmt: skip
             plot.add_layout(Legend(click_policy="hide"), "right")
             colours = PALETTES["colour-blind safe"]
-            most = max((s.counts.max() / max(s.counts.sum(), 1) for _, s in self.samples), default=1)
+            most = max(
+                (s.counts.max() / max(s.counts.sum(), 1) for _, s in self.samples), default=1
+            )
             for place, (name, seen) in enumerate(self.samples):
                 share = seen.counts / max(seen.counts.sum(), 1.0)
                 lift = 1.1 * most * place if self._stacked.value else 0.0

@@ -25,8 +25,12 @@ class Export:
     def __init__(self, chosen: Chosen, results: Results) -> None:
         self._chosen, self._results = chosen, results
         self._notice = Notice()
-        self._width = pn.widgets.FloatInput(name="Width [cm]", value=12.0, start=3, end=60, width=100)
-        self._height = pn.widgets.FloatInput(name="Height [cm]", value=8.0, start=3, end=60, width=100)
+        self._width = pn.widgets.FloatInput(
+            name="Width [cm]", value=12.0, start=3, end=60, width=100
+        )
+        self._height = pn.widgets.FloatInput(
+            name="Height [cm]", value=8.0, start=3, end=60, width=100
+        )
         self._font = pn.widgets.FloatInput(name="Font [pt]", value=9.0, start=4, end=40, width=100)
         self._palette = pn.widgets.Select(name="Colours", options=[*PALETTES], width=180)
         self._density = pn.widgets.Checkbox(name="with the kernel density", value=True)
@@ -136,10 +140,11 @@ class Export:
             "import iscat_analysis as ia",
             f"found = ia.fit_movie({str(movie)!r}, config={str(result.folder / 'config.toml')!r})",
             f"rejected = {sorted(self._results.rejected)!r}  # by hand",
-            "kept = found.table[(found.table['status'] == 'ok') & ~found.table['event'].isin(rejected)]",
+            "kept = found.table[found.table['status'] == 'ok']",
+            "kept = kept[~kept['event'].isin(rejected)]",
             "ia.find_species(kept).species",
         ]
-        cells = [
+        cells: list[dict[str, Any]] = [
             {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": [],
              "id": f"cell-{number}", "source": line}
             for number, line in enumerate(code)

@@ -17,7 +17,7 @@ from iscat_app.chosen import Chosen, Notice, table_of
 Kind = Literal["folder", "movie", "result"]
 
 MOVIES = (".tif", ".tiff", ".btf", ".mp", ".h5", ".hdf5", ".npy", ".zarr")
-"""Endings of files and folders that may be movies; what is inside is looked at when one is opened."""
+"""Endings of files and folders that may be movies; what is inside is seen when one is opened."""
 
 LARGEST_UPLOAD_MB = 200
 """Of a file that is dropped on the page; larger ones are opened where they lie."""

@@ -185,9 +185,7 @@ class Film:
             offset: float | str | None = config.camera.offset_adu
             if isinstance(offset, str):  # measured, or a map
                 offset = stack.metadata.offset_adu
-            self._film = RatioFilm(
-                stack, offset_adu=offset or 0.0
-            )
+            self._film = RatioFilm(stack, offset_adu=offset or 0.0)
             self._film.window = min(FIRST_WINDOW, self._film.longest)
         except ia.IscatError:
             stack.close()

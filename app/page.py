@@ -74,7 +74,8 @@ def page_of(folder: Path, queue: Queue) -> Any:
     colours = pn.pane.HTML("")
     heading = pn.pane.HTML("", sizing_mode="stretch_width")
     tabs.param.watch(show, "active")
-    chosen.param.watch(lambda *_: (show(), remember()), ["movie", "result", "changed"])
+    chosen.param.watch(show, ["movie", "result", "changed"])
+    chosen.param.watch(remember, ["movie"])
     template = _Template(
         title="iSCAT analysis", main=[heading, tabs], header=[colours],
         header_background="#1B1D21", theme="dark" if dark else "default", busy_indicator=None,
@@ -87,16 +88,16 @@ def page_of(folder: Path, queue: Queue) -> Any:
 def _given(name: str) -> str:
     """Read a part of the address."""
     values = pn.state.session_args.get(name) or [b""]
-    return values[0].decode("utf-8", "replace")
+    return str(values[0], "utf-8", "replace")
 
 
 def _colours(chosen: Chosen) -> str:
     """Link to the same page in other colours."""
     same = {} if chosen.movie is None else {"movie": str(chosen.movie)}
-    links = (
-        f'<a style="color: white" href="?{html.escape(urlencode(same | {"theme": theme}))}">{name}</a>'
-        for name, theme in (("dark", "dark"), ("light", "default"))
-    )
+    links = []
+    for name, theme in (("dark", "dark"), ("light", "default")):
+        query = html.escape(urlencode(same | {"theme": theme}))
+        links.append(f'<a style="color: white" href="?{query}">{name}</a>')
     return f'<nav aria-label="colours">{" · ".join(links)}</nav>'
 
 

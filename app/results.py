@@ -22,6 +22,7 @@ from iscat_analysis.answers.gates import (
     usual_bin,
 )
 from iscat_analysis.records import Status
+from iscat_analysis.species.describe import Branch
 from iscat_app.chosen import Chosen, Notice, table_of
 from iscat_app.rejections import Rejections
 
@@ -29,8 +30,25 @@ DRAWS = 50
 """Simulated repetitions behind the intervals of the species."""
 
 _BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
-_BRANCHES = {"landing and leaving": "magnitude", "landing": "landing", "leaving": "leaving"}
-_GATE_HEAD = ("gate [kDa]", "events", "95 %", "mean [kDa]", "± SE", "width [kDa]", "fraction", "95 %")
+_BRANCHES: dict[str, Branch] = {
+    "landing and leaving": "magnitude",
+    "landing": "landing",
+    "leaving": "leaving",
+}
+_HINT = (
+    "<small>Drag over the histogram for a gate; click a bar, or dots below, to select events."
+    "</small>"
+)
+_GATE_HEAD = (
+    "gate [kDa]",
+    "events",
+    "95 %",
+    "mean [kDa]",
+    "± SE",
+    "width [kDa]",
+    "fraction",
+    "95 %",
+)
 _SPECIES_HEAD = ("species [kDa]", "95 %", "width [kDa]", "events", "fraction", "95 %")
 
 
@@ -60,7 +78,9 @@ class Results:
         self._bars = ColumnDataSource({"left": [], "right": [], "top": []})
         self._curve = ColumnDataSource({"x": [], "y": []})
         self._species_curve = ColumnDataSource({"x": [], "y": []})
-        self._events = ColumnDataSource({name: [] for name in ("x", "y", "frame", "mass", "event", "colour")})
+        self._events = ColumnDataSource(
+            {name: [] for name in ("x", "y", "frame", "mass", "event", "colour")}
+        )
         self._hist = figure(
             width=620, height=330, tools="xwheel_zoom,xpan,reset,save", x_axis_label="|mass| [kDa]",
             y_axis_label="events", active_drag=None,
@@ -96,8 +116,12 @@ class Results:
         self._events.selected.on_change("indices", self._events_selected)
 
     def _make_widgets(self) -> None:
-        self.bin = pn.widgets.FloatInput(name="Bar width [kDa]", value=10.0, start=0.01, step=1.0, width=110)
-        self.kernel = pn.widgets.FloatInput(name="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110)
+        self.bin = pn.widgets.FloatInput(
+            name="Bar width [kDa]", value=10.0, start=0.01, step=1.0, width=110
+        )
+        self.kernel = pn.widgets.FloatInput(
+            name="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110
+        )
         self.branch = pn.widgets.Select(name="Events", options=[*_BRANCHES], width=160)
         self.flagged = pn.widgets.Checkbox(name="flagged too")
         self.find = pn.widgets.Button(name="Find the species", width=140)
@@ -109,7 +133,9 @@ class Results:
         self._species_table = pn.pane.HTML("", sizing_mode="stretch_width")
         self.which = pn.widgets.Select(name="Selected events", options=[], size=7, width=230)
         self._facts = pn.pane.HTML("", width=300)
-        self._picture = pn.pane.PNG(None, width=620, alt_text="data, model and residual of the event")
+        self._picture = pn.pane.PNG(
+            None, width=620, alt_text="data, model and residual of the event"
+        )
         reject = pn.widgets.Button(name="Reject the selected events", width=190)
         self.listed = pn.widgets.Select(name="Rejected by hand", options=[], size=5, width=230)
         back = pn.widgets.Button(name="Take the event back", width=160)
@@ -127,7 +153,7 @@ class Results:
             pn.Row(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
-                    pn.pane.HTML("<small>Drag over the histogram for a gate; click a bar, or events below, to select.</small>"),
+                    pn.pane.HTML(_HINT),
                     pn.Row(self.low, self.high, add, drop, styles={"align-items": "end"}),
                     self._gate_table, self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
@@ -191,7 +217,13 @@ class Results:
             self._curve.data = {"x": seen.mass_kda, "y": seen.density}
             self._hist.yaxis.axis_label = f"events per {seen.bin_kda:g} kDa"
             self._draw_species()
-            place = {"x": "x_px", "y": "y_px", "frame": "frame", "mass": "mass_kda", "event": "event"}
+            place = {
+                "x": "x_px",
+                "y": "y_px",
+                "frame": "frame",
+                "mass": "mass_kda",
+                "event": "event",
+            }
             data = {name: self._seen[column].to_numpy() for name, column in place.items()}
             data["colour"] = np.where(self._seen["status"] == "ok", _BLUE, "#E69F00")
             self._events.selected.indices = []
@@ -329,7 +361,9 @@ class Results:
 
     def _list_rejected(self) -> None:
         rows = self.table[self.table["event"].isin(self.rejected)].to_dict("records")
-        self.listed.options = {f"{r['event']}: {r['mass_kda']:.1f} kDa": int(r["event"]) for r in rows}
+        self.listed.options = {
+            f"{r['event']}: {r['mass_kda']:.1f} kDa": int(r["event"]) for r in rows
+        }
 
 
 def facts_of(row: pd.Series) -> str:

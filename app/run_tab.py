@@ -71,7 +71,9 @@ class RunTab:
         options = {f"{r.number}: {r.movie.name}, {r.state}": r.number for r in self._queue.runs}
         if options != self._which.options:
             value = self._which.value
-            self._which.param.update(options=options, value=value or next(iter(options.values()), None))
+            self._which.param.update(
+                options=options, value=value or next(iter(options.values()), None)
+            )
         self._show()
         for run in self._queue.runs:
             if run.ended and run.number not in self._ended:

@@ -39,6 +39,7 @@ class Run:
     settings: Sequence[str] = ()
     scheduler: str = "threads"
     state: State = "waiting"
+    is_asked_to_stop: bool = False
     stage: str = ""
     done: int = 0
     total: int = 0
@@ -99,9 +100,7 @@ class Queue:
             for run in self.runs:
                 if run.out == out and not run.ended:
                     return run
-            run = Run(
-                len(self.runs) + 1, movie, config, out, overwrite, tuple(settings), scheduler
-            )
+            run = Run(len(self.runs) + 1, movie, config, out, overwrite, tuple(settings), scheduler)
             self.runs.append(run)
             self.version += 1
             self._wake.notify_all()
@@ -113,7 +112,7 @@ class Queue:
             if run.state == "waiting":
                 run.state = "stopped"
             elif run.state == "running" and self._process is not None and self._process.pid:
-                run.state = "stopping"
+                run.state, run.is_asked_to_stop = "stopping", True
                 os.kill(self._process.pid, signal.SIGINT)
             self.version += 1
 
@@ -155,7 +154,7 @@ class Queue:
             self._process.join()
             with self._wake:
                 if not run.ended:  # it was ended from outside
-                    run.state = "stopped" if run.state == "stopping" else "failed"
+                    run.state = "stopped" if run.is_asked_to_stop else "failed"
                     run.say("the process ended without a word; perhaps memory ran out")
                 self._process = None
                 self.version += 1

@@ -117,7 +117,7 @@ def mass_histogram(
         raise ConfigError(
             f"`bin_kda` = {width:g} makes {bars} bars up to {reach:.4g} kDa: give a wider one"
         )
-    edges = width * np.arange(bars + 1)
+    edges: FloatArray = width * np.arange(bars + 1, dtype=np.float64)
     at = np.linspace(0.0, float(edges[-1]), _POINTS)
     z = (at[:, np.newaxis] - mass) / kernel
     density = np.exp(-0.5 * z**2).sum(axis=1) * width / (math.sqrt(2 * math.pi) * kernel)

@@ -126,7 +126,7 @@ class RatioFilm:
         return float(low), float(high if high > low else low + 1.0)
 
     def _frame(self, number: int) -> FloatArray:
-        counts = self.movie.read(number, number + 1)[0].astype(np.float64)
+        counts: FloatArray = self.movie.read(number, number + 1)[0].astype(np.float64)
         counts -= self._offset
         light = float(counts.mean())
         if not light > 0:

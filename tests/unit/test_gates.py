@@ -97,7 +97,9 @@ def test_bars_follow_the_errors(table: pd.DataFrame) -> None:
         mass_histogram(np.array([1.0, 500.0]), bin_kda=0.01)
 
 
-@pytest.mark.parametrize(("kind", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")])
+@pytest.mark.parametrize(
+    ("kind", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF"), ("png", b"\x89PNG")]
+)
 def test_figures_are_files_of_their_kind(kind: str, begins: bytes) -> None:
     mass = np.array([60.0, 66.0, 72.0])
     seen = mass_histogram(mass, bin_kda=5.0)

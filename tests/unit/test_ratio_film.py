@@ -64,7 +64,7 @@ def test_light_and_noise_are_measured(counts: np.ndarray) -> None:
 
 
 def test_dark_frames_and_impossible_windows_are_refused(counts: np.ndarray) -> None:
-    with pytest.raises(ia.ConfigError, match="camera.offset_adu"):
+    with pytest.raises(ia.ConfigError, match=r"camera\.offset_adu"):
         RatioFilm(ia.open_stack(counts), offset_adu=1e9).contrast(20)
     with pytest.raises(ia.ConfigError, match="window"):
         RatioFilm(ia.open_stack(counts), window=21)
