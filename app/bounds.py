@@ -60,7 +60,7 @@ class Bounds:
             widget.param.watch(self._follow, "value")
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(
+            pn.FlexBox(
                 pn.Column(*self._sliders.values(), self._mode),
                 pn.Column(self._table, self._note),
                 pn.pane.Bokeh(plot),

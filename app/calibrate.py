@@ -54,7 +54,7 @@ class Calibrate:
         self.body = pn.Column(
             self._notice.pane,
             pn.Row(self._standards, fit, self._use, styles={"align-items": "end"}),
-            pn.Row(pn.pane.Bokeh(peaks), pn.pane.Bokeh(plot)),
+            pn.FlexBox(pn.pane.Bokeh(peaks), pn.pane.Bokeh(plot)),
             self._table, self._text,
         )  # fmt: skip
 

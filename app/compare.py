@@ -41,7 +41,7 @@ class Compare:
         test.on_click(self._test)
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(pn.Column(self._paths, pn.Row(self._bin, self._stacked), test), self._plot),
+            pn.FlexBox(pn.Column(self._paths, pn.Row(self._bin, self._stacked), test), self._plot),
             self._table,
         )
 

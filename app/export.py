@@ -52,7 +52,7 @@ class Export:
         self.body = pn.Column(
             self._notice.pane,
             pn.Row(self._width, self._height, self._font, self._palette, self._density),
-            pn.Row(self._preview, pn.Column(*buttons)),
+            pn.FlexBox(self._preview, pn.Column(*buttons)),
             "### The same without the window",
             self._command,
         )

@@ -142,7 +142,7 @@ class Film:
         self.use_span.on_click(self._keep_span)
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(
+            pn.FlexBox(
                 pn.Column(
                     pn.Row(self.play, self.frame),
                     pn.pane.Bokeh(self._figure),

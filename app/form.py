@@ -152,7 +152,7 @@ class Form:
         save.on_click(self._save)
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(
+            pn.FlexBox(
                 pn.Column("### What matters most", self._first, pn.Row(save, propose), width=420),
                 pn.Column("### Everything else", self._rest, width=520),
                 pn.Column("### The file", self._written, width=420),

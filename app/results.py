@@ -134,7 +134,7 @@ class Results:
         self.which = pn.widgets.Select(name="Selected events", options=[], size=7, width=230)
         self._facts = pn.pane.HTML("", width=300)
         self._picture = pn.pane.PNG(
-            None, width=620, alt_text="data, model and residual of the event"
+            None, width=560, alt_text="data, model and residual of the event"
         )
         reject = pn.widgets.Button(name="Reject the selected events", width=190)
         self.listed = pn.widgets.Select(name="Rejected by hand", options=[], size=5, width=230)
@@ -150,7 +150,7 @@ class Results:
         self.body = pn.Column(
             self._notice.pane,
             pn.Row(self.bin, self.kernel, self.branch, self.flagged, self.find),
-            pn.Row(
+            pn.FlexBox(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML(_HINT),
@@ -310,7 +310,7 @@ class Results:
             return
         edges, mass = self.histogram.edges, self.masses()
         inside = np.zeros(mass.size, dtype=bool)
-        for bar in new:
+        for bar in (b for b in new if b < self.histogram.counts.size):
             inside |= (mass >= edges[bar]) & (mass < edges[bar + 1])
         self._events.selected.indices = np.flatnonzero(inside).tolist()
 

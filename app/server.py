@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import socket
 import threading
+import traceback
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +14,9 @@ from typing import Any
 
 import panel as pn
 from bokeh.server.auth_provider import AuthProvider
+from tornado.iostream import StreamClosedError
 from tornado.web import RequestHandler
+from tornado.websocket import WebSocketClosedError
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_app.page import page_of
@@ -22,17 +26,29 @@ HOST = "127.0.0.1"
 FIRST_PORT, PORTS = 5006, 50
 """Where a free port is looked for, if none is asked for."""
 
+_ACCESS = "tornado.access"  # where it is logged who was not let in
 _LOCKED = (
     "<!doctype html><html lang=en><title>iSCAT analysis</title>"
     "<p>This address needs the token: open the whole address that <code>iscat app</code> printed."
 )
 
 
-def serve(folder: Path, *, port: int | None, say: Callable[[str], None]) -> None:
-    """Show a folder in the browser until Ctrl-C; `say` is told the address."""
+def serve(
+    folder: Path,
+    *,
+    port: int | None,
+    say: Callable[[str], None],
+    warn: Callable[[str], None],
+    debug: bool = False,
+) -> None:
+    """Show a folder in the browser until Ctrl-C.
+
+    `say` is told the address, and `warn` what went wrong, with `debug` with its traceback.
+    """
     if not folder.is_dir():
         raise DataError(f"{folder}: is no folder; give the folder that holds the movies")
     number = _free_port(port)
+    logging.basicConfig(level=logging.WARNING, handlers=[_Log(warn, debug=debug)], force=True)
     token = secrets.token_urlsafe(24)
     queue = Queue()
     root = folder.resolve()
@@ -58,6 +74,27 @@ def serve(folder: Path, *, port: int | None, say: Callable[[str], None]) -> None
         say("ended")
     finally:
         queue.close()
+
+
+class _Log(logging.Handler):
+    """Says in a line what libraries log, but not that a page was closed while it was written to."""
+
+    def __init__(self, warn: Callable[[str], None], *, debug: bool) -> None:
+        super().__init__()
+        self._warn, self._debug = warn, debug
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say one record."""
+        error = record.exc_info[1] if record.exc_info else None
+        gone = isinstance(error, (WebSocketClosedError, StreamClosedError))
+        if gone or "connection was closed" in record.getMessage() or record.name == _ACCESS:
+            return
+        if error is None:
+            self._warn(record.getMessage())
+        elif self._debug:
+            self._warn("".join(traceback.format_exception(error)))
+        else:
+            self._warn(f"unexpected {type(error).__name__}: {error}; --debug gives the traceback")
 
 
 class _Token(AuthProvider):

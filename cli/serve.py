@@ -52,4 +52,4 @@ def app(
                 'pip install "iscat-analysis[app]"'
             ) from None
         messages.notify("Ctrl-C ends it")
-        serve(folder, port=port, say=print_result)
+        serve(folder, port=port, say=print_result, warn=messages.error, debug=debug)

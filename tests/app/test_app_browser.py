@@ -150,6 +150,7 @@ def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             server.send_signal(signal.SIGINT)
             assert server.wait(PATIENCE_S) == 0
     said = log.read_text()
+    assert "unexpected" not in said, said
     assert "Traceback" not in said, said
 
 
