@@ -13,7 +13,7 @@ from bokeh.plotting import figure
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import mass_calibration
 from iscat_analysis.calibration.mass import MassCalibration
-from iscat_analysis.movie.addresses import beside
+from iscat_analysis.movie.addresses import path_beside
 from iscat_app.chosen import Chosen, Notice, table_of
 from iscat_app.form import add_table
 
@@ -79,7 +79,7 @@ class Calibrate:
         except ValueError:
             self._notice.say("Write the masses as 66, 146, 480.", "error")
             return
-        out = beside(result, ".calibration")
+        out = path_beside(result, ".calibration")
         notes: list[str] = []
         self._notice.work(
             "Fitting",

@@ -13,7 +13,7 @@ import panel as pn
 import param
 
 from iscat_analysis.errors import IscatError
-from iscat_analysis.movie.addresses import beside, setup_beside
+from iscat_analysis.movie.addresses import path_beside, setup_beside
 
 T = TypeVar("T")
 
@@ -31,7 +31,7 @@ class Chosen(param.Parameterized):
     def choose(self, movie: Path | None, result: Path | None = None) -> None:
         """Show a movie, with the result that lies beside it unless another is given."""
         if result is None and movie is not None:
-            result = beside(movie, ".iscat")
+            result = path_beside(movie, ".iscat")
         found = result if result is not None and (result / "summary.json").is_file() else None
         self.param.update(movie=movie, result=found)
 

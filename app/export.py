@@ -11,7 +11,7 @@ import panel as pn
 
 import iscat_analysis as ia
 from iscat_analysis.config import config_to_toml
-from iscat_analysis.movie.addresses import beside
+from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.report.gates import PALETTES, Format, figure_bytes, histogram_figure
 from iscat_app.chosen import Chosen, Notice
 from iscat_app.results import Results
@@ -135,7 +135,7 @@ class Export:
         result = self._results.result
         if result is None:
             raise ia.DataError("there is no result yet")
-        movie = self._chosen.movie or beside(result.folder, ".tif")
+        movie = self._chosen.movie or path_beside(result.folder, ".tif")
         code = [
             "import iscat_analysis as ia",
             f"found = ia.fit_movie({str(movie)!r}, config={str(result.folder / 'config.toml')!r})",

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import panel as pn
 
 import iscat_analysis as ia
-from iscat_analysis.movie.addresses import beside
+from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.reading import read_json
 from iscat_app.chosen import Chosen, Notice, table_of
 
@@ -45,11 +45,11 @@ def listed(folder: Path) -> list[Entry]:
         if path.is_dir() and ending == ".iscat":
             continue  # shown with its movie, or below
         if ending in MOVIES:
-            done = (beside(path, ".iscat") / "summary.json").is_file()
+            done = (path_beside(path, ".iscat") / "summary.json").is_file()
             entries.append(Entry(path, "movie", f"{'●' if done else '○'} {path.name}"))
         elif path.is_dir():
             entries.append(Entry(path, "folder", f"▸ {path.name}/"))
-    shown = {beside(e.path, ".iscat") for e in entries if e.kind == "movie"}
+    shown = {path_beside(e.path, ".iscat") for e in entries if e.kind == "movie"}
     for path in sorted(folder.glob("*.iscat")):
         if path not in shown and (path / "summary.json").is_file():
             entries.append(Entry(path, "result", f"◆ {path.name}"))

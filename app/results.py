@@ -30,6 +30,7 @@ DRAWS = 50
 """Simulated repetitions behind the intervals of the species."""
 
 _BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
+_LEFT_PX = 660
 _BRANCHES: dict[str, Branch] = {
     "landing and leaving": "magnitude",
     "landing": "landing",
@@ -157,6 +158,7 @@ class Results:
                     pn.Row(self.low, self.high, add, drop, styles={"align-items": "end"}),
                     self._gate_table, self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
+                    width=_LEFT_PX,
                 ),
                 pn.Column(self.which, reject, self._facts, self._picture, self.listed, back),
             ),

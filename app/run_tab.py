@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 
-from iscat_analysis.movie.addresses import beside
+from iscat_analysis.movie.addresses import path_beside
 from iscat_app.chosen import Chosen, Notice
 from iscat_app.files import listed
 from iscat_app.runs import Queue, Run
@@ -107,7 +107,7 @@ class RunTab:
             return
         self._notice.say("")
         run = self._queue.add(
-            movie, self._chosen.config, beside(movie, ".iscat"), overwrite=self._overwrite.value,
+            movie, self._chosen.config, path_beside(movie, ".iscat"), overwrite=self._overwrite.value,
             scheduler=self._scheduler.value.strip() or "threads",
         )  # fmt: skip
         self.refresh()
@@ -123,7 +123,7 @@ class RunTab:
         put = 0
         for entry in listed(movie.parent):
             if entry.kind == "movie":
-                out = beside(entry.path, ".iscat")
+                out = path_beside(entry.path, ".iscat")
                 if self._overwrite.value or not (out / "summary.json").is_file():
                     self._queue.add(
                         entry.path, config, out, overwrite=self._overwrite.value,

@@ -220,10 +220,10 @@ def _analyse(
             resolved = load_config(config, settings)
             with open_executor(
                 scheduler, None, shared=movie, workers=resolved.compute.workers
-            ) as place:
+            ) as executor:
                 analysis = fit_stack(
                     movie, resolved, out=out, overwrite=overwrite, progress=progress,
-                    notify=notify, command=command, place=place,
+                    notify=notify, command=command, executor=executor,
                 )  # fmt: skip
             to.send(("done", f"{len(analysis.table)} rows; results in {out}"))
         except IscatError as error:

@@ -71,7 +71,7 @@ def serve(
     try:
         server.io_loop.start()
     except KeyboardInterrupt:  # which is how one ends it
-        say("ended")
+        pass
     finally:
         queue.close()
 

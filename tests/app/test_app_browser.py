@@ -276,6 +276,7 @@ def test_a_damaged_movie_is_refused_in_words_and_the_page_goes_on(page: Page) ->
 @pytest.mark.large
 def test_two_tabs_show_two_movies_and_one_queue(page: Page, address: str, folder: Path) -> None:
     shutil.copy(folder / "landing.tif", folder / "second.tif")
+    page.click("Look again")
     page.choose("second.tif")
     page.says("240 of 64 × 64 pixels")
     first = page.driver.current_window_handle

@@ -119,7 +119,7 @@ def test_every_example_runs(
         Path("movie.iscat/report.html").write_text("<title>a page</title>", encoding="utf-8")
     if "watch" in arguments:
         Path("movies").mkdir()
-        monkeypatch.setattr("iscat_analysis.day.watch._Folder.look", _interrupt)
+        monkeypatch.setattr("iscat_analysis.day.watch._Folder.check", _interrupt)
     if "app" in arguments:  # test_app goes the whole way, in a browser
         pytest.importorskip("panel", reason="needs the Python package panel")
         Path("measurements/monday").mkdir(parents=True)
