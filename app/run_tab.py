@@ -107,8 +107,8 @@ class RunTab:
             return
         self._notice.say("")
         run = self._queue.add(
-            movie, self._chosen.config, path_beside(movie, ".iscat"), overwrite=self._overwrite.value,
-            scheduler=self._scheduler.value.strip() or "threads",
+            movie, self._chosen.config, path_beside(movie, ".iscat"),
+            overwrite=self._overwrite.value, scheduler=self._scheduler.value.strip() or "threads",
         )  # fmt: skip
         self.refresh()
         self._which.value = run.number
