@@ -43,6 +43,7 @@ class RatioFilm:
 
     @window.setter
     def window(self, frames: int) -> None:
+        """Take means of so many frames from now on."""
         frames = int(number_in("`window`", frames, least=1, most=self.longest, whole=True))
         if frames != self._window:
             self._window, self._at = frames, -1
@@ -54,6 +55,7 @@ class RatioFilm:
 
     @offset_adu.setter
     def offset_adu(self, counts: float) -> None:
+        """Take contrasts over another offset from now on."""
         self._offset, self._at = float(counts), -1
 
     @property
