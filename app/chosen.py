@@ -26,6 +26,7 @@ class Chosen(param.Parameterized):
     movie = param.ClassSelector(class_=Path, default=None, doc="File or folder of a movie.")
     result = param.ClassSelector(class_=Path, default=None, doc="Output folder of a movie.")
     span = param.Tuple(default=None, length=2, doc="Frames to analyse, half-open.")
+    frame = param.Integer(default=None, allow_None=True, doc="Frame of the event that is shown.")
     changed = param.Integer(default=0, doc="Counts what changes on the disk.")
 
     def choose(self, movie: Path | None, result: Path | None = None) -> None:
@@ -33,7 +34,7 @@ class Chosen(param.Parameterized):
         if result is None and movie is not None:
             result = path_beside(movie, ".iscat")
         found = result if result is not None and (result / "summary.json").is_file() else None
-        self.param.update(movie=movie, result=found)
+        self.param.update(movie=movie, result=found, frame=None)
 
     def look_again(self) -> None:
         """See whether there is a result by now."""

@@ -161,6 +161,7 @@ class Film:
         """Open the movie that is chosen, if it is not open."""
         now = self._chosen.movie, self._chosen.result, self._chosen.changed
         if now == self._shown:
+            self._go_to_event()
             return
         self._shown = now
         self.play.value = False
@@ -171,6 +172,13 @@ class Film:
         self._notice.say("")
         with self._notice.told():
             self._open()
+            self._go_to_event()
+
+    def _go_to_event(self) -> None:
+        """Show the frame of the event that was looked at under Results."""
+        if self._film is not None and self._chosen.frame is not None:
+            self.frame.value = min(self._chosen.frame, self.frame.end)
+            self._chosen.frame = None
 
     def _close(self) -> None:
         if self._film is not None:

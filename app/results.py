@@ -332,6 +332,7 @@ class Results:
             return
         row = int(np.flatnonzero(self.table["event"] == number)[0])
         self._facts.object = facts_of(self.table.iloc[row])
+        self._chosen.frame = int(self.table["frame"].iloc[row])  # where the film goes
         self._notice.work(
             "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, number)
         )

@@ -193,10 +193,22 @@ def page(driver: Any, address: str) -> Iterator[Page]:
     assert [entry["message"] for entry in failed] == []
 
 
-@pytest.mark.parametrize("token", ["", "?token=guessed"])
-def test_nobody_is_let_in_without_the_token(address: str, token: str) -> None:
+WEBSOCKET = {
+    "Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13",
+    "Sec-WebSocket-Key": "dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Protocol": "bokeh, e30",
+}  # fmt: skip
+"""Headers with which a program would speak to the page past the page."""
+
+
+@pytest.mark.parametrize(
+    ("place", "headers"), [("", {}), ("?token=guessed", {}), ("ws", WEBSOCKET)]
+)
+def test_nobody_is_let_in_without_the_token(
+    address: str, place: str, headers: dict[str, str]
+) -> None:
+    wanted = urllib.request.Request(address.partition("?")[0] + place, headers=headers)
     with pytest.raises(urllib.error.HTTPError) as refused:
-        urllib.request.urlopen(address.partition("?")[0] + token)
+        urllib.request.urlopen(wanted)
     with refused.value as answer:
         assert answer.code == 403
 
