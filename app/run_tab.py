@@ -70,10 +70,9 @@ class RunTab:
         self._version = self._queue.version
         options = {f"{r.number}: {r.movie.name}, {r.state}": r.number for r in self._queue.runs}
         if options != self._which.options:
-            value = self._which.value
-            self._which.param.update(
-                options=options, value=value or next(iter(options.values()), None)
-            )
+            is_new = len(options) != len(self._which.options)
+            value = self._queue.runs[-1].number if is_new else self._which.value
+            self._which.param.update(options=options, value=value)
         self._show()
         for run in self._queue.runs:
             if run.ended and run.number not in self._ended:

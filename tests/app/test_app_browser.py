@@ -300,7 +300,7 @@ def test_two_tabs_show_two_movies_and_one_queue(page: Page, address: str, folder
     page.click("Analyse this movie")
     page.driver.switch_to.window(page.driver.window_handles[-1])
     page.open("Run")
-    page.says("second.tif")
+    page.says("$ iscat-fit", "second.tif")
     page.click("Stop")
     page.says(": stopped")
     page.click("Go on or try again")
