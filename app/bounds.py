@@ -32,20 +32,22 @@ class Bounds:
         self._computes = self._again = self._seen = False
         slider = pn.widgets.FloatSlider
         self._sliders = {
-            "optics.na": slider(name="NA", start=0.8, end=1.48, step=0.01, value=1.42),
+            "optics.na": slider(label="NA", start=0.8, end=1.48, step=0.01, value=1.42),
             "optics.focus_nm": slider(
-                name="Focus [nm]", start=-1000, end=1000, step=10, value=-300
+                label="Focus [nm]", start=-1000, end=1000, step=10, value=-300
             ),
-            "optics.attenuation": slider(name="Attenuation", start=0.02, end=1, step=0.02, value=1),
+            "optics.attenuation": slider(
+                label="Attenuation", start=0.02, end=1, step=0.02, value=1
+            ),
             "bounds.photons_per_pixel": slider(
-                name="Photoelectrons per pixel and frame", start=1000, end=200_000, step=1000,
+                label="Photoelectrons per pixel and frame", start=1000, end=200_000, step=1000,
                 value=50_000,
             ),
-            "bounds.n_after": slider(name="Frames", start=1, end=1000, step=1, value=100),
-            "particle.mass_kda": slider(name="Mass [kDa]", start=10, end=2000, step=5, value=150),
-            "particle.height_nm": slider(name="Height [nm]", start=0, end=500, step=5, value=5),
+            "bounds.n_after": slider(label="Frames", start=1, end=1000, step=1, value=100),
+            "particle.mass_kda": slider(label="Mass [kDa]", start=10, end=2000, step=5, value=150),
+            "particle.height_nm": slider(label="Height [nm]", start=0, end=500, step=5, value=5),
         }  # fmt: skip
-        self._mode = pn.widgets.Select(name="Free", width=150, value="joint",
+        self._mode = pn.widgets.Select(label="Free", width=150, value="joint",
                                        options=["mass", "localize", "joint"])  # fmt: skip
         self._image = ColumnDataSource({"image": [np.zeros((_PIXELS, _PIXELS))]})
         self._mapper = LinearColorMapper(palette=gray(256), low=-1, high=1)

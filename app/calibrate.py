@@ -29,11 +29,11 @@ class Calibrate:
         self._chosen = chosen
         self._notice = Notice()
         self._toml = ""
-        self._standards = pn.widgets.TextInput(name="Masses of the standards [kDa]",
+        self._standards = pn.widgets.TextInput(label="Masses of the standards [kDa]",
                                                placeholder="66, 146, 480", width=260)  # fmt: skip
-        fit = pn.widgets.Button(name="Fit the line", button_type="primary", width=120)
+        fit = pn.widgets.Button(label="Fit the line", color="primary", width=120)
         self._use = pn.widgets.Button(
-            name="Put it into the movie's iscat.toml", width=250, disabled=True
+            label="Put it into the movie's iscat.toml", width=250, disabled=True
         )
         self._points = ColumnDataSource({"mass": [], "contrast": [], "low": [], "high": []})
         self._line = ColumnDataSource({"mass": [], "contrast": []})

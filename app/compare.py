@@ -29,11 +29,13 @@ class Compare:
         self._chosen = chosen
         self._notice = Notice()
         self.samples: list[tuple[str, MassHistogram]] = []
-        self._paths = pn.widgets.MultiSelect(name="Results (Ctrl for several)",
+        self._paths = pn.widgets.MultiSelect(label="Results (Ctrl for several)",
                                              options=[], size=10, width=430)  # fmt: skip
-        self._bin = pn.widgets.FloatInput(name="Bar width [kDa]", value=10.0, start=0.01, width=130)
-        self._stacked = pn.widgets.Checkbox(name="one above the other")
-        test = pn.widgets.Button(name="Test whether they differ", button_type="primary", width=200)
+        self._bin = pn.widgets.FloatInput(
+            label="Bar width [kDa]", value=10.0, start=0.01, width=130
+        )
+        self._stacked = pn.widgets.Checkbox(label="one above the other")
+        test = pn.widgets.Button(label="Test whether they differ", color="primary", width=200)
         self._plot = pn.pane.Bokeh(figure(width=760, height=420))
         self._table = pn.pane.HTML("", sizing_mode="stretch_width")
         for widget in (self._paths, self._bin, self._stacked):

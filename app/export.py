@@ -26,14 +26,14 @@ class Export:
         self._chosen, self._results = chosen, results
         self._notice = Notice()
         self._width = pn.widgets.FloatInput(
-            name="Width [cm]", value=12.0, start=3, end=60, width=100
+            label="Width [cm]", value=12.0, start=3, end=60, width=100
         )
         self._height = pn.widgets.FloatInput(
-            name="Height [cm]", value=8.0, start=3, end=60, width=100
+            label="Height [cm]", value=8.0, start=3, end=60, width=100
         )
-        self._font = pn.widgets.FloatInput(name="Font [pt]", value=9.0, start=4, end=40, width=100)
-        self._palette = pn.widgets.Select(name="Colours", options=[*PALETTES], width=180)
-        self._density = pn.widgets.Checkbox(name="with the kernel density", value=True)
+        self._font = pn.widgets.FloatInput(label="Font [pt]", value=9.0, start=4, end=40, width=100)
+        self._palette = pn.widgets.Select(label="Colours", options=[*PALETTES], width=180)
+        self._density = pn.widgets.Checkbox(label="with the kernel density", value=True)
         self._preview = pn.pane.PNG(None, width=560, alt_text="preview of the figure")
         self._command = pn.pane.Str("", sizing_mode="stretch_width")
         for widget in (self._width, self._height, self._font, self._palette, self._density):
@@ -63,7 +63,6 @@ class Export:
 
         return pn.widgets.FileDownload(
             callback=named, filename=f"histogram.{ending}", label=name, width=240,
-            button_type="default",
         )  # fmt: skip
 
     def refresh(self) -> None:

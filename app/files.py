@@ -95,18 +95,18 @@ class Files:
         self._chosen, self.folder = chosen, folder
         self._entries: dict[str, Entry] = {}
         self._notice = Notice()
-        self._where = pn.widgets.TextInput(name="Folder", sizing_mode="stretch_width")
-        self._filter = pn.widgets.TextInput(name="Show names with", width=180)
+        self._where = pn.widgets.TextInput(label="Folder", sizing_mode="stretch_width")
+        self._filter = pn.widgets.TextInput(label="Show names with", width=180)
         # Of many, since a list of one sends its first line where nothing is chosen.
         self._list = pn.widgets.MultiSelect(
-            name="Movies (● analysed, ○ not yet), ◆ results, ▸ folders",
+            label="Movies (● analysed, ○ not yet), ◆ results, ▸ folders",
             size=_SHOWN, sizing_mode="stretch_width",
         )  # fmt: skip
         self._facts = pn.pane.HTML("", sizing_mode="stretch_width")
-        again = pn.widgets.Button(name="Look again", width=100)
+        again = pn.widgets.Button(label="Look again", width=100)
         again.on_click(lambda _: self.refresh())
         self._drop = pn.widgets.FileDropper(
-            name="Copy a small movie here", multiple=True, max_file_size=f"{LARGEST_UPLOAD_MB}MB",
+            label="Copy a small movie here", multiple=True, max_file_size=f"{LARGEST_UPLOAD_MB}MB",
             sizing_mode="stretch_width", height=90,
         )  # fmt: skip
         self._where.param.watch(self._go, "value")

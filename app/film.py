@@ -116,20 +116,20 @@ class Film:
         self._light.add_tools(BoxSelectTool(dimensions="width", renderers=[marks]))
 
     def _make_widgets(self) -> None:
-        self.play = pn.widgets.Toggle(name="▶ Play", width=90)
-        self.frame = pn.widgets.IntSlider(name="Frame", start=0, end=1, width=470)
+        self.play = pn.widgets.Toggle(label="▶ Play", width=90)
+        self.frame = pn.widgets.IntSlider(label="Frame", start=0, end=1, width=470)
         self.rate = pn.widgets.Select(
-            name="Frames per second", options=list(RATES), value=25, width=130
+            label="Frames per second", options=list(RATES), value=25, width=130
         )
         self.kind = pn.widgets.RadioButtonGroup(options=[_RATIO, _RAW], value=_RATIO)
-        self.window = pn.widgets.IntSlider(name="Window [frames]", start=1, end=2, width=300)
+        self.window = pn.widgets.IntSlider(label="Window [frames]", start=1, end=2, width=300)
         self.contrast = pn.widgets.RangeSlider(
-            name="Black and white at", start=0, end=1, value=(0, 1), step=0.01, width=300
+            label="Black and white at", start=0, end=1, value=(0, 1), step=0.01, width=300
         )
-        self.search = pn.widgets.Checkbox(name="Mark what the search sees in this frame")
-        self.events = pn.widgets.Checkbox(name="Ring the events of the result", value=True)
-        self.span = pn.widgets.StaticText(name="Frames marked in the light", value="all")
-        self.use_span = pn.widgets.Button(name="Analyse only these frames", disabled=True)
+        self.search = pn.widgets.Checkbox(label="Mark what the search sees in this frame")
+        self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
+        self.span = pn.widgets.StaticText(label="Frames marked in the light", value="all")
+        self.use_span = pn.widgets.Button(label="Analyse only these frames", disabled=True)
         self.facts = pn.pane.HTML("", width=320)
         self.play.param.watch(self._play, "value")
         self.frame.param.watch(self._frame_moved, "value")
@@ -230,7 +230,7 @@ class Film:
     # ---- playing ----------------------------------------------------------------------------
 
     def _play(self, event: Any) -> None:
-        self.play.name = "⏸ Pause" if event.new else "▶ Play"
+        self.play.label = "⏸ Pause" if event.new else "▶ Play"
         if event.new and self._film is None:
             self.play.value = False
         elif event.new:
@@ -306,7 +306,7 @@ class Film:
         unit = 100.0 if self.kind.value == _RATIO else 1.0
         digits = max(0, 2 - math.floor(math.log10(unit * span)))
         self.contrast.param.update(
-            name="Black and white at " + ("[%]" if unit > 1 else "[counts]"),
+            label="Black and white at " + ("[%]" if unit > 1 else "[counts]"),
             start=round(unit * (low - span), digits), end=round(unit * (high + span), digits),
             step=10.0**-digits, value=(round(unit * low, digits), round(unit * high, digits)),
         )  # fmt: skip

@@ -124,6 +124,11 @@ def write_texts(path: Path, texts: Mapping[str, str]) -> ia.Config:
     return checked
 
 
+def _plain(text: str) -> str:
+    """Take the quotes off a text."""
+    return str(tomllib.loads(f"value = {text}")["value"]) if text.startswith('"') else text
+
+
 def _as_toml(text: str) -> str:
     """Put quotes around what is a text and has none."""
     try:
@@ -146,8 +151,8 @@ class Form:
         self._first = pn.Column()
         self._rest = pn.Accordion(sizing_mode="stretch_width")
         self._written = pn.pane.Str("", sizing_mode="stretch_width")
-        propose = pn.widgets.Button(name="Propose from the movie", width=190)
-        save = pn.widgets.Button(name="Save iscat.toml", button_type="primary", width=150)
+        propose = pn.widgets.Button(label="Propose from the movie", width=190)
+        save = pn.widgets.Button(label="Save iscat.toml", color="primary", width=150)
         propose.on_click(self._propose)
         save.on_click(self._save)
         self.body = pn.Column(
@@ -170,8 +175,7 @@ class Form:
                 texts = read_texts(self._chosen.config)
                 for key, widget in self._widgets.items():
                     unset = _UNSET if isinstance(widget, pn.widgets.Select) else ""
-                    text = texts.get(key, unset)
-                    widget.value = text.strip('"') if text.startswith('"') else text
+                    widget.value = _plain(texts.get(key, unset))
             self._show_file()
         if self._chosen.span is not None:
             first, last = self._chosen.span
@@ -197,13 +201,18 @@ class Form:
                 texts[key] = text
         return texts
 
+    def _others(self) -> dict[str, str]:
+        """Give what is in the file and not in the form, which stays as it is."""
+        texts = read_texts(self._chosen.config)
+        return {key: text for key, text in texts.items() if key not in self._widgets}
+
     def _save(self, _: Any) -> None:
         path = self._chosen.setup
         if path is None:
             self._notice.say("Choose a movie under Open.", "error")
             return
         with self._notice.told():
-            config = write_texts(path, self._texts())
+            config = write_texts(path, self._texts() | self._others())
             self._chosen.span = None
             self._chosen.changed += 1
             self._notice.say(f"saved as {path}: mode {config.fit.mode}")
@@ -240,9 +249,9 @@ def _widget_of(field: Field) -> Any:
     """Make the widget of a key; what is left empty has its default."""
     if field.choices:
         texts = [str(c).lower() if isinstance(c, bool) else str(c) for c in field.choices]
-        return pn.widgets.Select(name=field.label, options=[_UNSET, *texts], width=380)
+        return pn.widgets.Select(label=field.label, options=[_UNSET, *texts], width=380)
     default = "" if field.default is None else _default(field.default)
-    return pn.widgets.TextInput(name=field.label, placeholder=default, width=380)
+    return pn.widgets.TextInput(label=field.label, placeholder=default, width=380)
 
 
 def _default(value: Any) -> str:

@@ -118,28 +118,28 @@ class Results:
 
     def _make_widgets(self) -> None:
         self.bin = pn.widgets.FloatInput(
-            name="Bar width [kDa]", value=10.0, start=0.01, step=1.0, width=110
+            label="Bar width [kDa]", value=10.0, start=0.01, step=1.0, width=110
         )
         self.kernel = pn.widgets.FloatInput(
-            name="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110
+            label="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110
         )
-        self.branch = pn.widgets.Select(name="Events", options=[*_BRANCHES], width=160)
-        self.flagged = pn.widgets.Checkbox(name="flagged too")
-        self.find = pn.widgets.Button(name="Find the species", width=140)
-        self.low = pn.widgets.FloatInput(name="Gate from [kDa]", value=0.0, width=110)
-        self.high = pn.widgets.FloatInput(name="to [kDa]", value=100.0, width=110)
-        add = pn.widgets.Button(name="Add the gate", width=110)
-        drop = pn.widgets.Button(name="Remove all gates", width=130)
+        self.branch = pn.widgets.Select(label="Events", options=[*_BRANCHES], width=160)
+        self.flagged = pn.widgets.Checkbox(label="flagged too")
+        self.find = pn.widgets.Button(label="Find the species", width=140)
+        self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=110)
+        self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=110)
+        add = pn.widgets.Button(label="Add the gate", width=110)
+        drop = pn.widgets.Button(label="Remove all gates", width=130)
         self._gate_table = pn.pane.HTML("", sizing_mode="stretch_width")
         self._species_table = pn.pane.HTML("", sizing_mode="stretch_width")
-        self.which = pn.widgets.Select(name="Selected events", options=[], size=7, width=230)
+        self.which = pn.widgets.Select(label="Selected events", options=[], size=7, width=230)
         self._facts = pn.pane.HTML("", width=300)
         self._picture = pn.pane.PNG(
             None, width=560, alt_text="data, model and residual of the event"
         )
-        reject = pn.widgets.Button(name="Reject the selected events", width=190)
-        self.listed = pn.widgets.Select(name="Rejected by hand", options=[], size=5, width=230)
-        back = pn.widgets.Button(name="Take the event back", width=160)
+        reject = pn.widgets.Button(label="Reject the selected events", width=190)
+        self.listed = pn.widgets.Select(label="Rejected by hand", options=[], size=5, width=230)
+        back = pn.widgets.Button(label="Take the event back", width=160)
         for widget in (self.bin, self.kernel, self.branch, self.flagged):
             widget.param.watch(lambda _: self._draw(), "value")
         self.find.on_click(self._find_species)

@@ -25,15 +25,15 @@ class RunTab:
         self._chosen, self._queue = chosen, queue
         self._version, self._ended = -1, set[int]()
         self._notice = Notice()
-        self._overwrite = pn.widgets.Checkbox(name="Replace an earlier result")
+        self._overwrite = pn.widgets.Checkbox(label="Replace an earlier result")
         self._scheduler = pn.widgets.TextInput(
-            name="Where: threads, or the address of a Dask scheduler", value="threads", width=330
+            label="Where: threads, or the address of a Dask scheduler", value="threads", width=330
         )
-        start = pn.widgets.Button(name="Analyse this movie", button_type="primary", width=170)
-        every = pn.widgets.Button(name="Analyse all movies of the folder", width=240)
-        self._which = pn.widgets.Select(name="Run", options=[], width=420)
-        stop = pn.widgets.Button(name="Stop", width=90)
-        again = pn.widgets.Button(name="Go on or try again", width=160)
+        start = pn.widgets.Button(label="Analyse this movie", color="primary", width=170)
+        every = pn.widgets.Button(label="Analyse all movies of the folder", width=240)
+        self._which = pn.widgets.Select(label="Run", options=[], width=420)
+        stop = pn.widgets.Button(label="Stop", width=90)
+        again = pn.widgets.Button(label="Go on or try again", width=160)
         start.on_click(self._start)
         every.on_click(self._start_all)
         stop.on_click(lambda _: self._do(self._queue.stop))
