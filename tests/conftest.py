@@ -36,7 +36,7 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 LONGEST_FIRST = (
     "test_tracked_optics", "test_output", "test_second_process", "test_cli_ending",
     "test_short_tracks", "test_equilibrium", "test_optics_at_heights", "test_compilation",
-    "test_report_browser", "test_crowded", "test_day",
+    "test_report_browser", "test_app_browser", "test_crowded", "test_day",
     "test_cluster", "test_pipeline", "test_report", "test_landing", "test_moving",
     "test_equilibrium_spread", "test_cli_help", "test_misfit_search",
     "test_focus_scan", "test_movers", "test_benchmark", "test_optics_calibration", "test_public",
