@@ -10,11 +10,13 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
 from typing import Literal
 
@@ -148,7 +150,8 @@ class Queue:
                 context = get_context("spawn")
                 here, there = context.Pipe(duplex=False)
                 self._process = context.Process(target=_analyse, args=(run_of(run), there))
-                self._process.start()
+                with _interrupts_held():
+                    self._process.start()
                 there.close()
             self._follow(run, here)
             self._process.join()
@@ -180,6 +183,20 @@ class Queue:
                 self.version += 1
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Start a process that sees an interrupt only when it is ready to answer it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    ensure_running()  # which would let interrupts through again
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
 def run_of(run: Run) -> tuple[Path, Path | None, Path, bool, tuple[str, ...], str, str]:
     """Give what a process needs to know of a run."""
     return (
@@ -193,9 +210,6 @@ def _analyse(
 ) -> None:
     """Do one run, in a process of its own, and tell how far it is."""
     movie, config, out, overwrite, settings, scheduler, command = job
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    if hasattr(signal, "pthread_sigmask"):  # the command that started this blocks its signals
-        signal.pthread_sigmask(signal.SIG_SETMASK, ())
     said = 0.0
     lock = threading.Lock()
 
@@ -211,6 +225,9 @@ def _analyse(
             to.send(("note", text))
 
     try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if hasattr(signal, "pthread_sigmask"):  # one that came meanwhile is raised here
+            signal.pthread_sigmask(signal.SIG_SETMASK, ())
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import IscatError
         from iscat_analysis.executors import open_executor

@@ -26,7 +26,13 @@ HOST = "127.0.0.1"
 FIRST_PORT, PORTS = 5006, 50
 """Where a free port is looked for, if none is asked for."""
 
-_ACCESS = "tornado.access"  # where it is logged who was not let in
+_UNHEARD = (
+    "tornado.access",  # who was not let in
+    "bokeh.server.views.ws",  # that a page was closed
+    "tifffile",  # what is wrong with a file, which the page says in words
+)
+"""Logs that nobody needs to read."""
+
 _LOCKED = (
     "<!doctype html><html lang=en><title>iSCAT analysis</title>"
     "<p>This address needs the token: open the whole address that <code>iscat app</code> printed."
@@ -52,6 +58,8 @@ def serve(
     token = secrets.token_urlsafe(24)
     queue = Queue()
     root = folder.resolve()
+    for name in _UNHEARD:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     server = pn.io.server.get_server(
         {"/": lambda: page_of(root, queue)},
         address=HOST,
@@ -86,8 +94,7 @@ class _Log(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """Say one record."""
         error = record.exc_info[1] if record.exc_info else None
-        gone = isinstance(error, (WebSocketClosedError, StreamClosedError))
-        if gone or "connection was closed" in record.getMessage() or record.name == _ACCESS:
+        if isinstance(error, (WebSocketClosedError, StreamClosedError)):
             return
         if error is None:
             self._warn(record.getMessage())
