@@ -225,14 +225,15 @@ def _analyse(
             to.send(("note", text))
 
     try:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        if hasattr(signal, "pthread_sigmask"):  # one that came meanwhile is raised here
-            signal.pthread_sigmask(signal.SIG_SETMASK, ())
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import IscatError
         from iscat_analysis.executors import open_executor
         from iscat_analysis.pipeline import fit_stack
 
+        # An interrupt that came during these imports is raised here.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_SETMASK, ())
         try:
             resolved = load_config(config, settings)
             with open_executor(
