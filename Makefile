@@ -41,7 +41,7 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(STAMP): pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable ".[test,napari,lint,docs]"
+	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable ".[test,app,napari,lint,docs]"
 	@touch $@
 
 demo: $(STAMP)

@@ -42,6 +42,8 @@ from iscat_cli.init import EXAMPLE as INIT_EXAMPLE
 from iscat_cli.init import init
 from iscat_cli.kd import EXAMPLE as KD_EXAMPLE
 from iscat_cli.kd import kd
+from iscat_cli.serve import EXAMPLE as APP_EXAMPLE
+from iscat_cli.serve import app
 from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
 from iscat_cli.simulate import simulate
 from iscat_cli.species import EXAMPLE as SPECIES_EXAMPLE
@@ -64,6 +66,7 @@ COMMANDS = (
     (kd, KD_EXAMPLE),
     (export, EXPORT_EXAMPLE),
     (view, VIEW_EXAMPLE),
+    (app, APP_EXAMPLE),
     (config, CONFIG_EXAMPLE),
 )
 

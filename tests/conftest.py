@@ -34,7 +34,8 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_output", "test_tracked_optics", "test_report_browser", "test_day", "test_moving",
+    "test_output", "test_tracked_optics", "test_report_browser", "test_app_browser",
+    "test_day", "test_moving",
     "test_compilation", "test_equilibrium", "test_landing", "test_pipeline", "test_cluster",
     "test_stored", "test_crowded", "test_focus_scan", "test_cli_help", "test_cli_contract",
     "test_report", "test_planes", "test_benchmark", "test_bad_input", "test_fuzz", "test_movers",

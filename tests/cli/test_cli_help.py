@@ -98,6 +98,10 @@ def test_every_command_has_an_example() -> None:
         assert any(example.startswith(f"iscat {' '.join(name)} ") for example in shown)
 
 
+def _interrupt(_: object) -> None:
+    raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("example", _examples())
 def test_every_example_runs(
     example: str, laboratory: Path, tmp_path: Path, monkeypatch, capsys
@@ -114,12 +118,12 @@ def test_every_example_runs(
         Path("movie.iscat").mkdir()
         Path("movie.iscat/report.html").write_text("<title>a page</title>", encoding="utf-8")
     if "watch" in arguments:
-
-        def interrupt(_: object) -> None:
-            raise KeyboardInterrupt
-
         Path("movies").mkdir()
-        monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", interrupt)
+        monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", _interrupt)
+    if "app" in arguments:  # test_app goes the whole way, in a browser
+        pytest.importorskip("panel", reason="needs the Python package panel")
+        Path("measurements/monday").mkdir(parents=True)
+        monkeypatch.setattr("tornado.platform.asyncio.BaseAsyncIOLoop.start", _interrupt)
     if "samples.csv" in arguments:
         sketch_figures(monkeypatch)
         Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")

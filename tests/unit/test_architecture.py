@@ -13,7 +13,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(
-    p for room in ("iscat_analysis", "cli", "viewer") for p in (ROOT / room).rglob("*.py")
+    p for room in ("iscat_analysis", "app", "cli", "viewer") for p in (ROOT / room).rglob("*.py")
 )
 TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in SOURCES}
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-FRONT_ENDS = {"cli": "iscat_cli", "viewer": "iscat_napari"}
+FRONT_ENDS = {"app": "iscat_app", "cli": "iscat_cli", "viewer": "iscat_napari"}
 """Folder → the name it is installed under."""
 
 
@@ -25,11 +25,11 @@ def project(repo_root: Path) -> dict:
 def test_packages_match_the_folders(repo_root: Path, project: dict) -> None:
     inits = (repo_root / "iscat_analysis").rglob("__init__.py")
     folders = {".".join(p.parent.relative_to(repo_root).parts) for p in inits}
-    ours = folders | {"iscat_cli", "iscat_napari"}
+    ours = folders | {*FRONT_ENDS.values()}
     assert set(project["tool"]["setuptools"]["packages"]) == ours
 
 
-@pytest.mark.parametrize("name", ["cli", "viewer"])
+@pytest.mark.parametrize("name", [*FRONT_ENDS])
 def test_a_front_end_has_no_packages_of_its_own(repo_root: Path, name: str) -> None:
     assert [p.parent.name for p in (repo_root / name).rglob("__init__.py")] == [name]
 

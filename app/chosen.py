@@ -1,0 +1,121 @@
+"""What a page is about: a folder, a movie in it, and the movie's result."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import panel as pn
+import param
+
+from iscat_analysis.errors import IscatError
+from iscat_analysis.movie.addresses import path_beside, setup_beside
+
+T = TypeVar("T")
+
+_THREADS = ThreadPoolExecutor(4, thread_name_prefix="page")
+
+
+class Chosen(param.Parameterized):
+    """The movie that all parts of a page show."""
+
+    movie = param.ClassSelector(class_=Path, default=None, doc="File or folder of a movie.")
+    result = param.ClassSelector(class_=Path, default=None, doc="Output folder of a movie.")
+    span = param.Tuple(default=None, length=2, doc="Frames to analyse, half-open.")
+    frame = param.Integer(default=None, allow_None=True, doc="Frame of the event that is shown.")
+    changed = param.Integer(default=0, doc="Counts what changes on the disk.")
+
+    def choose(self, movie: Path | None, result: Path | None = None) -> None:
+        """Show a movie, with the result that lies beside it unless another is given."""
+        if result is None and movie is not None:
+            result = path_beside(movie, ".iscat")
+        found = result if result is not None and (result / "summary.json").is_file() else None
+        self.param.update(movie=movie, result=found, frame=None)
+
+    def look_again(self) -> None:
+        """See whether there is a result by now."""
+        self.choose(self.movie, self.result)
+        self.changed += 1
+
+    @property
+    def setup(self) -> Path | None:
+        """Where the configuration of the movie is, or would be."""
+        return None if self.movie is None else setup_beside(self.movie)
+
+    @property
+    def config(self) -> Path | None:
+        """The configuration of the movie, where there is one."""
+        return self.setup if self.setup is not None and self.setup.is_file() else None
+
+
+class Part(Protocol):
+    """One tab of a page."""
+
+    title: str
+    body: pn.viewable.Viewable
+
+    def refresh(self) -> None:
+        """Show what is chosen now; called when the tab is opened, and when the choice changes."""
+
+
+class Notice:
+    """A line that says what went wrong, what is going on, or what to do."""
+
+    def __init__(self) -> None:
+        self.pane = pn.pane.HTML("", sizing_mode="stretch_width", visible=False)
+        self.text, self.busy = "", False
+
+    def say(self, text: str, kind: str = "info") -> None:
+        """Show a text, as text whatever is in it; an empty one hides the line."""
+        self.text, self.busy = text, kind == "busy"
+        role = "alert" if kind == "error" else "status"
+        self.pane.object = f'<div class="notice {kind}" role="{role}">{html.escape(text)}</div>'
+        self.pane.visible = bool(text)
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """Show what the library refuses; everything else that fails is a fault of ours."""
+        try:
+            yield
+        except IscatError as error:
+            self.say(str(error), "error")
+        except (OSError, MemoryError) as error:
+            self.say(f"{type(error).__name__}: {error}", "error")
+
+    def work(self, what: str, job: Callable[[], T], then: Callable[[T], None]) -> None:
+        """Do something that takes long in a thread, as the page goes on, and then show it."""
+        document = pn.state.curdoc
+        if what:
+            self.say(f"{what} …", "busy")
+
+        def finished(future: Future[T]) -> None:
+            if document.session_context is not None and not document.session_context.destroyed:
+                document.add_next_tick_callback(lambda: self._show(future, then))
+
+        _THREADS.submit(job).add_done_callback(finished)
+
+    def _show(self, future: Future[T], then: Callable[[T], None]) -> None:
+        """Show what a thread has made, as one change of the page."""
+        with self.told():
+            try:
+                found = future.result()
+                if self.busy:
+                    self.say("")
+                then(found)
+            except Exception as error:
+                self.say(f"{type(error).__name__}: {error}", "error")
+                raise
+
+
+def table_of(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
+    """Write a table as HTML; its cells are text."""
+
+    def line(cells: tuple[str, ...], tag: str) -> str:
+        return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
+
+    top = f"<thead>{line(head, 'th')}</thead>" if head else ""
+    return f"<table>{top}<tbody>{''.join(line(row, 'td') for row in rows)}</tbody></table>"

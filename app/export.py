@@ -1,0 +1,152 @@
+"""Export: the figure, the table, and the command that does the same without the window."""
+
+from __future__ import annotations
+
+import io
+import json
+import shlex
+from typing import Any, get_args
+
+import panel as pn
+
+import iscat_analysis as ia
+from iscat_analysis.config import config_to_toml
+from iscat_analysis.movie.addresses import path_beside
+from iscat_analysis.report.gates import PALETTES, Format, figure_bytes, histogram_figure
+from iscat_app.chosen import Chosen, Notice
+from iscat_app.results import Results
+
+
+class Export:
+    """Everything that leaves the window."""
+
+    title = "Export"
+
+    def __init__(self, chosen: Chosen, results: Results) -> None:
+        self._chosen, self._results = chosen, results
+        self._notice = Notice()
+        self._width = pn.widgets.FloatInput(
+            label="Width [cm]", value=12.0, start=3, end=60, width=100
+        )
+        self._height = pn.widgets.FloatInput(
+            label="Height [cm]", value=8.0, start=3, end=60, width=100
+        )
+        self._font = pn.widgets.FloatInput(label="Font [pt]", value=9.0, start=4, end=40, width=100)
+        self._palette = pn.widgets.Select(label="Colours", options=[*PALETTES], width=180)
+        self._density = pn.widgets.Checkbox(label="with the kernel density", value=True)
+        self._preview = pn.pane.PNG(None, width=560, alt_text="preview of the figure")
+        self._command = pn.pane.Str("", sizing_mode="stretch_width")
+        for widget in (self._width, self._height, self._font, self._palette, self._density):
+            widget.param.watch(lambda _: self._draw(), "value")
+        buttons = [
+            self._download(f"Figure as {kind.upper()}", lambda kind=kind: self._figure(kind), kind)
+            for kind in get_args(Format)
+        ]
+        buttons += [
+            self._download("Events as CSV", self._csv, "csv"),
+            self._download("Gates as CSV", self._gates, "gates.csv"),
+            self._download("Configuration as TOML", self._toml, "toml"),
+            self._download("Notebook", self._notebook, "ipynb"),
+        ]
+        self._buttons = buttons
+        self.body = pn.Column(
+            self._notice.pane,
+            pn.Row(self._width, self._height, self._font, self._palette, self._density),
+            pn.FlexBox(self._preview, pn.Column(*buttons)),
+            "### The same without the window",
+            self._command,
+        )
+
+    def _download(self, name: str, make: Any, ending: str) -> Any:
+        def named() -> Any:
+            return make()
+
+        return pn.widgets.FileDownload(
+            callback=named, filename=f"histogram.{ending}", label=name, width=240,
+        )  # fmt: skip
+
+    def refresh(self) -> None:
+        """Show what would be exported."""
+        self._results.refresh()
+        result = self._results.result
+        for button in self._buttons:
+            button.disabled = result is None
+            if result is not None:
+                button.filename = f"{result.folder.stem}.{button.filename.partition('.')[2]}"
+        if result is None:
+            self._notice.say("There is no result yet: analyse the movie under Run.")
+            self._preview.object, self._command.object = None, ""
+            return
+        self._notice.say("")
+        self._draw()
+        self._command.object = self._commands()
+
+    def _draw(self) -> None:
+        with self._notice.told():
+            self._preview.object = self._figure("png").getvalue()
+
+    def _figure(self, kind: Format) -> io.BytesIO:
+        results = self._results
+        if results.histogram is None or results.result is None:
+            raise ia.DataError("there is no histogram yet")
+        drawn = histogram_figure(
+            [(results.result.folder.stem, results.histogram)], width_cm=self._width.value,
+            height_cm=self._height.value, font_pt=self._font.value, palette=self._palette.value,
+            gates=results.gates, curve=results.species_curve(), density=self._density.value,
+        )  # fmt: skip
+        return io.BytesIO(figure_bytes(drawn, kind))
+
+    def _csv(self) -> io.BytesIO:
+        """Write all events; those that were rejected say so."""
+        table = self._results.table
+        marked = table.assign(rejected_by_hand=table["event"].isin(self._results.rejected))
+        return io.BytesIO(marked.to_csv(index=False).encode())
+
+    def _gates(self) -> io.BytesIO:
+        import pandas as pd
+
+        from iscat_analysis.answers.gates import gate_rows
+
+        return io.BytesIO(pd.DataFrame(gate_rows(self._results.gates)).to_csv(index=False).encode())
+
+    def _toml(self) -> io.BytesIO:
+        result = self._results.result
+        text = config_to_toml(result.config) if result is not None else ""
+        return io.BytesIO(text.encode())
+
+    def _commands(self) -> str:
+        result = self._results.result
+        if result is None:
+            return ""
+        folder, movie = result.folder, self._chosen.movie
+        lines = []
+        if movie is not None:
+            again = [str(folder / "config.toml"), "--out", f"{folder.stem}-again.iscat"]
+            lines.append(shlex.join(["iscat-fit", str(movie), "--config", *again]))
+        lines.append(shlex.join(["iscat", "species", str(folder)]))
+        rejected = self._results.rejected
+        if rejected and self._results.rejections is not None:
+            lines.append(f"# {len(rejected)} events were rejected by hand: "
+                         f"{self._results.rejections.path}")  # fmt: skip
+        return "\n".join(lines)
+
+    def _notebook(self) -> io.BytesIO:
+        result = self._results.result
+        if result is None:
+            raise ia.DataError("there is no result yet")
+        movie = self._chosen.movie or path_beside(result.folder, ".tif")
+        code = [
+            "import iscat_analysis as ia",
+            f"found = ia.fit_movie({str(movie)!r}, config={str(result.folder / 'config.toml')!r})",
+            f"rejected = {sorted(self._results.rejected)!r}  # by hand",
+            "kept = found.table[found.table['status'] == 'ok']",
+            "kept = kept[~kept['event'].isin(rejected)]",
+            "ia.find_species(kept).species",
+        ]
+        cells: list[dict[str, Any]] = [
+            {"cell_type": "code", "execution_count": None, "metadata": {}, "outputs": [],
+             "id": f"cell-{number}", "source": line}
+            for number, line in enumerate(code)
+        ]  # fmt: skip
+        book = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
+        return io.BytesIO(json.dumps(book, indent=1).encode())

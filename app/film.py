@@ -1,0 +1,448 @@
+"""Look: the raw and the ratiometric film, with what was found, and the light below."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import panel as pn
+from bokeh.models import BoxSelectTool, ColumnDataSource, CustomJS, LinearAxis, Range1d, Spinner
+from bokeh.plotting import figure
+
+import iscat_analysis as ia
+from iscat_analysis.pipeline.ratio_film import RatioFilm
+from iscat_app.chosen import Chosen, Notice
+
+RATES = (5, 10, 25, 50, 100, 250, 1000)
+"""Frames of the movie per second."""
+
+AHEAD = 2
+"""Pictures on their way to the browser at most."""
+
+SLIDER_S = 0.25
+"""After which the slider of frames follows the film, as it plays."""
+
+SHOWN = 12
+"""Frames around its own in which an event of a landing movie is ringed."""
+
+FIRST_WINDOW = 25
+"""Frames of the window before anyone has chosen."""
+
+_LANDS, _LEAVES, _DOUBTFUL, _HERE = "#56B4E9", "#CC79A7", "#E69F00", "#F0E442"
+_SIDE_PX = 560
+_GREYS = (0xFF000000 + 0x010101 * np.arange(256)).astype(np.uint32)  # opaque
+_RATIO, _RAW = "ratiometric", "raw"
+
+
+class Film:
+    """Plays a movie; the frames are read as they are shown."""
+
+    title = "Look"
+
+    def __init__(self, chosen: Chosen) -> None:
+        self._chosen = chosen
+        self._film: RatioFilm | None = None
+        self._shown: tuple[Any, ...] = ()
+        self._preview: ia.Preview | None = None
+        self._events = pd.DataFrame()
+        self._um = 1.0
+        self._limits = (0.0, 1.0)
+        self._sent = 0  # pictures
+        self._at = 0  # the frame that is shown
+        self._next = 0.0  # where the film is, as it plays
+        self._ticked = self._slid = 0.0
+        self._by_player = False
+        self._due = False  # whether a step of the player is to come
+        self._notice = Notice()
+        self._make_figures()
+        self._make_widgets()
+
+    # ---- what there is to see ---------------------------------------------------------------
+
+    def _make_figures(self) -> None:
+        self._picture = ColumnDataSource({"image": [np.zeros((2, 2), np.uint32)], "sent": [0],
+                                          "dw": [1.0], "dh": [1.0]})  # fmt: skip
+        self._rings = ColumnDataSource({"x": [], "y": [], "colour": [], "text": []})
+        self._x, self._y = Range1d(0, 1), Range1d(1, 0)
+        self._figure = figure(
+            width=_SIDE_PX + 60, height=_SIDE_PX + 40, x_range=self._x, y_range=self._y,
+            tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom",
+            output_backend="canvas", toolbar_location="right",
+        )  # fmt: skip
+        self._figure.grid.visible = False
+        # Coloured here, which is a tenth of the work that it is in the browser.
+        self._figure.image_rgba(image="image", x=0, y=0, dw="dw", dh="dh", source=self._picture)
+        self._figure.scatter(
+            "x", "y", source=self._rings, marker="circle", size=22, line_color="colour",
+            line_width=2, fill_color=None,
+        )  # fmt: skip
+        self._figure.text(
+            "x", "y", text="text", source=self._rings, text_color="colour", text_font_size="11px",
+            x_offset=12, y_offset=-8,
+        )  # fmt: skip
+        self._bar = ColumnDataSource({"x": [], "y": [], "text": []})
+        self._figure.line("x", "y", source=self._bar, line_width=5, color=_HERE)
+        self._figure.text(
+            "x", "y", text="text", source=self._bar, text_color=_HERE, y_offset=-6,
+            text_font_size="12px",
+        )  # fmt: skip
+        # The browser says which picture it has drawn, and only then the next one is sent.
+        self._drawn = Spinner(value=0, visible=False, title="pictures drawn")
+        self._picture.js_on_change(
+            "data",
+            CustomJS(
+                args={"drawn": self._drawn, "picture": self._picture},
+                code="requestAnimationFrame(() => { drawn.value = picture.data.sent[0] })",
+            ),
+        )
+        self._drawn.on_change("value", self._browser_has_drawn)
+
+        self._trace = ColumnDataSource({"frame": [], "light": [], "noise": []})
+        self._light = figure(
+            width=_SIDE_PX + 60, height=170, tools="reset", x_axis_label="frame",
+            y_axis_label="light [counts]", toolbar_location=None, x_range=Range1d(0, 1),
+            y_range=Range1d(0, 1),
+        )  # fmt: skip
+        self._light.line("frame", "light", source=self._trace, color="#0072B2")
+        self._light.extra_y_ranges = {"noise": Range1d(0, 1)}
+        self._light.add_layout(LinearAxis(y_range_name="noise", axis_label="noise"), "right")
+        self._light.line(
+            "frame", "noise", source=self._trace, color="#D55E00", y_range_name="noise"
+        )
+        marks = self._light.scatter("frame", "light", source=self._trace, size=3, alpha=0)
+        self._light.add_tools(BoxSelectTool(dimensions="width", renderers=[marks]))
+
+    def _make_widgets(self) -> None:
+        self.play = pn.widgets.Toggle(label="▶ Play", width=90)
+        self.frame = pn.widgets.IntSlider(label="Frame", start=0, end=1, width=470)
+        self.rate = pn.widgets.Select(
+            label="Frames per second", options=list(RATES), value=25, width=130
+        )
+        self.kind = pn.widgets.RadioButtonGroup(options=[_RATIO, _RAW], value=_RATIO)
+        self.window = pn.widgets.IntSlider(label="Window [frames]", start=1, end=2, width=300)
+        self.contrast = pn.widgets.RangeSlider(
+            label="Black and white at", start=0, end=1, value=(0, 1), step=0.01, width=300
+        )
+        self.search = pn.widgets.Checkbox(label="Mark what the search sees in this frame")
+        self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
+        self.span = pn.widgets.StaticText(label="Frames marked in the light", value="all")
+        self.use_span = pn.widgets.Button(label="Analyse only these frames", disabled=True)
+        self.facts = pn.pane.HTML("", width=320)
+        self.play.param.watch(self._play, "value")
+        self.frame.param.watch(self._frame_moved, "value")
+        self.kind.param.watch(self._kind_changed, "value")
+        self.window.param.watch(self._window_changed, "value_throttled")
+        self.contrast.param.watch(self._contrast_changed, "value")
+        self.search.param.watch(self._search_changed, "value")
+        self.events.param.watch(lambda _: self._ring(), "value")
+        self._trace.selected.on_change("indices", self._marked)
+        self.use_span.on_click(self._keep_span)
+        self.body = pn.Column(
+            self._notice.pane,
+            pn.FlexBox(
+                pn.Column(
+                    pn.Row(self.play, self.frame),
+                    pn.pane.Bokeh(self._figure),
+                    pn.pane.Bokeh(self._light),
+                ),
+                pn.Column(
+                    self.kind, self.rate, self.window, self.contrast, self.events, self.search,
+                    self.facts, self.span, self.use_span, pn.pane.Bokeh(self._drawn), width=340,
+                ),
+            ),
+        )  # fmt: skip
+
+    # ---- the movie --------------------------------------------------------------------------
+
+    def refresh(self) -> None:
+        """Open the movie that is chosen, if it is not open."""
+        now = self._chosen.movie, self._chosen.result, self._chosen.changed
+        if now == self._shown:
+            self._go_to_event()
+            return
+        self._shown = now
+        self.play.value = False
+        self._close()
+        if self._chosen.movie is None:
+            self._notice.say("Choose a movie under Open.")
+            return
+        self._notice.say("")
+        with self._notice.told():
+            self._open()
+            self._go_to_event()
+
+    def _go_to_event(self) -> None:
+        """Show the frame of the event that was looked at under Results."""
+        if self._film is not None and self._chosen.frame is not None:
+            self.frame.value = min(self._chosen.frame, self.frame.end)
+            self._chosen.frame = None
+
+    def _close(self) -> None:
+        if self._film is not None:
+            self._film.movie.close()
+        self._film, self._preview, self._events = None, None, pd.DataFrame()
+
+    def _open(self) -> None:
+        stack = ia.open_stack(self._chosen.movie)
+        try:
+            config = ia.configure(self._chosen.config)
+            pixel_nm = config.camera.pixel_size_nm or stack.metadata.pixel_size_nm
+            offset: float | str | None = config.camera.offset_adu
+            if isinstance(offset, str):  # measured, or a map
+                offset = stack.metadata.offset_adu
+            self._film = RatioFilm(stack, offset_adu=offset or 0.0)
+            self._film.window = min(FIRST_WINDOW, self._film.longest)
+        except ia.IscatError:
+            stack.close()
+            raise
+        if offset is None:
+            self._notice.say(
+                "The offset of the camera is not known yet and is taken as 0, so that contrasts "
+                "come out too small; marking what the search sees measures it."
+            )
+        if self._chosen.result is not None:
+            with self._notice.told(), ia.open_result(self._chosen.result) as result:
+                self._events = result.table
+        self._um = (pixel_nm or 1000.0) / 1000.0
+        frames, rows, columns = stack.shape
+        unit = "µm" if pixel_nm else "pixels"
+        self._figure.xaxis.axis_label = self._figure.yaxis.axis_label = unit
+        width, height = columns * self._um, rows * self._um
+        self._x.update(start=0, end=width, reset_start=0, reset_end=width)
+        self._y.update(start=height, end=0, reset_start=height, reset_end=0)
+        side = _SIDE_PX / max(rows, columns)
+        self._figure.update(width=round(columns * side) + 80, height=round(rows * side) + 50)
+        self._bar.data = _bar_of(width, height) if pixel_nm else {"x": [], "y": [], "text": []}
+        self.window.param.update(end=max(self._film.longest, 2), value=self._film.window)
+        self.frame.param.update(end=frames - 1)
+        self._fit_limits()
+        self._shown_by_player(self._film.frames[0])
+        self._show()
+        light = self._film.light()
+        self._trace.data = {name: light[name].to_numpy() for name in light}
+        self._light.x_range.update(start=0, end=frames)
+        self._light.y_range.update(**_around(light["light"]))
+        self._light.extra_y_ranges["noise"].update(**_around(light["noise"]))
+
+    # ---- playing ----------------------------------------------------------------------------
+
+    def _play(self, event: Any) -> None:
+        self.play.label = "⏸ Pause" if event.new else "▶ Play"
+        if event.new and self._film is None:
+            self.play.value = False
+        elif event.new:
+            self._next, self._ticked = float(self.frame.value), time.monotonic()
+            self._soon()
+        elif self._film is not None:
+            self._shown_by_player(self.frame.value)
+
+    def _soon(self) -> None:
+        """Show the next frame when it is time for it."""
+        document = pn.state.curdoc
+        if document is not None and not self._due and self._sent - self._drawn.value < AHEAD:
+            self._due = True
+            left = 1.0 / self.rate.value - (time.monotonic() - self._ticked)
+            document.add_timeout_callback(self._step, max(1, round(1000 * left)))
+
+    def _step(self) -> None:
+        """Show the frame that it is time for; where the browser is slow, some are left out."""
+        self._due = False
+        if self._film is None or not self.play.value:
+            return
+        now = time.monotonic()
+        self._next += max((now - self._ticked) * self.rate.value, 1.0)
+        self._ticked = now
+        first, stop = self._film.frames if self.kind.value == _RATIO else (0, self.frame.end + 1)
+        if not first <= self._next < stop:
+            self._next = float(first)
+        self._at = math.floor(self._next)
+        if now - self._slid > SLIDER_S:
+            self._slid = now
+            self._shown_by_player(self._at)
+        self._show()
+        self._soon()
+
+    def _shown_by_player(self, frame: int) -> None:
+        self._by_player = True
+        self.frame.value = self._at = frame
+        self._by_player = False
+
+    def _browser_has_drawn(self, attr: str, old: Any, new: Any) -> None:
+        del attr, old, new
+        if self.play.value:
+            self._soon()
+
+    def _frame_moved(self, _: Any) -> None:
+        if not self._by_player:
+            self._at = self.frame.value
+            self._next = float(self._at)
+            self._show()
+            if self.search.value:
+                self._look()
+
+    def _kind_changed(self, _: Any) -> None:
+        if self._film is not None:
+            self._fit_limits()
+            self._show()
+
+    def _window_changed(self, event: Any) -> None:
+        if self._film is not None:
+            with self._notice.told():
+                self._film.window = event.new
+                self._fit_limits()
+                self._show()
+                if self.search.value:
+                    self._look()
+
+    def _fit_limits(self) -> None:
+        if self._film is None:
+            return
+        low, high = self._film.limits(ratio=self.kind.value == _RATIO)
+        span = high - low
+        self._limits = low, high
+        unit = 100.0 if self.kind.value == _RATIO else 1.0
+        digits = max(0, 2 - math.floor(math.log10(unit * span)))
+        self.contrast.param.update(
+            label="Black and white at " + ("[%]" if unit > 1 else "[counts]"),
+            start=round(unit * (low - span), digits), end=round(unit * (high + span), digits),
+            step=10.0**-digits, value=(round(unit * low, digits), round(unit * high, digits)),
+        )  # fmt: skip
+
+    def _contrast_changed(self, event: Any) -> None:
+        unit = 100.0 if self.kind.value == _RATIO else 1.0
+        low, high = (value / unit for value in event.new)
+        if high > low and (low, high) != self._limits:
+            self._limits = low, high
+            self._show()
+
+    def _show(self) -> None:
+        """Send the picture of the frame to the browser."""
+        film = self._film
+        if film is None:
+            return
+        with self._notice.told():
+            at = self._at
+            image = film.contrast(at) if self.kind.value == _RATIO else film.raw(at)
+            low, high = self._limits
+            scaled = np.clip((image - low) * (255.0 / (high - low)), 0, 255)
+            rows, columns = image.shape
+            self._sent += 1
+            self._picture.data = {
+                "image": [_GREYS[np.nan_to_num(scaled).astype(np.uint8)]],
+                "sent": [self._sent],
+                "dw": [columns * self._um],
+                "dh": [rows * self._um],
+            }
+            self._ring()
+
+    # ---- what was found ---------------------------------------------------------------------
+
+    def _ring(self) -> None:
+        """Ring what landed or left about this frame."""
+        rings: list[tuple[float, float, str, str]] = []
+        at = self._at
+        if self.events.value and len(self._events):
+            near = self._events[
+                (self._events["frame"] - at).abs().le(SHOWN) & self._events["x_px"].notna()
+            ]
+            for row in near.to_dict("records"):
+                ok = row["status"] == "ok"
+                colour = _DOUBTFUL if not ok else _LANDS if row["mass_kda"] > 0 else _LEAVES
+                rings.append((row["x_px"], row["y_px"], colour, f"{row['mass_kda']:.0f}"))
+        if self.search.value and self._found_at == at:
+            for row in self._found.to_dict("records"):
+                rings.append((row["x_px"], row["y_px"], _HERE, f"{row['snr']:.1f} σ"))
+        data = {
+            "x": [(x + 0.5) * self._um for x, *_ in rings],
+            "y": [(y + 0.5) * self._um for _, y, *_ in rings],
+            "colour": [ring[2] for ring in rings],
+            "text": [ring[3] for ring in rings],
+        }
+        if data != self._rings.data:
+            self._rings.data = data
+
+    _found_at = -1
+    _found = pd.DataFrame()
+
+    def _search_changed(self, event: Any) -> None:
+        if not event.new:
+            self._ring()
+        elif self._film is None:
+            self.search.value = False
+        elif self._preview is not None:
+            self._look()
+        else:
+            movie, config = self._film.movie, self._chosen.config
+            self._notice.work(
+                "Measuring camera and noise",
+                lambda: ia.Preview(movie, ia.configure(config)),
+                self._take_preview,
+            )
+
+    def _take_preview(self, made: ia.Preview) -> None:
+        """Look as the search does: with its window, and over the offset that it found."""
+        if self._film is None or made.steady.path != self._film.movie.path:
+            return  # another movie was chosen meanwhile
+        self._preview = made
+        offset = made.camera.numbers["offset_adu"].value
+        if isinstance(offset, (int, float)):
+            self._film.offset_adu = float(offset)
+        self._film.window = min(max(made.window, 1), self._film.longest)
+        self.window.value = self._film.window
+        self._fit_limits()
+        self._show()
+        self._look()
+
+    def _look(self) -> None:
+        """Search the windows around the frame that is shown."""
+        preview, at = self._preview, self._at
+        if preview is not None and not self.play.value:
+            window = min(self.window.value, preview.longest)
+            self._notice.work(
+                "", lambda: preview.look(at, window), lambda look: self._mark(look, at, window)
+            )
+
+    def _mark(self, look: ia.Look, at: int, window: int) -> None:
+        if at != self._at:
+            return
+        self._found, self._found_at = look.found(), at
+        self.facts.object = (
+            f"<p>{len(self._found)} above {look.threshold:.2f} times the noise, with windows of "
+            f"{window} frames</p>"
+        )
+        self._ring()
+
+    # ---- frames to analyse ------------------------------------------------------------------
+
+    def _marked(self, attr: str, old: Any, new: list[int]) -> None:
+        del attr, old
+        frames = np.asarray(self._trace.data["frame"])[new] if new else np.array([])
+        self.use_span.disabled = not len(frames)
+        self.span.value = f"{frames.min()} to {frames.max()}" if len(frames) else "all"
+
+    def _keep_span(self, _: Any) -> None:
+        first, last = (int(text) for text in self.span.value.split(" to "))
+        self._chosen.span = (first, last + 1)
+        self._notice.say(
+            f"fit.frames = [{first}, {last + 1}] goes into the form: save it under Set up."
+        )
+
+
+def _bar_of(width_um: float, height_um: float) -> dict[str, list[Any]]:
+    """Give a scale bar of a round length, a fifth of the width or less."""
+    wanted = width_um / 5
+    power = 10.0 ** math.floor(math.log10(wanted))
+    length = max(step * power for step in (1, 2, 5) if step * power <= wanted)
+    x, y = 0.04 * width_um, 0.96 * height_um
+    return {"x": [x, x + length], "y": [y, y], "text": [f"{length:g} µm", ""]}
+
+
+def _around(values: pd.Series) -> dict[str, float]:
+    """Give an axis from a little below the values to a little above."""
+    seen = values[np.isfinite(values)]
+    low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0)
+    room = 0.15 * (high - low) or 0.05 * abs(high) or 1.0
+    return {"start": low - room, "end": high + room}

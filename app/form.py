@@ -1,0 +1,284 @@
+"""Set up: a form made of the configuration's schema, which writes iscat.toml."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import panel as pn
+
+import iscat_analysis as ia
+from iscat_analysis.config import config_to_toml, parse_config, toml_value
+from iscat_analysis.files import whole_file
+from iscat_analysis.pipeline.setup import Setup, write_setup
+from iscat_app.chosen import Chosen, Notice
+
+FIRST = (
+    "camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind", "fit.mode",
+)  # fmt: skip
+"""What matters most, and is asked first."""
+
+_ELSEWHERE = ("simulation", "bounds")  # sections that no analysis of a movie reads
+_UNSET = "(default)"
+_UNITS = {
+    "nm": "nm", "kda": "kDa", "deg": "°", "e": "photoelectrons", "ms": "ms", "hz": "Hz",
+    "frames": "frames", "adu": "counts", "mb": "MB", "c": "°C", "s": "mPa·s",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Field:
+    """One key of the configuration, as its schema has it."""
+
+    key: str
+    help: str
+    default: Any
+    choices: tuple[Any, ...]
+
+    @property
+    def label(self) -> str:
+        """The key with its unit."""
+        name = self.key.rpartition(".")[2]
+        unit = _UNITS.get(name.rpartition("_")[2], "")
+        return f"{self.key}{f' [{unit}]' if unit and '_' in name else ''}"
+
+
+def fields() -> list[Field]:
+    """Read the keys out of the JSON schema of the configuration."""
+    whole = ia.Config.model_json_schema()
+    found = []
+    for section, reference in whole["properties"].items():
+        if section in _ELSEWHERE:
+            continue
+        for name, said in _resolved(reference, whole).get("properties", {}).items():
+            choices = _choices(_resolved(said, whole))
+            found.append(
+                Field(
+                    f"{section}.{name}", said.get("description", ""), said.get("default"), choices
+                )
+            )
+    return found
+
+
+def _resolved(said: Mapping[str, Any], whole: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Follow a reference into the schema's definitions."""
+    for each in (said, *said.get("anyOf", ())):
+        if "$ref" in each:
+            found: Mapping[str, Any] = whole["$defs"][each["$ref"].rpartition("/")[2]]
+            return found
+    return said
+
+
+def _choices(said: Mapping[str, Any]) -> tuple[Any, ...]:
+    """Give the values that a key may have, where these are few."""
+    kinds = [each for each in said.get("anyOf", [said]) if each.get("type") != "null"]
+    found: list[Any] = []
+    for kind in kinds:
+        if "enum" in kind:
+            found += kind["enum"]
+        elif "const" in kind:
+            found.append(kind["const"])
+        elif kind.get("type") == "boolean":
+            found += [True, False]
+        else:
+            return ()
+    return tuple(found)
+
+
+def read_texts(path: Path | None) -> dict[str, str]:
+    """Read a configuration file as texts by key."""
+    if path is None:
+        return {}
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, OSError) as error:
+        raise ia.ConfigError(f"{path}: cannot be read ({error})") from None
+    return {
+        f"{section}.{name}": toml_text(value)
+        for section, table in values.items()
+        if isinstance(table, dict)
+        for name, value in table.items()
+    }
+
+
+def toml_text(value: Any) -> str:
+    """Write what tomllib has read."""
+    return toml_value(tuple(value) if isinstance(value, list) else value)
+
+
+def write_texts(path: Path, texts: Mapping[str, str]) -> ia.Config:
+    """Check texts by key, and write them as a configuration file."""
+    tables: dict[str, list[str]] = {}
+    for key, text in texts.items():
+        section, _, name = key.partition(".")
+        tables.setdefault(section, []).append(f"{name} = {_as_toml(text)}")
+    written = "# Written by `iscat app`; `iscat config` prints every key there is.\n"
+    for section, lines in tables.items():
+        written += f"\n[{section}]\n" + "\n".join(lines) + "\n"
+    checked = parse_config(tomllib.loads(written), where=str(path))
+    with whole_file(path) as partial:
+        partial.write_text(written, encoding="utf-8")
+    return checked
+
+
+def _plain(text: str) -> str:
+    """Take the quotes off a text."""
+    return str(tomllib.loads(f"value = {text}")["value"]) if text.startswith('"') else text
+
+
+def _as_toml(text: str) -> str:
+    """Put quotes around what is a text and has none."""
+    try:
+        tomllib.loads(f"value = {text}")
+    except tomllib.TOMLDecodeError:
+        return toml_value(text.strip())
+    return text.strip()
+
+
+class Form:
+    """The form, for the movie that is chosen."""
+
+    title = "Set up"
+
+    def __init__(self, chosen: Chosen) -> None:
+        self._chosen = chosen
+        self._notice = Notice()
+        self._widgets: dict[str, Any] = {}
+        self._shown: tuple[Any, ...] | None = None
+        self._first = pn.Column()
+        self._rest = pn.Accordion(sizing_mode="stretch_width")
+        self._written = pn.pane.Str("", sizing_mode="stretch_width")
+        propose = pn.widgets.Button(label="Propose from the movie", width=190)
+        save = pn.widgets.Button(label="Save iscat.toml", color="primary", width=150)
+        propose.on_click(self._propose)
+        save.on_click(self._save)
+        self.body = pn.Column(
+            self._notice.pane,
+            pn.FlexBox(
+                pn.Column("### What matters most", self._first, pn.Row(save, propose), width=420),
+                pn.Column("### Everything else", self._rest, width=520),
+                pn.Column("### The file", self._written, width=420),
+            ),
+        )  # fmt: skip
+
+    def refresh(self) -> None:
+        """Show the configuration of the movie that is chosen."""
+        if not self._widgets:
+            self._make_widgets()
+        now = self._chosen.movie, self._chosen.changed
+        if now != self._shown:
+            self._shown = now
+            with self._notice.told():
+                texts = read_texts(self._chosen.config)
+                for key, widget in self._widgets.items():
+                    unset = _UNSET if isinstance(widget, pn.widgets.Select) else ""
+                    widget.value = _plain(texts.get(key, unset))
+            self._show_file()
+        if self._chosen.span is not None:
+            first, last = self._chosen.span
+            self._widgets["fit.frames"].value = f"[{first}, {last}]"
+
+    def _make_widgets(self) -> None:
+        sections: dict[str, list[Any]] = {}
+        for field in fields():
+            widget = _widget_of(field)
+            self._widgets[field.key] = widget
+            shown = pn.Column(widget, pn.pane.HTML(_help(field), width=400))
+            if field.key not in FIRST:
+                sections.setdefault(field.key.partition(".")[0], []).append(shown)
+        for key in FIRST:
+            self._first.append(self._widgets[key])
+        self._rest.extend([(name, pn.Column(*parts)) for name, parts in sections.items()])
+
+    def _texts(self) -> dict[str, str]:
+        texts = {}
+        for key, widget in self._widgets.items():
+            text = str(widget.value).strip()
+            if text and text != _UNSET:
+                texts[key] = text
+        return texts
+
+    def _others(self) -> dict[str, str]:
+        """Give what is in the file and not in the form, which stays as it is."""
+        texts = read_texts(self._chosen.config)
+        return {key: text for key, text in texts.items() if key not in self._widgets}
+
+    def _save(self, _: Any) -> None:
+        path = self._chosen.setup
+        if path is None:
+            self._notice.say("Choose a movie under Open.", "error")
+            return
+        with self._notice.told():
+            config = write_texts(path, self._texts() | self._others())
+            self._chosen.span = None
+            self._chosen.changed += 1
+            self._notice.say(f"saved as {path}: mode {config.fit.mode}")
+            self._show_file()
+
+    def _propose(self, _: Any) -> None:
+        """Fill the form as `iscat init` would, with what the file and its noise say."""
+        movie, path = self._chosen.movie, self._chosen.setup
+        if movie is None or path is None:
+            self._notice.say("Choose a movie under Open.", "error")
+            return
+        texts = self._texts()
+        answers = {
+            key: _number(texts[key]) for key in FIRST if key in texts and key != "fit.mode"
+        }  # fmt: skip
+        self._notice.work(
+            "Looking at the movie",
+            lambda: write_setup(movie, answers=answers, out=path, overwrite=True),
+            self._proposed,
+        )
+
+    def _proposed(self, found: Setup) -> None:
+        self._chosen.changed += 1
+        self._shown = None
+        self.refresh()
+        self._notice.say(f"saved as {found.out}; every value has its origin beside it")
+
+    def _show_file(self) -> None:
+        config = self._chosen.config
+        self._written.object = config.read_text("utf-8") if config else "none yet"
+
+
+def _widget_of(field: Field) -> Any:
+    """Make the widget of a key; what is left empty has its default."""
+    if field.choices:
+        texts = [str(c).lower() if isinstance(c, bool) else str(c) for c in field.choices]
+        return pn.widgets.Select(label=field.label, options=[_UNSET, *texts], width=380)
+    default = "" if field.default is None else _default(field.default)
+    return pn.widgets.TextInput(label=field.label, placeholder=default, width=380)
+
+
+def _default(value: Any) -> str:
+    return "" if isinstance(value, dict) else f"default {value}"
+
+
+def _help(field: Field) -> str:
+    import html
+
+    return f"<small>{html.escape(field.help)}</small>"
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def add_table(path: Path, section: str, toml: str) -> None:
+    """Put a section, as a calibration writes it, into a configuration file in place of its own."""
+    texts = read_texts(path if path.is_file() else None)
+    kept = {key: text for key, text in texts.items() if not key.startswith(f"{section}.")}
+    new = tomllib.loads(toml)[section]
+    write_texts(path, kept | {f"{section}.{name}": toml_text(v) for name, v in new.items()})
+
+
+def whole_toml(path: Path | None) -> str:
+    """Write the complete configuration that a file stands for."""
+    return config_to_toml(ia.load_config(path))

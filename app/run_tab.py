@@ -1,0 +1,145 @@
+"""Run: the queue, what it says, and what can be done about it."""
+
+from __future__ import annotations
+
+import html
+from typing import Any
+
+import panel as pn
+
+from iscat_analysis.movie.addresses import path_beside
+from iscat_app.chosen import Chosen, Notice
+from iscat_app.files import listed
+from iscat_app.runs import Queue, Run
+
+LOOK_MS = 500
+"""Between two looks at the queue."""
+
+
+class RunTab:
+    """Shows the queue, which belongs to all pages."""
+
+    title = "Run"
+
+    def __init__(self, chosen: Chosen, queue: Queue) -> None:
+        self._chosen, self._queue = chosen, queue
+        self._version, self._ended = -1, set[int]()
+        self._notice = Notice()
+        self._overwrite = pn.widgets.Checkbox(label="Replace an earlier result")
+        self._scheduler = pn.widgets.TextInput(
+            label="Where: threads, or the address of a Dask scheduler", value="threads", width=330
+        )
+        start = pn.widgets.Button(label="Analyse this movie", color="primary", width=170)
+        every = pn.widgets.Button(label="Analyse all movies of the folder", width=240)
+        self._which = pn.widgets.Select(label="Run", options=[], width=420)
+        stop = pn.widgets.Button(label="Stop", width=90)
+        again = pn.widgets.Button(label="Go on or try again", width=160)
+        start.on_click(self._start)
+        every.on_click(self._start_all)
+        stop.on_click(lambda _: self._do(self._queue.stop))
+        again.on_click(lambda _: self._do(self._queue.again))
+        self._which.param.watch(lambda _: self._show(), "value")
+        self._bar = pn.indicators.Progress(value=0, max=100, width=420)
+        self._state = pn.pane.HTML("")
+        self._log = pn.pane.Str("", sizing_mode="stretch_width")
+        self.body = pn.Column(
+            self._notice.pane,
+            pn.Row(start, every),
+            pn.Row(self._overwrite, self._scheduler),
+            pn.Row(self._which, stop, again),
+            self._bar,
+            self._state,
+            self._log,
+            sizing_mode="stretch_width",
+        )
+
+    def watch(self) -> None:
+        """Look at the queue now and then, whichever tab is open."""
+        self._ended = {run.number for run in self._queue.runs if run.ended}
+        pn.state.add_periodic_callback(self._look, period=LOOK_MS)
+
+    def refresh(self) -> None:
+        """Show the queue as it is."""
+        self._version = -1
+        self._look()
+
+    def _look(self) -> None:
+        running = any(run.state == "running" for run in self._queue.runs)
+        if self._version == self._queue.version and not running:
+            return
+        self._version = self._queue.version
+        options = {f"{r.number}: {r.movie.name}, {r.state}": r.number for r in self._queue.runs}
+        if options != self._which.options:
+            is_new = len(options) != len(self._which.options)
+            value = self._queue.runs[-1].number if is_new else self._which.value
+            self._which.param.update(options=options, value=value)
+        self._show()
+        for run in self._queue.runs:
+            if run.ended and run.number not in self._ended:
+                self._ended.add(run.number)
+                if run.movie == self._chosen.movie:
+                    self._chosen.look_again()
+
+    def _chosen_run(self) -> Run | None:
+        return next((r for r in self._queue.runs if r.number == self._which.value), None)
+
+    def _show(self) -> None:
+        run = self._chosen_run()
+        if run is None:
+            self._state.object, self._log.object = "<p>Nothing was run yet.</p>", ""
+            self._bar.value = 0
+            return
+        share = 100 * run.done / run.total if run.total else 0
+        self._bar.value = 100 if run.state == "done" else int(share)
+        left = run.seconds_left
+        parts = [f"<b>{html.escape(run.movie.name)}</b>: {run.state}"]
+        if run.state in ("running", "stopping"):
+            parts.append(f"{run.stage or 'starting'} {run.done} of {run.total}")
+            parts += [] if left is None else [f"about {_time(left)} left in this stage"]
+        self._state.object = f"<p role='status'>{', '.join(parts)}</p>"
+        self._log.object = "\n".join([f"$ {run.command}", *run.log])
+
+    def _start(self, _: Any) -> None:
+        movie = self._chosen.movie
+        if movie is None:
+            self._notice.say("Choose a movie under Open.", "error")
+            return
+        self._notice.say("")
+        run = self._queue.add(
+            movie, self._chosen.config, path_beside(movie, ".iscat"),
+            overwrite=self._overwrite.value, scheduler=self._scheduler.value.strip() or "threads",
+        )  # fmt: skip
+        self.refresh()
+        self._which.value = run.number
+
+    def _start_all(self, _: Any) -> None:
+        """Put all movies of the folder into the queue, but those that have a result."""
+        movie = self._chosen.movie
+        if movie is None:
+            self._notice.say("Choose a movie of the folder under Open.", "error")
+            return
+        config = self._chosen.config
+        put = 0
+        for entry in listed(movie.parent):
+            if entry.kind == "movie":
+                out = path_beside(entry.path, ".iscat")
+                if self._overwrite.value or not (out / "summary.json").is_file():
+                    self._queue.add(
+                        entry.path, config, out, overwrite=self._overwrite.value,
+                        scheduler=self._scheduler.value.strip() or "threads",
+                    )  # fmt: skip
+                    put += 1
+        self._notice.say(f"{put} movies are in the queue; those with a result were left alone")
+        self.refresh()
+
+    def _do(self, what: Any) -> None:
+        run = self._chosen_run()
+        if run is not None:
+            made = what(run)
+            self.refresh()
+            if made is not None:
+                self._which.value = made.number
+
+
+def _time(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -1,0 +1,252 @@
+"""The queue of movies to be analysed, each in a process of its own, one after the other.
+
+It belongs to the server and not to a page, so that pages may be closed and opened as it works.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import signal
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from multiprocessing.resource_tracker import ensure_running
+from pathlib import Path
+from typing import Literal
+
+State = Literal["waiting", "running", "stopping", "done", "stopped", "failed"]
+
+LOG_LINES = 200
+"""Lines of a run that are kept."""
+
+CLOSING_S = 1.0
+"""That a run has to end by itself when the server ends; finished parts are on the disk by then."""
+
+
+@dataclass
+class Run:
+    """One movie that is, was or will be analysed."""
+
+    number: int
+    movie: Path
+    config: Path | None
+    out: Path
+    overwrite: bool = False
+    settings: Sequence[str] = ()
+    scheduler: str = "threads"
+    state: State = "waiting"
+    is_asked_to_stop: bool = False
+    stage: str = ""
+    done: int = 0
+    total: int = 0
+    stage_began: float = 0.0
+    log: list[str] = field(default_factory=list)
+
+    @property
+    def command(self) -> str:
+        """The command line that does the same."""
+        words = ["iscat-fit", str(self.movie)]
+        words += ["--config", str(self.config)] if self.config else []
+        words += [word for each in self.settings for word in ("--set", each)]
+        words += ["--scheduler", self.scheduler] if self.scheduler != "threads" else []
+        words += ["--out", str(self.out)]
+        return shlex.join([*words, *(["--overwrite"] if self.overwrite else [])])
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will happen."""
+        return self.state in ("done", "stopped", "failed")
+
+    @property
+    def seconds_left(self) -> float | None:
+        """How long the stage will take, judged by its pace."""
+        if self.state != "running" or not 0 < self.done < self.total:
+            return None
+        return (time.monotonic() - self.stage_began) * (self.total / self.done - 1)
+
+    def say(self, text: str) -> None:
+        """Keep a line for the log."""
+        self.log = [*self.log, text][-LOG_LINES:]
+
+
+class Queue:
+    """Runs, one after the other; whoever shows them looks at `version`."""
+
+    def __init__(self) -> None:
+        self.runs: list[Run] = []
+        self.version = 0
+        self._lock = threading.Lock()
+        self._process: BaseProcess | None = None
+        self._closed = False
+        self._wake = threading.Condition(self._lock)
+        threading.Thread(target=self._work, daemon=True, name="queue").start()
+
+    def add(
+        self,
+        movie: Path,
+        config: Path | None,
+        out: Path,
+        *,
+        overwrite: bool = False,
+        settings: Sequence[str] = (),
+        scheduler: str = "threads",
+    ) -> Run:
+        """Put a movie at the end; one that waits or runs already is not put twice."""
+        with self._wake:
+            for run in self.runs:
+                if run.out == out and not run.ended:
+                    return run
+            run = Run(len(self.runs) + 1, movie, config, out, overwrite, tuple(settings), scheduler)
+            self.runs.append(run)
+            self.version += 1
+            self._wake.notify_all()
+            return run
+
+    def stop(self, run: Run) -> None:
+        """Stop a run; what it has finished is kept, and `again` goes on from there."""
+        with self._wake:
+            if run.state == "waiting":
+                run.state = "stopped"
+            elif run.state == "running" and self._process is not None and self._process.pid:
+                run.state, run.is_asked_to_stop = "stopping", True
+                os.kill(self._process.pid, signal.SIGINT)
+            self.version += 1
+
+    def again(self, run: Run) -> Run:
+        """Go on with a run that was stopped, or repeat one that failed."""
+        return self.add(
+            run.movie, run.config, run.out, overwrite=run.overwrite, settings=run.settings,
+            scheduler=run.scheduler,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Stop what runs and begin nothing more."""
+        with self._wake:
+            self._closed = True
+            process = self._process
+            self._wake.notify_all()
+        if process is not None and process.is_alive() and process.pid:
+            os.kill(process.pid, signal.SIGINT)
+            process.join(CLOSING_S)
+            if process.is_alive():
+                process.terminate()
+
+    def _work(self) -> None:
+        while True:
+            with self._wake:
+                while not self._closed and not any(r.state == "waiting" for r in self.runs):
+                    self._wake.wait()
+                if self._closed:
+                    return
+                run = next(r for r in self.runs if r.state == "waiting")
+                run.state = "running"
+                self.version += 1
+                context = get_context("spawn")
+                here, there = context.Pipe(duplex=False)
+                self._process = context.Process(target=_analyse, args=(run_of(run), there))
+                with _interrupts_held():
+                    self._process.start()
+                there.close()
+            self._follow(run, here)
+            self._process.join()
+            with self._wake:
+                if not run.ended:  # it was ended from outside
+                    run.state = "stopped" if run.is_asked_to_stop else "failed"
+                    run.say("the process ended without a word; perhaps memory ran out")
+                self._process = None
+                self.version += 1
+
+    def _follow(self, run: Run, here: Connection) -> None:
+        """Take down what a process says until it has nothing more to say."""
+        while True:
+            try:
+                kind, *what = here.recv()
+            except (EOFError, OSError):
+                return
+            with self._lock:
+                if kind == "progress":
+                    stage, run.done, run.total = what
+                    if stage != run.stage:
+                        run.stage, run.stage_began = stage, time.monotonic()
+                elif kind == "note":
+                    run.say(*what)
+                else:
+                    run.state = kind
+                    for line in what:
+                        run.say(line)
+                self.version += 1
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Start a process that sees an interrupt only when it is ready to answer it."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    ensure_running()  # which would let interrupts through again
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+def run_of(run: Run) -> tuple[Path, Path | None, Path, bool, tuple[str, ...], str, str]:
+    """Give what a process needs to know of a run."""
+    return (
+        run.movie, run.config, run.out, run.overwrite, tuple(run.settings), run.scheduler,
+        run.command,
+    )  # fmt: skip
+
+
+def _analyse(
+    job: tuple[Path, Path | None, Path, bool, tuple[str, ...], str, str], to: Connection
+) -> None:
+    """Do one run, in a process of its own, and tell how far it is."""
+    movie, config, out, overwrite, settings, scheduler, command = job
+    said = 0.0
+    lock = threading.Lock()
+
+    def progress(stage: str, done: int, total: int) -> None:
+        nonlocal said
+        with lock:
+            if done in (0, total) or time.monotonic() - said > 0.2:
+                said = time.monotonic()
+                to.send(("progress", stage, done, total))
+
+    def notify(text: str) -> None:
+        with lock:
+            to.send(("note", text))
+
+    try:
+        from iscat_analysis.config import load_config
+        from iscat_analysis.errors import IscatError
+        from iscat_analysis.executors import open_executor
+        from iscat_analysis.pipeline import fit_stack
+
+        # An interrupt that came during these imports is raised here.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_SETMASK, ())
+        try:
+            resolved = load_config(config, settings)
+            with open_executor(
+                scheduler, None, shared=movie, workers=resolved.compute.workers
+            ) as executor:
+                analysis = fit_stack(
+                    movie, resolved, out=out, overwrite=overwrite, progress=progress,
+                    notify=notify, command=command, executor=executor,
+                )  # fmt: skip
+            to.send(("done", f"{len(analysis.table)} rows; results in {out}"))
+        except IscatError as error:
+            to.send(("failed", str(error)))
+        except (OSError, MemoryError) as error:
+            to.send(("failed", f"{type(error).__name__}: {error}"))
+    except KeyboardInterrupt as stop:
+        to.send(("stopped", str(stop) or "stopped; what was finished is kept"))

@@ -1,0 +1,174 @@
+"""The server: it listens to this machine alone, and to those who know the token."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+import socket
+import threading
+import traceback
+import webbrowser
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import panel as pn
+from bokeh.server.auth_provider import AuthProvider
+from tornado.iostream import StreamClosedError
+from tornado.web import RequestHandler
+from tornado.websocket import WebSocketClosedError
+
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_app.page import page_of
+from iscat_app.runs import Queue
+
+HOST = "127.0.0.1"
+FIRST_PORT, PORTS = 5006, 50
+"""Where a free port is looked for, if none is asked for."""
+
+_UNHEARD = (
+    "tornado.access",  # who was not let in
+    "bokeh.server.views.ws",  # that a page was closed
+    "tifffile",  # what is wrong with a file, which the page says in words
+)
+"""Logs that nobody needs to read."""
+
+_LOCKED = (
+    "<!doctype html><html lang=en><title>iSCAT analysis</title>"
+    "<p>This address needs the token: open the whole address that <code>iscat app</code> printed."
+)
+
+
+def serve(
+    folder: Path,
+    *,
+    port: int | None,
+    say: Callable[[str], None],
+    warn: Callable[[str], None],
+    debug: bool = False,
+) -> None:
+    """Show a folder in the browser until Ctrl-C.
+
+    `say` is told the address, and `warn` what went wrong, with `debug` with its traceback.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder}: is no folder; give the folder that holds the movies")
+    number = _free_port(port)
+    logging.basicConfig(level=logging.WARNING, handlers=[_Log(warn, debug=debug)], force=True)
+    token = secrets.token_urlsafe(24)
+    queue = Queue()
+    root = folder.resolve()
+    for name in _UNHEARD:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    server = pn.io.server.get_server(
+        {"/": lambda: page_of(root, queue)},
+        address=HOST,
+        port=number,
+        websocket_origin=[f"{HOST}:{number}", f"localhost:{number}"],
+        auth_provider=_Token(token, number),
+        title="iSCAT analysis",
+        show=False,
+        start=False,
+        verbose=False,
+    )
+    address = f"http://{HOST}:{number}/?token={token}"
+
+    server.start()
+    say(address)
+    threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+    try:
+        server.io_loop.start()
+    except KeyboardInterrupt:  # which is how one ends it
+        pass
+    finally:
+        queue.close()
+
+
+class _Log(logging.Handler):
+    """Says in a line what libraries log, but not that a page was closed while it was written to."""
+
+    def __init__(self, warn: Callable[[str], None], *, debug: bool) -> None:
+        super().__init__()
+        self._warn, self._debug = warn, debug
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Say one record."""
+        error = record.exc_info[1] if record.exc_info else None
+        if isinstance(error, (WebSocketClosedError, StreamClosedError)):
+            return
+        if error is None:
+            self._warn(record.getMessage())
+        elif self._debug:
+            self._warn("".join(traceback.format_exception(error)))
+        else:
+            self._warn(f"unexpected {type(error).__name__}: {error}; --debug gives the traceback")
+
+
+class _Token(AuthProvider):
+    """Lets in who has the token, in the address or, from then on, in a cookie."""
+
+    def __init__(self, token: str, port: int) -> None:
+        self._token, self._cookie = token, f"iscat_app_{port}"
+        super().__init__()
+
+    @property
+    def get_user(self) -> Callable[[RequestHandler], str | None]:
+        def user(request: RequestHandler) -> str | None:
+            given = request.get_argument("token", "")
+            if given and self._is_token(given):
+                request.set_cookie(self._cookie, given, httponly=True, samesite="Strict")
+                return "owner"
+            return "owner" if self._is_token(request.get_cookie(self._cookie) or "") else None
+
+        return user
+
+    def _is_token(self, given: str) -> bool:
+        return secrets.compare_digest(given.encode(), self._token.encode())
+
+    @property
+    def get_user_async(self) -> None:
+        return None
+
+    @property
+    def login_url(self) -> str:
+        return "/locked"
+
+    @property
+    def get_login_url(self) -> None:
+        return None
+
+    @property
+    def login_handler(self) -> type[RequestHandler]:
+        return _Locked
+
+    @property
+    def logout_url(self) -> None:
+        return None
+
+    @property
+    def logout_handler(self) -> None:
+        return None
+
+
+class _Locked(RequestHandler):
+    """Says what is missing."""
+
+    def get(self, *_: Any) -> None:
+        """Answer whoever has no token."""
+        self.set_status(403)
+        self.finish(_LOCKED)
+
+
+def _free_port(wanted: int | None) -> int:
+    """Find a port that nothing listens at, or make sure of the one that is asked for."""
+    ports = range(FIRST_PORT, FIRST_PORT + PORTS) if wanted is None else [wanted]
+    for port in ports:
+        with socket.socket() as probe:
+            try:
+                probe.bind((HOST, port))
+            except (OSError, OverflowError):
+                continue
+            return int(probe.getsockname()[1])
+    if wanted is not None:
+        raise ConfigError(f"--port {wanted}: is in use, or not allowed; leave it out")
+    raise ConfigError(f"none of the ports {FIRST_PORT} to {ports[-1]} is free: give --port")

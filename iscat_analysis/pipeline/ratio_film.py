@@ -1,0 +1,164 @@
+"""A movie as one looks at it: the mean of some frames over the mean of those before them.
+
+Frames are read when they are needed, and the two sums follow a player from frame to frame, so that
+a movie of any length is played with the memory of two images.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.errors import ConfigError
+from iscat_analysis.inference.checks import number_in
+from iscat_analysis.movie import Stack
+from iscat_analysis.records import FloatArray
+
+_SAMPLED = 5  # frames from which limits of the contrast are taken
+_INSIDE = (0.001, 0.999)  # quantiles of the pixels that such limits leave inside
+
+
+class RatioFilm:
+    """The ratiometric film of a movie, in which particles appear as they land.
+
+    Each frame is divided by its mean first, so that a flickering laser does not show.  Counts are
+    above `offset_adu`: with the wrong one every contrast is wrong by the same factor.
+    """
+
+    def __init__(self, movie: Stack, *, window: int = 1, offset_adu: float = 0.0) -> None:
+        self.movie = movie
+        self._offset = float(offset_adu)
+        self._window = 0
+        self._at = -1
+        shape = movie.shape[1:]
+        self._before, self._after = np.zeros(shape), np.zeros(shape)
+        self.window = window
+
+    @property
+    def window(self) -> int:
+        """Frames in each of the two means."""
+        return self._window
+
+    @window.setter
+    def window(self, frames: int) -> None:
+        """Take means of so many frames from now on."""
+        frames = int(number_in("`window`", frames, least=1, most=self.longest, whole=True))
+        if frames != self._window:
+            self._window, self._at = frames, -1
+
+    @property
+    def offset_adu(self) -> float:
+        """Counts of a pixel without light."""
+        return self._offset
+
+    @offset_adu.setter
+    def offset_adu(self, counts: float) -> None:
+        """Take contrasts over another offset from now on."""
+        self._offset, self._at = float(counts), -1
+
+    @property
+    def longest(self) -> int:
+        """Frames that a window may have at most."""
+        return self.movie.shape[0] // 2
+
+    @property
+    def frames(self) -> tuple[int, int]:
+        """Frames that have a whole window before and after them, half-open."""
+        return self._window, self.movie.shape[0] - self._window + 1
+
+    def raw(self, frame: int) -> FloatArray:
+        """Give the counts of a frame.
+
+        Shapes: result (y, x).
+        """
+        frame = min(max(frame, 0), self.movie.shape[0] - 1)
+        return np.asarray(self.movie.read(frame, frame + 1)[0], dtype=np.float64)
+
+    def contrast(self, frame: int) -> FloatArray:
+        """Give the mean from a frame on over the mean before it, minus 1.
+
+        Shapes: result (y, x).
+        """
+        first, stop = self.frames
+        frame = min(max(frame, first), stop - 1)
+        step = frame - self._at
+        if self._at < 0 or abs(step) > self._window // 2:
+            self._sum_anew(frame)
+        else:
+            while self._at < frame:
+                self._forward()
+            while self._at > frame:
+                self._backward()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(self._after / self._before - 1.0)
+
+    def light(self, most: int = 400) -> pd.DataFrame:
+        """Give light and noise of frames all over the movie, at most so many.
+
+        Columns: frame, light [counts above the offset, mean of the pixels], noise (standard
+        deviation of the contrast of this frame to the next, of one frame).
+        """
+        last = self.movie.shape[0] - 2
+        rows = []
+        for frame in np.unique(np.linspace(0, last, min(most, last + 1)).astype(int)):
+            pair = self.movie.read(int(frame), int(frame) + 2).astype(np.float64) - self._offset
+            light = pair.mean(axis=(1, 2))
+            with np.errstate(divide="ignore", invalid="ignore"):
+                change = (pair[1] / light[1]) / (pair[0] / light[0])
+            change = change[np.isfinite(change)]
+            noise = float(np.std(change)) / math.sqrt(2) if change.size else math.nan
+            rows.append((int(frame), float(light[0]), noise))
+        return pd.DataFrame(rows, columns=["frame", "light", "noise"])
+
+    def limits(self, *, ratio: bool) -> tuple[float, float]:
+        """Give the limits between which most of the pixels of a few frames lie.
+
+        Those of the contrast are as far above 0 as below.
+        """
+        first, stop = self.frames if ratio else (0, self.movie.shape[0])
+        looked = np.unique(np.linspace(first, stop - 1, _SAMPLED).astype(int))
+        seen = [(self.contrast if ratio else self.raw)(int(t)) for t in looked]
+        values = np.concatenate([image[np.isfinite(image)] for image in seen])
+        low, high = np.quantile(values, _INSIDE) if values.size else (0.0, 1.0)
+        if ratio:
+            high = max(abs(low), abs(high)) or 1.0
+            low = -high
+        return float(low), float(high if high > low else low + 1.0)
+
+    def _frame(self, number: int) -> FloatArray:
+        counts: FloatArray = self.movie.read(number, number + 1)[0].astype(np.float64)
+        counts -= self._offset
+        light = float(counts.mean())
+        if not light > 0:
+            raise ConfigError(
+                f"{self.movie.name}: frame {number} is no brighter than camera.offset_adu = "
+                f"{self._offset:g}: correct the offset"
+            )
+        counts /= light
+        return counts
+
+    def _sum_anew(self, frame: int) -> None:
+        self._before[:], self._after[:] = 0.0, 0.0
+        for number in range(frame - self._window, frame):
+            self._before += self._frame(number)
+        for number in range(frame, frame + self._window):
+            self._after += self._frame(number)
+        self._at = frame
+
+    def _forward(self) -> None:
+        passing = self._frame(self._at)
+        self._before += passing
+        self._before -= self._frame(self._at - self._window)
+        self._after += self._frame(self._at + self._window)
+        self._after -= passing
+        self._at += 1
+
+    def _backward(self) -> None:
+        self._at -= 1
+        passing = self._frame(self._at)
+        self._before -= passing
+        self._before += self._frame(self._at - self._window)
+        self._after += passing
+        self._after -= self._frame(self._at + self._window)
