@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.burnt_in import find_text, patched, without_text
 from iscat_analysis.camera.calibration.laws import Law, find_law
 from iscat_analysis.camera.calibration.transfer import Transfer, measure_transfer
 from iscat_analysis.camera.counts import Camera, camera_from_config, rounding_variance_adu2
@@ -28,7 +29,7 @@ from iscat_analysis.camera.successive import averaged_noise
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import CountSource, StackMetadata
+from iscat_analysis.records import BoolArray, CountSource, StackMetadata
 
 MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", "metadata"
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
@@ -73,6 +74,7 @@ class LearnedCamera:
     messages: tuple[str, ...]
     level_e: float = 0.0
     response: Response | None = None
+    text: BoolArray | None = None
 
     @property
     def said(self) -> str:
@@ -115,15 +117,19 @@ def with_camera(
     movie: Stack, config: Config, span: tuple[int, int]
 ) -> tuple[Stack, Config, LearnedCamera]:
     """Give a movie through its response curve, and a configuration with numbers of the camera."""
+    text = find_text(movie, span)
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
     resolved = pixel_nm < _RESOLVED * optics.wavelength_nm / optics.na
     learned = learn_camera(
-        movie, config.camera, span,
+        movie if text is None else patched(movie, text), config.camera, span,
         additive=optics.scheme == "darkfield",
         moving=config.fit.mode == "track" and resolved,
         metadata=movie.metadata,
     )  # fmt: skip
+    if text is not None:
+        movie = without_text(movie, text, learned.camera)
+        learned = replace(learned, text=text)
     return movie, config.model_copy(update={"camera": learned.config}), learned
 
 

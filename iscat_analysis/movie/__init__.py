@@ -21,6 +21,7 @@ from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.mapped_frames import open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
+from iscat_analysis.movie.side_files import with_side_files
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
@@ -137,7 +138,7 @@ def _open_file(address: Path) -> Stack:
     except DataError:
         stack.close()
         raise
-    return stack
+    return stack.told(with_side_files(stack.metadata, path))
 
 
 def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:

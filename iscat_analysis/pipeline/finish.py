@@ -70,7 +70,7 @@ def gather(
     learned = bool(ready.summary.get("optics", {}).get("calibrated"))
     rows = reported_rows(found, learned_optics=learned)
     table, achieved, budget = rows.table, rows.achieved, rows.budget
-    recorded = ready.movie.metadata.ticks
+    recorded = ready.whole.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
         table = make_rows(table, {"tick": ticks[table["frame"].to_numpy(int)]})
@@ -134,7 +134,7 @@ def gather(
     summary = summary_of(context, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
-        input_path=printable(str(ready.movie.path)),
+        input_path=printable(str(ready.whole.path)),
         input_sha256=ready.digest.result(),
         versions=versions(),
         seed=config.compute.seed if config.samples_posterior else None,
@@ -146,7 +146,7 @@ def gather(
         "input": {
             "path": provenance.input_path,
             "sha256": provenance.input_sha256,
-            "shape": list(ready.movie.shape),
+            "shape": list(ready.whole.shape),
         },
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
