@@ -134,7 +134,7 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
     lowest, highest = counts.min(axis=0).astype(np.int64), counts.max(axis=0).astype(np.int64)
     width = highest - lowest
     doubtful = width > _RANGE * max(float(np.median(width)), 1.0)
-    if not _LEAST_PIXELS <= doubtful.sum():
+    if not doubtful.sum() >= _LEAST_PIXELS:
         return None
     series = np.sort(counts[:, doubtful].astype(np.int64), axis=0)
     ink, share = _commonest(series)

@@ -41,13 +41,14 @@ def look_at_changes(
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away
     images = np.empty((len(starts), *movie.shape[1:]), dtype=np.float32)
-    level, lit = np.zeros(movie.shape[1:]), 0
+    level, power, lit = np.zeros(movie.shape[1:]), 0.0, 0
     saturated = np.zeros(movie.shape[1:], dtype=np.bool_)
     for first in starts:
         counts, highest = summed(movie.read(first, first + BLOCK))
         saturated |= camera.saturated(highest)
         light = camera.to_electrons(counts / BLOCK)
         if light.mean() > 0:
+            power += light.mean()
             light /= light.mean()
             level += light
             images[lit] = light
@@ -57,7 +58,12 @@ def look_at_changes(
     images, level = images[:lit], level / lit
     usable = (level > 0.1 * np.median(level)) & ~saturated
     images /= np.where(usable, level, 1.0).astype(np.float32)
-    images[:, ~usable] = 1.0
+    images -= 1
+    light_e = np.where(usable, level, 0.0) * power / lit
+    # where the field is dim a contrast has more noise: as much everywhere, as searches take it
+    sharp = light_e / np.sqrt(np.maximum(light_e + camera.read_variance_e2(light_e.shape), 1.0))
+    images *= (sharp / max(float(np.median(sharp[usable])), 1e-300)).astype(np.float32)
+    images += 1
     pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
     return find_changes(images, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding import SHORTEST_MOVIE
 
 _GROUP, _READ = 16, 4  # frames from one group to the next, and how many of them are looked at
@@ -37,6 +37,7 @@ _SUDDEN = 0.7  # of a change, which one frame makes
 _SAME, _LIKE, _OTHER = 0.99, 0.9, 0.5  # correlation of patterns: one, alike, and others
 _BRIGHTER, _FLATTER = 1.03, 0.985  # light and contrast of a pattern under more light
 _MOST_BREAKS = 12  # beyond which nothing is usual
+_LONG = 0.75  # of the longest stretch, from where a part tells as much as that
 _NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
 
 
@@ -64,9 +65,10 @@ class Stretches:
     breaks: tuple[Break, ...] = ()
 
     @property
-    def longest(self) -> tuple[int, int]:
-        """The part that tells most of camera, light and optics."""
-        return max(self.kept, key=lambda span: span[1] - span[0])
+    def main(self) -> tuple[int, int]:
+        """The part that tells of camera, light and optics: the first of those that are long."""
+        longest = max(stop - start for start, stop in self.kept)
+        return next(span for span in self.kept if span[1] - span[0] >= _LONG * longest)
 
     def message(self, name: str) -> str:
         """Say where the movie breaks; empty where it does not."""

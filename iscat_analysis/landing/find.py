@@ -86,7 +86,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     particle = config.particle
     if not particle.height_is_open or config.fit.mode != "mass":
         return config
-    first, last = ready.stretches.longest
+    first, last = ready.stretches.main
     some = config.fit.model_copy(update={"frames": (first, min(last, first + TOLD_FRAMES))})
     trial = config.model_copy(update={"fit": some})
     found = analyse_landings(
@@ -206,12 +206,12 @@ def analyse_landings(
             interrupted = True
     forgetting = beside(reader.forget)
     fits, views, repeats = merged.result()
-    light, drift = merged.light(), merged.drift()
+    light, drift, begin = merged.light(), merged.drift(), stretches[0][0]
     forgetting.result()
     if not interrupted:  # and their memory is free again
         progress("landing", total, total)
     wanted = config.background.follows_pattern
-    for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
+    for text in frame_warnings(movie.name, merged, drift, light, begin, window, corrected=wanted):
         warn(text)
     searched = merged.searched().summary(_median_snr(fits), context.templates.threshold, stride)
     if text := searched_warning(movie.name, searched):
@@ -245,7 +245,7 @@ def analyse_landings(
         image=context.contrasts(merged.image),
         compared=Compared(
             frames_before=(0, 0),
-            frames_after=(first, first + light.size),
+            frames_after=(begin, begin + light.size),
             power_ratio=1.0,
             power=light / np.nanmean(light) if np.isfinite(light).any() else light,
             masked_pixels=merged.masked_pixels,

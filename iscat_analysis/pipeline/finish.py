@@ -26,6 +26,7 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
+from iscat_analysis.pipeline.timeline import timeline_of
 from iscat_analysis.records import (
     Analysis,
     Film,
@@ -142,6 +143,7 @@ def gather(
     )
     summary |= {
         **further,
+        **({"timeline": timeline} if (timeline := timeline_of(ready, found, table)) else {}),
         **({"budget": budget} if budget else {}),
         "input": {
             "path": provenance.input_path,

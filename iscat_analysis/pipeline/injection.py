@@ -144,7 +144,7 @@ def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[st
     try:
         config = found.context.config
         if ready.stretches.breaks:  # a stretch tells what the others would
-            fit = config.fit.model_copy(update={"frames": ready.stretches.longest})
+            fit = config.fit.model_copy(update={"frames": ready.stretches.main})
             config = config.model_copy(update={"fit": fit})
         recovered = inject_and_recover(
             ready.movie, config, ready.camera, found, run.inject,

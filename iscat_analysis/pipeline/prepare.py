@@ -72,7 +72,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     asked = config.fit.frames
     if stretches.breaks:  # all that is learned of the movie is learned within one of its parts
         run.warn(stretches.message(movie.name))
-        span = stretches.longest
+        span = stretches.main
         config = _within(config, span)
     start, stop = config.background.recorded or span
     stored, auto = movie, config.camera.assumed is not config.camera
@@ -85,6 +85,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if known.text is not None:
         stored = without_text(stored, known.text, camera)
         run.warn(text_said(known.text, movie.name))
+    if known.padding:
+        run.notify(f"{movie.name}: {known.padding}")
     if auto:
         run.notify(f"{movie.name}: {known.said}")
     whole, kept = movie, None
@@ -166,8 +168,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         "texts": [] if known.text is None else text_summary(known.text)
     }
     return Prepared(
-        whole, movie, steady, config, camera, way, lines, opened, other_kind, digest, summary, stretches,
-        known.response, processing, kept,
+        whole, movie, steady, config, camera, way, lines, opened, other_kind, digest, summary,
+        stretches, known.response, processing, kept,
     )  # fmt: skip
 
 

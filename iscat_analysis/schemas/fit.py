@@ -25,6 +25,7 @@ from iscat_analysis.schemas.base import (
     row_model,
 )
 from iscat_analysis.schemas.calibration import OpticsParameter, Twin
+from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.schemas.tracks import Motion, Track
 
 if TYPE_CHECKING:
@@ -385,29 +386,6 @@ class Scale(Closed):
     refusal: str | None = key("Why the model does not carry the scale so far; rows are flagged")
 
 
-class Break(Closed):
-    """Frames before and after which are not compared with each other."""
-
-    start: Count = key("First frame that is left out, or the first one after a cut")
-    stop: Count = key("One past the last; the same as start where none is left out")
-    cause: str = key("What it looks like")
-
-
-class Text(Closed):
-    """A rectangle of pixels into which a text is burnt."""
-
-    rows: tuple[Count, Count] = key("Rows [start, stop)")
-    columns: tuple[Count, Count] = key("Columns [start, stop)")
-
-
-class LeftOut(Closed):
-    """Frames and pixels that are no measurement."""
-
-    analysed: list[tuple[Count, Count]] = key("Frames [start, stop) that are analysed together")
-    breaks: list[Break] = key("Where landing movies break, and why")
-    texts: list[Text] = key("Texts that are burnt in")
-
-
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
@@ -438,6 +416,7 @@ class Summary(Document):
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
     left_out: LeftOut = maybe("Frames and pixels that are no measurement")
+    timeline: Timeline = maybe("Light, noise, focus, drift and events against frame")
     processing: Processed = maybe("Where the frames are not as the camera gave them")
     changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
     blocks: Blocks = maybe("Mode track: blocks of frames that have a background each")
