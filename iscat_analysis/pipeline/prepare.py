@@ -78,6 +78,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     stored, auto = movie, config.camera.assumed is not config.camera
     stated = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
+    refuse_channels(movie.read(start, min(stop, start + _OPENING)), stated, movie.name)
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
     for text in (*known.messages, *law_said(known)):
@@ -105,7 +106,6 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if way != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
     refuse_overflow(stored.read(start, max(start, stop)), movie.name)
-    refuse_channels(seen, camera, movie.name)
     swapped = axes_warning(movie.name, seen)
     if swapped:
         run.warn(swapped)

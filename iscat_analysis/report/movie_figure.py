@@ -33,8 +33,8 @@ def movie_figure(analysis: Analysis) -> Figure:
             hidden = one["what"].startswith("partly")
             stop = max(one["stop"], one["start"] + narrow)
             axes.axvspan(
-                one["start"], stop, color=GREY if hidden else PURPLE,
-                alpha=0.15 if hidden else 0.3, lw=0,
+                one["start"], stop, lw=0, color=GREY if hidden else PURPLE,
+                alpha=0.2 if hidden else 0.3, label="partly hidden" if hidden else "left out",
             )  # fmt: skip
         axes.set_ylabel(label, rotation=0, ha="right", va="center")
         axes.yaxis.set_major_locator(MaxNLocator(3))
@@ -75,10 +75,13 @@ def _rows(analysis: Analysis, told: Mapping[str, Any]) -> list[Row]:
     def events(axes: Axes) -> None:
         counted = told["events"]
         ok, flagged = (np.array(counted[name]) for name in ("ok", "flagged"))
-        axes.stairs(ok, counted["edges"], fill=True, color=BLUE, label="ok")
-        if flagged.any():
+        several = flagged.any()
+        axes.stairs(
+            ok, counted["edges"], fill=True, color=BLUE, label="ok" if several else None
+        )
+        if several:
             axes.stairs(
-                ok + flagged, counted["edges"], baseline=ok, fill=True, color=PURPLE,
+                ok + flagged, counted["edges"], baseline=ok, fill=True, color=VERMILLION,
                 label="flagged",
             )  # fmt: skip
 
