@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -115,10 +114,9 @@ def _centre(
 
     From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
     """
+    sight = sight.placed(sight.x_nm, sight.y_nm)
     starts = [
-        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
-        for x in _STARTS_NM
-        for y in _STARTS_NM
+        sight.placed(sight.x_nm + x, sight.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM
     ]
 
     def misfit(one: ParticleImage) -> float:
