@@ -217,10 +217,9 @@ def kept(new: dict[str, Any], whole: dict[str, Any]) -> bool:
     near = all(
         any(abs(mass / one - 1) < MASS for mass in new["species"]) for one in whole["species"]
     )
-    return bool(
-        new["recall"] >= RECALL * whole["recall"] and near and new["pull_std"] is not None
-        and whole["pull_std"] is not None and new["pull_std"] < PULLS * whole["pull_std"]
-    )  # fmt: skip
+    found = new["recall"] >= RECALL * whole["recall"]
+    told = new["pull_std"] is not None and whole["pull_std"] is not None
+    return found and near and told and new["pull_std"] < PULLS * whole["pull_std"]
 
 
 def main() -> int:
