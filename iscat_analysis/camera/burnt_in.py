@@ -138,12 +138,10 @@ def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
         return None
     series = np.sort(counts[:, doubtful].astype(np.int64), axis=0)
     ink, share = _commonest(series)
-    there = series == ink
-    light = np.ma.masked_array(series, mask=there)
-    middle = np.ma.median(light, axis=0).filled(0)
-    scatter = np.ma.median(np.abs(light - middle), axis=0).filled(0) * 1.4826
-    nearest = np.abs(np.ma.masked_array(series - ink, mask=there)).min(axis=0)
-    apart = np.ma.filled(nearest > _APART * np.maximum(scatter, 1.0), fill_value=False)
+    light = np.where(series == ink, np.nan, series)
+    light[:, share == 1] = 0.0  # nothing but ink, or dead
+    scatter = 1.4826 * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
+    apart = np.nanmin(np.abs(light - ink), axis=0) > _APART * np.maximum(scatter, 1.0)
     inked = apart & (share >= max(_AGAIN, _TIMES / len(counts))) & (share <= 1 - _AGAIN)
     letters = np.zeros(doubtful.shape, dtype=np.bool_)
     letters[doubtful] = inked

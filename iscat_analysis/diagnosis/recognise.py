@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import NO_CHANGES, Changes, find_changes, spot_of
-from iscat_analysis.records import FrameSource
+from iscat_analysis.records import FloatArray, FrameSource
 from iscat_analysis.search.sliding import summed
 
 MOST_FRAMES = 2000
@@ -28,6 +30,8 @@ LEAST_MOVING = 0.4
 """Share around which there are three pictures where particles move: 0.6 for 0.02 µm²/s, 0.9 and
 more from 0.1 to 1 µm²/s.  Where landings crowd, one and a leaving to 70 pixels in 400 frames, it
 is 0.14, and 0.36 at most."""
+
+_DIM = 0.5  # of the usual light, below which changes are damped
 
 DOUBT = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
@@ -59,13 +63,22 @@ def look_at_changes(
     usable = (level > 0.1 * np.median(level)) & ~saturated
     images /= np.where(usable, level, 1.0).astype(np.float32)
     images -= 1
-    light_e = np.where(usable, level, 0.0) * power / lit
-    # where the field is dim a contrast has more noise: as much everywhere, as searches take it
-    sharp = light_e / np.sqrt(np.maximum(light_e + camera.read_variance_e2(light_e.shape), 1.0))
-    images *= (sharp / max(float(np.median(sharp[usable])), 1e-300)).astype(np.float32)
+    images *= _damping(np.where(usable, level, 0.0) * power / lit, camera)
     images += 1
     pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
     return find_changes(images, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
+
+
+def _damping(light_e: FloatArray, camera: Camera) -> NDArray[np.float32]:
+    """Give what keeps the noise of dim pixels, as around a round beam, to that of half the light.
+
+    Shapes: `light_e`, result (y, x).
+    """
+    read = camera.read_variance_e2((light_e.shape[0], light_e.shape[1]))
+    half = _DIM * float(np.median(light_e[light_e > 0])) if (light_e > 0).any() else 1.0
+    sharp = light_e / np.sqrt(np.maximum(light_e + read, 1.0))
+    enough = half / math.sqrt(max(half + float(read.mean()), 1.0))
+    return np.minimum(sharp / enough, 1.0).astype(np.float32)
 
 
 def as_landing(changes: Changes, name: str) -> str:

@@ -115,9 +115,7 @@ def _centre(
     From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
     """
     sight = sight.placed(sight.x_nm, sight.y_nm)
-    starts = [
-        sight.placed(sight.x_nm + x, sight.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM
-    ]
+    starts = [sight.placed(sight.x_nm + x, sight.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
 
     def misfit(one: ParticleImage) -> float:
         return goodness(one, model)[0]

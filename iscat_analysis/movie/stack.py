@@ -255,11 +255,6 @@ class Stack:
         seen._own = False
         return seen
 
-    def told(self, metadata: StackMetadata) -> Stack:
-        """Give the same movie with what is known of its recording."""
-        self._metadata = metadata
-        return self
-
     def channel(self, chosen: tuple[int, int] | None) -> Stack:
         """Give one of several channels whose frames take turns.
 

@@ -76,9 +76,7 @@ def _rows(analysis: Analysis, told: Mapping[str, Any]) -> list[Row]:
         counted = told["events"]
         ok, flagged = (np.array(counted[name]) for name in ("ok", "flagged"))
         several = flagged.any()
-        axes.stairs(
-            ok, counted["edges"], fill=True, color=BLUE, label="ok" if several else None
-        )
+        axes.stairs(ok, counted["edges"], fill=True, color=BLUE, label="ok" if several else None)
         if several:
             axes.stairs(
                 ok + flagged, counted["edges"], baseline=ok, fill=True, color=VERMILLION,
