@@ -35,8 +35,10 @@ StandardsOption = Annotated[
     typer.Option(
         "--standards",
         metavar="MASSES",
-        help="Masses in the calibrants [kDa], beside those of the table, as in 66,146,480; "
-        "66:0.5 gives one its standard error, otherwise 1 %.",
+        help=(
+            "Masses of the standards in the calibrants [kDa], besides those of the table, as "
+            "in 66,146,480. 66:0.5 gives a mass its standard error; the default is 1 %."
+        ),
     ),
 ]
 
@@ -52,7 +54,10 @@ KdMassesOption = Annotated[
     typer.Option(
         "--kd-masses",
         metavar="M | A,B",
-        help="About the mass of the monomer, found otherwise, or of A and B [kDa]; fitted.",
+        help=(
+            "Approximate mass of the monomer, or of A and B [kDa], from which the fit starts;"
+            " default: the monomer is found."
+        ),
     ),
 ]
 
@@ -97,8 +102,10 @@ def batch(
         str | None,
         typer.Option(
             metavar="K/N",
-            help="Analyse the K-th of N parts of the movies, and the calibrations unless another "
-            "part does; no page.",
+            help=(
+                "Analyse part K of N of the movies, and the calibrations unless another part "
+                "makes them; no page is made."
+            ),
         ),
     ] = None,
     merge: Annotated[
@@ -195,11 +202,11 @@ def print_batch(found: Batch) -> None:
     for row in found.kd.to_dict("records"):
         if not row["why"]:
             p = "" if math.isnan(row["p_value"]) else f", p = {row['p_value']:.2g}"
-            remarks = f"; {row['remarks']}" if row["remarks"] else ""
+            notes = f"; {row['remarks']}" if row["remarks"] else ""
             print_result(
                 f"{kd_name(row['condition'])} = {short(row['kd_nm'])} nM (95 %: "
                 f"{short(row['kd_low'])} to {upper_end(row['kd_high'])}), "
-                f"{count(row['movies'], 'movie')}{p}{remarks}"
+                f"{count(row['movies'], 'movie')}{p}{notes}"
             )
     if len(found.movies) > ROWS_SHOWN:
         print_result(f"… and {len(found.movies) - ROWS_SHOWN} more in {found.out / 'movies.csv'}")

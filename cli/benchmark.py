@@ -40,7 +40,14 @@ def benchmark(
     trials: Annotated[
         int, typer.Option(min=20, metavar="N", help="Repetitions in each mode.")
     ] = 1000,
-    seed: Annotated[int, typer.Option(min=0, metavar="N", help="Same seed, same numbers.")] = 1,
+    seed: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            metavar="N",
+            help="Seed of the random numbers: the same seed gives the same result.",
+        ),
+    ] = 1,
     settings: SetOption = None,
     posterior: Annotated[
         bool,

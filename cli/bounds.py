@@ -73,8 +73,10 @@ def bounds(
         typer.Option(
             "--scan",
             metavar="NAME=A:B:STEP",
-            help="Bounds along z, focus, attenuation, na, pixel, fov or photons; B is included, "
-            "and NAME=a,b,c lists values.",
+            help=(
+                "Bounds along z, focus, attenuation, na, pixel, fov or photons; B is "
+                "included. NAME=a,b,c lists values."
+            ),
         ),
     ] = None,
     optimize: Annotated[
@@ -90,9 +92,12 @@ def bounds(
         typer.Option(
             "--for",
             metavar="NAMES",
-            help="What --optimize shall make precise: x, y, z or mass, for the pupil also several, "
-            "as in z,mass; default all that are free. optics: how well particles would tell focus, "
-            "NA, phase, mask and aberrations, instead of the bounds of one particle.",
+            help=(
+                "Parameters whose bounds --optimize makes small: x, y, z or mass; for the "
+                "pupil also several, as in z,mass; default all free ones. optics: how well "
+                "particles would determine focus, NA, phase, mask and aberrations, instead of"
+                " the bounds of one particle."
+            ),
             autocompletion=lambda: ["x", "y", "z", "mass", "z,mass", OPTICS],
         ),
     ] = None,
@@ -110,15 +115,17 @@ def bounds(
         typer.Option(
             "--free",
             metavar="NAMES",
-            help="With --for optics: what is fitted, some of "
-            "focus,na,phase,mask,zernike,polarization; with --optimize pupil: what may change, "
-            "some of focus,phase,attenuation,mask,zernike; default all.",
+            help=(
+                "With --for optics: parameters to fit, some of "
+                "focus,na,phase,mask,zernike,polarization; with --optimize pupil: what may "
+                "change, some of focus,phase,attenuation,mask,zernike; default all."
+            ),
         ),
     ] = None,
     seed: Annotated[
         int | None,
         typer.Option(
-            "--seed", min=0, help="With --optimize pupil: of the starts of the search; default 0."
+            "--seed", min=0, help="With --optimize pupil: seed of the random starts; default 0."
         ),
     ] = None,
     target: Annotated[
@@ -126,8 +133,10 @@ def bounds(
         typer.Option(
             "--target",
             metavar="NAME=VALUE",
-            help="Frames and photons that a precision takes, as in mass=5kDa or z=2nm, and what "
-            "costs how much.",
+            help=(
+                "Frames and photons that a precision needs, as in mass=5kDa or z=2nm, and "
+                "what limits the precision."
+            ),
         ),
     ] = None,
     preset: Annotated[
@@ -275,7 +284,7 @@ def _target(config: Config, text: str) -> dict[str, Any]:
         "target": {
             "parameter": goal.parameter,
             "value": goal.value,
-            "effort": [asdict(way) for way in effort(config, goal)],
+            "effort": [asdict(entry) for entry in effort(config, goal)],
             "budget": [asdict(line) for line in budget(config, goal.parameter)],
             "note": ""
             if config.camera.samples_per_pixel > 1

@@ -116,14 +116,14 @@ def _unit(target: Mapping[str, Any]) -> str:
 def _effort_table(target: Mapping[str, Any]) -> Table:
     title = f"{target['value']:g} {_unit(target)} takes, with the background"
     found = table(title, "frames before", "frames after", "seconds", "collected photons")
-    for way in target["effort"]:
-        before = f"{way['n_before']:,.0f}".replace(",", " ")
-        if math.isfinite(way["n_after"]):
-            after = f"{way['n_after']:,.0f}".replace(",", " ")
-            times = short(way["seconds"]), short(way["collected"])
+    for entry in target["effort"]:
+        before = f"{entry['n_before']:,.0f}".replace(",", " ")
+        if math.isfinite(entry["n_after"]):
+            after = f"{entry['n_after']:,.0f}".replace(",", " ")
+            times = short(entry["seconds"]), short(entry["collected"])
         else:
             after, times = "never enough", ("–", "–")
-        found.add_row(way["background"], before, after, *times)
+        found.add_row(entry["background"], before, after, *times)
     return found
 
 

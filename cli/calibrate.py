@@ -62,7 +62,10 @@ def camera(
         Path | None, typer.Option(metavar="STACK", help="Frames without light.")
     ] = None,
     offset: Annotated[
-        float | None, typer.Option(metavar="COUNTS", help="The offset, known without a dark.")
+        float | None,
+        typer.Option(
+            metavar="COUNTS", help="Offset of the camera in counts, if it is known without a dark."
+        ),
     ] = None,
     maps: Annotated[
         bool, typer.Option("--maps", help="Write maps, one number per pixel, as TIFF.")
@@ -86,14 +89,14 @@ def camera(
     with failures(messages, debug=debug):
         from iscat_analysis.answers.calibrations import camera_calibration
         from iscat_analysis.errors import ConfigError
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
         given = [*(stacks or ()), *([dark] if dark is not None else [])]
         if not given:
             raise ConfigError("give a flat, the movie, or --dark")
         if dark is not None and offset is not None:
             raise ConfigError("--dark measures the offset: leave --offset out")
-        folder = out if out is not None else beside(given[0], ".camera")
+        folder = out if out is not None else path_beside(given[0], ".camera")
         with messages.progress() as progress:
             found = camera_calibration(
                 stacks or (),
@@ -126,12 +129,20 @@ def mass(
         str,
         typer.Option(
             metavar="KDA,KDA,...",
-            help="Masses of the standards; 66:0.5 gives one its standard error, otherwise 1 %.",
+            help=(
+                "Masses of the standards [kDa]; 66:0.5 gives a mass its standard error, the "
+                "default is 1 %."
+            ),
         ),
     ],
     landing: Annotated[
         LandingSign | None,
-        typer.Option(help="What landing does; default what the table's masses say, or dark."),
+        typer.Option(
+            help=(
+                "Whether a particle that lands makes its place dark or bright; default from the "
+                "table's masses, or dark."
+            )
+        ),
     ] = None,
     out: Annotated[
         Path | None,
@@ -155,9 +166,9 @@ def mass(
         masses, errors = _standards(standards)
 
         from iscat_analysis.answers.calibrations import mass_calibration
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
-        folder = out if out is not None else beside(events, ".calibration")
+        folder = out if out is not None else path_beside(events, ".calibration")
         found = mass_calibration(
             events,
             masses,
@@ -190,22 +201,30 @@ def optics(
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="What may change, some of focus,na,phase,mask,zernike,polarization; default all.",
+            help=(
+                "Parameters to learn, some of focus,na,phase,mask,zernike,polarization; "
+                "default all."
+            ),
         ),
     ] = None,
     focus_step: Annotated[
         float | None,
         typer.Option(
             metavar="NM",
-            help="The movie is a scan of immobile particles: rise of the focus per frame [nm]; "
-            "where focus is free it is measured as well.",
+            help=(
+                "The movie is a scan of the focus over immobile particles: rise of the focus "
+                "per frame [nm]; where focus is free it is measured as well."
+            ),
         ),
     ] = None,
     measured: Annotated[
         bool,
         typer.Option(
             "--measured",
-            help="Measure the picture itself instead, where no optics describe it; mode mass.",
+            help=(
+                "Measure the picture of a particle itself, for a microscope that no optics "
+                "describe; mode mass."
+            ),
         ),
     ] = False,
     out: Annotated[
@@ -233,9 +252,9 @@ def optics(
         from iscat_analysis.answers.calibrations import optics_calibration
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
-        from iscat_analysis.movie.addresses import beside
+        from iscat_analysis.movie.addresses import path_beside
 
-        folder = out if out is not None else beside(movie, ".optics")
+        folder = out if out is not None else path_beside(movie, ".optics")
         with messages.progress() as progress:
             found = optics_calibration(
                 movie,
@@ -277,13 +296,13 @@ def _measure(
     from iscat_analysis.answers.calibrations import template_calibration
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import ConfigError, DataError
-    from iscat_analysis.movie.addresses import beside
+    from iscat_analysis.movie.addresses import path_beside
 
     if free is not None or focus_step is not None:
         raise ConfigError(
             "--measured takes the picture as it is at one focus: leave out --free and --focus-step"
         )
-    folder = out if out is not None else beside(movie, ".optics")
+    folder = out if out is not None else path_beside(movie, ".optics")
     with messages.progress() as progress:
         found = template_calibration(
             movie, load_config(config, settings or ()), folder,

@@ -128,7 +128,7 @@ class _Lines:
     def __init__(self, messages: Messages) -> None:
         self._messages = messages
         self._lock = threading.Lock()
-        self._said = ""
+        self._last_notice = ""
         self._stage = ""
         self._first = (0.0, 0)  # when the stage first reported, and how much was done
         self._due = time.monotonic() + SECONDS_TO_FIRST_LINE
@@ -151,9 +151,9 @@ class _Lines:
                     text += f", about {duration(left)} left"
             else:
                 self._stage, self._due = "", now + SECONDS_TO_FIRST_LINE
-            if text == self._said:  # a stage that is run again has said so already
+            if text == self._last_notice:  # a stage that is run again has said so already
                 return
-            self._said = text
+            self._last_notice = text
         self._messages.notify(text)
 
 
@@ -194,8 +194,8 @@ def failures(messages: Messages, *, debug: bool) -> Iterator[None]:
         except typer.Exit:
             raise
         except KeyboardInterrupt as interruption:
-            said = str(interruption)
-            messages.error(f"interrupted: {said}" if said else "interrupted")
+            text = str(interruption)
+            messages.error(f"interrupted: {text}" if text else "interrupted")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
             if watched is not None and watched.lost:  # and this is what the compiler made of it
@@ -276,9 +276,9 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
         return f"{error.filename}: cannot be read or written ({error.strerror})", UNEXPECTED
     if isinstance(error, OSError) and error.errno in _NO_ROOM:
         return f"a file cannot be written ({error.strerror})", UNEXPECTED
-    said = f": {error}" if str(error) else ""
+    text = f": {error}" if str(error) else ""
     hint = "" if debug else "; run again with --debug for the traceback"
-    return f"unexpected {type(error).__name__}{said}{hint}", UNEXPECTED
+    return f"unexpected {type(error).__name__}{text}{hint}", UNEXPECTED
 
 
 def print_result(result: RenderableType) -> None:

@@ -61,16 +61,16 @@ class Interrupts:
             raise KeyboardInterrupt
         raise KeyboardInterrupt(f"{self._received.name} was received")
 
-    def note_unraisable(self, told: sys.UnraisableHookArgs) -> None:
+    def note_unraisable(self, unraisable: sys.UnraisableHookArgs) -> None:
         """Have an interrupt raised again that was raised where Python can only print it.
 
         A callback of compiled code is such a place: the compiler's look into its cache, for one.
         The interrupt would be lost, or end as an error of whoever made the call.
         """
-        if isinstance(told.exc_value, KeyboardInterrupt):
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
             self._swallowed = self.lost = True
         else:
-            sys.__unraisablehook__(told)
+            sys.__unraisablehook__(unraisable)
 
     def _watch(self) -> None:
         number = signal.Signals(signal.sigwait(self._numbers | {signal.SIGUSR1}))

@@ -72,7 +72,10 @@ def fit(
         str | None,
         typer.Option(
             metavar="SHAPE,TYPE",
-            help="STACK is nothing but numbers, as in 1500x128x128,uint16; also STACK::SHAPE,TYPE.",
+            help=(
+                "Shape and type of a raw file of numbers, as in 1500x128x128,uint16; also "
+                "STACK::SHAPE,TYPE."
+            ),
         ),
     ] = None,
     frames: Annotated[
@@ -80,7 +83,9 @@ def fit(
     ] = None,
     background: Annotated[
         str | None,
-        typer.Option(metavar="A:B", help="Frames before the particles bound, half-open."),
+        typer.Option(
+            metavar="A:B", help="Frames of the background, before the particles bound, half-open."
+        ),
     ] = None,
     channels: Annotated[
         str | None,
@@ -140,7 +145,7 @@ def fit(
 
         changes = _changes(settings, mode, frames, background, channels, posterior, workers)
 
-        from iscat_analysis.movie.addresses import MARK, beside, setup_beside
+        from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside
         from iscat_analysis.reading import is_file
 
         found_beside = setup_beside(stack)
@@ -154,9 +159,9 @@ def fit(
         movie, many = stack, resolved.compute.workers
         if raw is not None:
             stack = Path(f"{stack}{MARK}{raw}")
-        folder = beside(stack, ".iscat") if out is None else out
+        folder = path_beside(stack, ".iscat") if out is None else out
         with (
-            open_executor(scheduler, scheduler_file, shared=movie, workers=many) as place,
+            open_executor(scheduler, scheduler_file, shared=movie, workers=many) as executor,
             messages.progress() as progress,
         ):
             from iscat_analysis.pipeline import fit_stack  # while the second process imports
@@ -170,7 +175,7 @@ def fit(
                 notify=messages.notify,
                 command=context.obj,
                 inject=inject or 0,
-                place=place,
+                executor=executor,
             )
         rows: list[dict[str, Any]] = analysis.table.to_dict("records")
         if as_json:
@@ -228,13 +233,13 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
 def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
     from iscat_analysis.records import Status
 
-    remarks: Counter[str] = Counter()
+    flag_counts: Counter[str] = Counter()
     for row in flagged:
         found = {str(row["status"]), *str(row["flags"] or "").split(";")}
-        remarks.update(found & {"sidelobe"} or found)  # which is no event
+        flag_counts.update(found & {"sidelobe"} or found)  # which is no event
     for status in Status:
-        if status != Status.OK and remarks[status.value]:
-            messages.notify(f"{remarks[status.value]} {status}: {status.advice}")
+        if status != Status.OK and flag_counts[status.value]:
+            messages.notify(f"{flag_counts[status.value]} {status}: {status.advice}")
 
 
 def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:

@@ -40,7 +40,9 @@ def init(
     *,
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="Ask nothing: what is not known and not given is the default."),
+        typer.Option(
+            "--yes", help="Ask no questions: use defaults for what is neither known nor given."
+        ),
     ] = False,
     out: Annotated[
         Path | None,
@@ -48,11 +50,11 @@ def init(
     ] = None,
     pixel_size_nm: Annotated[
         float | None,
-        typer.Option("--pixel-size-nm", metavar="NM", help="Of a pixel, in the sample plane."),
+        typer.Option("--pixel-size-nm", metavar="NM", help="Side of a pixel in the sample plane."),
     ] = None,
     wavelength_nm: Annotated[
         float | None,
-        typer.Option("--wavelength-nm", metavar="NM", help="Of the light, in vacuum."),
+        typer.Option("--wavelength-nm", metavar="NM", help="Wavelength of the light in vacuum."),
     ] = None,
     na: Annotated[
         float | None, typer.Option("--na", metavar="NA", help="Numerical aperture.")
@@ -76,7 +78,7 @@ def init(
     """
     messages = Messages(context.command_path, quiet=quiet)
     with failures(messages, debug=debug):
-        from iscat_analysis.pipeline.setup import preview_said, write_setup
+        from iscat_analysis.pipeline.setup import preview_lines, write_setup
 
         given = {
             "camera.pixel_size_nm": pixel_size_nm,
@@ -101,7 +103,7 @@ def init(
         for note in found.notes:
             messages.notify(note)
         print_result(shown)
-        for line in preview_said(found):
+        for line in preview_lines(found):
             print_result(line)
         print_result(f"written: {found.out}")
 

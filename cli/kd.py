@@ -59,8 +59,11 @@ def kd(
         typer.Option(
             "--masses",
             metavar="M | A,B",
-            help="About the mass of the monomer, or of A and B [kDa]; fitted. Without it the "
-            "monomer is taken from peaks at one mass and its double.",
+            help=(
+                "Approximate mass of the monomer, or of A and B [kDa], from which the fit "
+                "starts. Without it the monomer is found from peaks at one mass and its "
+                "double."
+            ),
         ),
     ] = None,
     landing: Annotated[
@@ -68,13 +71,19 @@ def kd(
         typer.Option(
             "--landing",
             metavar="P",
-            help="Landings are as concentration times mass^P: -0.167 out of a drop at rest onto an "
-            "absorbing surface, -0.333 where liquid flows, 0 where all land alike; fitted, from "
-            "-1/6 ± 1/6, unless given.",
+            help=(
+                "Exponent P: the number of landings is proportional to concentration times "
+                "mass^P. -0.167 out of a drop at rest onto an absorbing surface, -0.333 where"
+                " liquid flows, 0 where all land alike; fitted, from -1/6 ± 1/6, unless "
+                "given."
+            ),
         ),
     ] = None,
     inactive: Annotated[
-        bool, typer.Option("--inactive", help="Fit the part of monomers, or of A, that is inert.")
+        bool,
+        typer.Option(
+            "--inactive", help="Fit the fraction of monomers, or of A, that does not bind."
+        ),
     ] = False,
     sigma: SigmaOption = None,
     limit: LimitOption = None,

@@ -66,7 +66,9 @@ SchedulerOption = Annotated[
     typer.Option(
         "--scheduler",
         metavar="threads|tcp://HOST:PORT",
-        help="Where the work runs: threads, here; or the workers of a Dask cluster.",
+        help=(
+            "Where the work runs: in threads of this process, or on the workers of a Dask cluster."
+        ),
     ),
 ]
 
@@ -75,7 +77,7 @@ SchedulerFileOption = Annotated[
     typer.Option(
         "--scheduler-file",
         metavar="F",
-        help="The file in which the scheduler of the cluster left its address.",
+        help="The file to which the scheduler of the cluster wrote its address.",
     ),
 ]
 

@@ -29,10 +29,16 @@ def simulate(
         Path, typer.Option(metavar="C.toml", help="Configuration with a [simulation] section.")
     ],
     out: Annotated[
-        Path, typer.Option(metavar="STACK.tif", help="The movie; STACK.truth.csv lands beside it.")
+        Path,
+        typer.Option(
+            metavar="STACK.tif", help="The movie to write; STACK.truth.csv is written beside it."
+        ),
     ],
     seed: Annotated[
-        int | None, typer.Option(min=0, metavar="N", help="In place of the configured seed.")
+        int | None,
+        typer.Option(
+            min=0, metavar="N", help="Seed of the random numbers, instead of the configured one."
+        ),
     ] = None,
     settings: SetOption = None,
     overwrite: OverwriteOption = False,

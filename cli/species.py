@@ -74,18 +74,25 @@ def species(
     *,
     k: Annotated[
         int | None,
-        typer.Option("--k", metavar="N", help="So many species; default as many as BIC likes."),
+        typer.Option(
+            "--k", metavar="N", help="Number of species; default the number with the smallest BIC."
+        ),
     ] = None,
     masses: Annotated[
         str | None,
-        typer.Option("--masses", metavar="M1,M2", help="Species of these masses, held [kDa]."),
+        typer.Option(
+            "--masses", metavar="M1,M2", help="Masses of the species, which are fixed [kDa]."
+        ),
     ] = None,
     ladder: Annotated[
         str | None,
         typer.Option(
             "--ladder",
             metavar="M1",
-            help="Oligomers of a monomer of about this mass [kDa], which is fitted; auto finds it.",
+            help=(
+                "Species are oligomers of a monomer of about this mass [kDa], which is "
+                "fitted; auto finds it."
+            ),
         ),
     ] = None,
     steps: Annotated[
@@ -97,25 +104,37 @@ def species(
     offset: Annotated[
         bool, typer.Option("--offset", help="Fit an offset common to all oligomers.")
     ] = False,
-    hold: Annotated[bool, typer.Option("--hold", help="Hold the monomer at the mass given.")] = (
-        False
-    ),
+    hold: Annotated[
+        bool, typer.Option("--hold", help="Fix the mass of the monomer at the one given.")
+    ] = (False),
     widths: Annotated[
         Width | None,
         typer.Option(
             "--widths",
-            help="Of --masses and --ladder: one width for all species (default), or one each.",
+            help=(
+                "With --masses and --ladder: one width for all species (default), or one for each."
+            ),
         ),
     ] = None,
     background: Annotated[
         bool,
         typer.Option(
             "--background/--no-background",
-            help="Of --masses and --ladder: whether something broad and faint may be there too.",
+            help=(
+                "With --masses and --ladder: whether a broad, weak background of other masses"
+                " is fitted."
+            ),
         ),
     ] = True,
     side: Annotated[
-        Side, typer.Option("--branch", help="Magnitudes of all events, or one side.")
+        Side,
+        typer.Option(
+            "--branch",
+            help=(
+                "Events to use: all, by the magnitude of their mass, or only those that land or "
+                "leave."
+            ),
+        ),
     ] = Side.MAGNITUDE,
     sigma: SigmaOption = None,
     limit: LimitOption = None,
@@ -125,8 +144,10 @@ def species(
         typer.Option(
             "--frame-rate",
             metavar="HZ",
-            help="Frames per second, for rates of landing and leaving; default as the "
-            "configuration beside the table says.",
+            help=(
+                "Frames per second, for rates of landing and leaving; default from the "
+                "configuration beside the table."
+            ),
         ),
     ] = None,
     frames: Annotated[
@@ -139,9 +160,14 @@ def species(
         ),
     ] = None,
     draws: Annotated[
-        int, typer.Option("--draws", metavar="N", help="Simulated repetitions for the intervals.")
+        int,
+        typer.Option(
+            "--draws",
+            metavar="N",
+            help="Number of simulated repetitions for the intervals.",
+        ),
     ] = 100,
-    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Of the repetitions.")] = 1,
+    seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the repetitions.")] = 1,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Folder for species.csv, species.json and a figure."),
@@ -316,15 +342,15 @@ def _print(found: Distribution) -> None:
         if row.get("background"):
             shown.add_row("background", "–", "–", "–", short(row["count"]), "–", "–", "–", "–")
             continue
-        hidden = math.isnan(row["count_corrected"])
+        undetectable = math.isnan(row["count_corrected"])
         shown.add_row(
             str(row.get("n", number)),
             short(row["mass_kda"]),
-            "not determined" if hidden else _interval(row["mass_low"], row["mass_high"]),
+            "not determined" if undetectable else _interval(row["mass_low"], row["mass_high"]),
             short(row["width_kda"], 3),
             short(row["count"]),
             f"{100 * row['efficiency']:.3g} %",
-            "–" if hidden else short(row["count_corrected"]),
+            "–" if undetectable else short(row["count_corrected"]),
             "–" if math.isnan(row["fraction"]) else f"{100 * row['fraction']:.3g} %",
             _interval(100 * row["fraction_low"], 100 * row["fraction_high"], 3),
         )

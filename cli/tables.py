@@ -9,7 +9,7 @@ import typer
 SigmaOption = Annotated[
     float | None,
     typer.Option(
-        "--sigma", metavar="KDA", help="Error of every event, in place of the table's [kDa]."
+        "--sigma", metavar="KDA", help="Error of every event, instead of the table's [kDa]."
     )
 ]  # fmt: skip
 
@@ -18,8 +18,10 @@ LimitOption = Annotated[
     typer.Option(
         "--limit",
         metavar="M[:S]",
-        help="Mass of which every other particle is detected, and the spread of the detector's "
-        "estimate [kDa]; default from the table.",
+        help=(
+            "Mass at which half of the particles are detected, and the spread of the "
+            "detector's estimate [kDa]; default from the table."
+        ),
     ),
 ]
 

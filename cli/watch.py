@@ -63,7 +63,7 @@ def watch(
     scheduler: SchedulerOption = "threads",
     scheduler_file: SchedulerFileOption = None,
     interval: Annotated[
-        float, typer.Option(metavar="S", help="Seconds between two looks at the folder.")
+        float, typer.Option(metavar="S", help="Seconds between two checks of the folder.")
     ] = 10.0,
     workers: WorkersOption = None,
     as_json: JsonOption = False,

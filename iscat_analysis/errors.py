@@ -8,8 +8,8 @@ class IscatError(Exception):
 
     exit_status = 1
 
-    def __init__(self, *said: str) -> None:
-        super().__init__(*("; ".join(_lines(text)) for text in said))
+    def __init__(self, *messages: str) -> None:
+        super().__init__(*("; ".join(_lines(text)) for text in messages))
 
 
 def _lines(text: str) -> list[str]:
@@ -30,9 +30,9 @@ class FloodError(DataError):
 class SignError(DataError):
     """Most particles of a calibrant have the sign of those that leave."""
 
-    def __init__(self, said: str, advice: str) -> None:
-        super().__init__(said, advice)  # both, so that it can be pickled
-        self.said = said
+    def __init__(self, problem: str, advice: str) -> None:
+        super().__init__(problem, advice)  # both, so that it can be pickled
+        self.problem = problem
 
     def __str__(self) -> str:
         return ", ".join(self.args)

@@ -97,17 +97,17 @@ class Executor(Protocol):
         """Do a job and wait for it; `here` does the same with what this process holds already."""
 
     def each(self, work: Callable[[T], R], items: Sequence[T]) -> Generator[tuple[int, R]]:
-        """Do something with every item, several at a time where jobs run elsewhere."""
+        """Apply a function to every item, in parallel where jobs run elsewhere."""
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
-        """Say what a user should know before work begins."""
+    def warnings(self, memory_limit_mb: int) -> list[str]:
+        """List what the user should know before work begins."""
 
 
 class LocalExecutor:
-    """The process that asks, which does one job after the other or shares them with a second one.
+    """Runs jobs in this process, one after the other or shared with a second process.
 
-    Results do not depend on which process does a job.  The jobs of a second process that is lost
-    are done here.
+    Results do not depend on which process does a job.  Jobs of a second process that dies are done
+    in this one.
     """
 
     distant = False
@@ -147,7 +147,7 @@ class LocalExecutor:
         work: Callable[[T], R],
         waiting: deque[tuple[int, T]],
     ) -> Generator[tuple[int, R]]:
-        """Do an item here and one in the second process, until none waits or that is lost."""
+        """Do items here and in the second process, until none is left or that process dies."""
         sent: tuple[int, T, Future[R]] | None = None
         with ThreadPoolExecutor(1, initializer=_ELSEWHERE.set, initargs=(True,)) as sender:
             try:
@@ -175,8 +175,8 @@ class LocalExecutor:
                     second.end()
                     self._second = None
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
-        """Say nothing; see `Executor`."""
+    def warnings(self, memory_limit_mb: int) -> list[str]:
+        """Return no warnings; see `Executor`."""
         del memory_limit_mb
         return []
 
@@ -229,7 +229,7 @@ class DaskExecutor:
         del jobs
         return wanted
 
-    def remarks(self, memory_limit_mb: int) -> list[str]:
+    def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Executor`."""
         if not self._memory:
             return [f"{self._address} has no workers yet; the work begins with the first"]
@@ -304,7 +304,7 @@ class DaskExecutor:
             pool.shutdown(cancel_futures=True)
 
     def _stop(self) -> None:
-        """Let the cluster forget what is not finished; the cluster itself goes on."""
+        """Cancel unfinished jobs; the cluster itself keeps running."""
         with self._lock:
             self._stopped = True
             live = list(self._live)
@@ -442,7 +442,7 @@ def _connected(address: str) -> Client:
 
 
 def _refuse_silence(address: str) -> None:
-    """Refuse an address where nobody greets as a scheduler does: Dask would wait without end."""
+    """Refuse an address without a Dask scheduler, for which Dask would wait without end."""
     match = _ADDRESS.fullmatch(address)
     if match is None:
         raise ConfigError(

@@ -20,7 +20,7 @@ _NO_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL}
 
 @contextmanager
 def unfinished(path: Path) -> Iterator[None]:
-    """Have `discard_unfinished` remove something for as long as the block runs."""
+    """Register a path that `discard_unfinished` removes while the block runs."""
     _UNFINISHED[path] = True
     try:
         yield
@@ -32,7 +32,7 @@ def unfinished(path: Path) -> Iterator[None]:
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Put a file in place once everything is written."""
+    """Write a file under another name, and rename it when it is complete."""
     partial = path.with_name(f"{path.name}.{os.getpid()}-{secrets.token_hex(4)}.partial")
     partial.touch(exist_ok=False)  # nobody else's file or link has this name
     try:

@@ -113,9 +113,12 @@ def fit_movie(
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite)
-    with open_stack(movie, name=name) as stack, open_executor(scheduler, scheduler_file) as place:
+    with (
+        open_stack(movie, name=name) as stack,
+        open_executor(scheduler, scheduler_file) as executor,
+    ):
         command = f"iscat_analysis.fit_movie({str(stack.path)!r})"
-        analysis = analyse(stack, resolved, progress=progress, command=command, place=place)
+        analysis = analyse(stack, resolved, progress=progress, command=command, executor=executor)
     result = Result(analysis)
     if folder is not None:
         result.save(folder, overwrite=overwrite)

@@ -282,8 +282,8 @@ class Result:
 
     def _facts(self) -> list[tuple[str, str]]:
         table, tracked = event_table(self.analysis), self.analysis.tracks is not None
-        said = tracks_headline if tracked else headline
-        facts = [("", text) for text in said(self.analysis, table)] if len(self) else []
+        headlines = tracks_headline if tracked else headline
+        facts = [("", text) for text in headlines(self.analysis, table)] if len(self) else []
         counts = (self.tracks if tracked else table)["status"].value_counts()
         facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():

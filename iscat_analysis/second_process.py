@@ -45,7 +45,7 @@ class SecondProcess:
         return result
 
     def end(self) -> None:
-        """End it now, whatever it does."""
+        """Kill it, whatever it does."""
         self._held.close()
         self._pool.shutdown(wait=False, cancel_futures=True)
 

@@ -1,7 +1,7 @@
-"""Text from outside, as names of files and samples: it is shown, and never takes effect.
+"""Text from outside, such as names of files and samples, made harmless where it is shown.
 
-A name may hold what a terminal, a spreadsheet, Matplotlib or XML would act on.  Each place where
-text goes has one function here.
+A name may hold characters that a terminal, a spreadsheet, Matplotlib or XML would act on.  For each
+place where text is shown there is one function.
 """
 
 from __future__ import annotations

@@ -32,11 +32,11 @@ _ALLOTTED: ContextVar[_Allotment | None] = ContextVar("allotted", default=None)
 
 
 def _wanted() -> None:
-    """Do nothing: the work is still wanted."""
+    """Do nothing: the work is not cancelled."""
 
 
 class _Inline(ThreadPoolExecutor):
-    """The thread that asks, which does each task at once, if it is still wanted."""
+    """Runs each task at once in the calling thread, unless work is cancelled."""
 
     def __init__(self, stop: Callable[[], None] = _wanted) -> None:
         super().__init__(1)
@@ -53,7 +53,7 @@ class _Inline(ThreadPoolExecutor):
 
 
 class _Watched(ThreadPoolExecutor):
-    """Threads that look before each task whether they are still wanted."""
+    """Threads that check before each task whether work is cancelled."""
 
     def __init__(self, allotment: _Allotment) -> None:
         super().__init__(allotment.count)
@@ -74,8 +74,8 @@ def processors() -> int:
     return os.cpu_count() or 1
 
 
-def beside(work: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Begin work in a thread of its own, with no more threads than are allotted to this one."""
+def start_in_thread(work: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Run a function in a thread of its own, with no more threads than are allotted to this one."""
     pool = ThreadPoolExecutor(1)
     begun = pool.submit(copy_context().run, work, *arguments)
     pool.shutdown(wait=False)
@@ -116,7 +116,7 @@ def over_frames(pool: ThreadPoolExecutor, shape: tuple[int, ...]) -> Mapper:
 
 @contextmanager
 def allotted(count: int, stop: Callable[[], None]) -> Iterator[None]:
-    """Let `threads` start as many threads as a place has, whatever number it is asked for."""
+    """Limit `threads` to the number of an executor, whatever number it is asked for."""
     token = _ALLOTTED.set(_Allotment(count, stop))
     try:
         yield

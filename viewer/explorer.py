@@ -178,7 +178,7 @@ class Explorer(QWidget):
         wanted = layer, layer.data, path, stamp
         if self._preview is not None and _same(wanted, self._made_of):
             return self._preview
-        with self._told(), _busy():
+        with self._errors_shown(), _busy():
             movie = layer.data
             stack = (
                 movie.stack
@@ -202,7 +202,7 @@ class Explorer(QWidget):
         if preview is None:
             return
         window = self.window_frames.value()
-        with self._told():
+        with self._errors_shown():
             if window != self._window:  # each has its threshold, for the same false alarms
                 with _silent(self.threshold):
                     self.threshold.setValue(preview.threshold(window))
@@ -224,7 +224,7 @@ class Explorer(QWidget):
 
     def _threshold_changed(self, *_: object) -> None:
         if self._look is not None:
-            with self._told():
+            with self._errors_shown():
                 self._show_found()
 
     def _show_found(self) -> None:
@@ -267,13 +267,13 @@ class Explorer(QWidget):
 
     def _settings(self, preview: ia.Preview, threshold: float, window: int) -> str:
         """Say with which options the command would search so."""
-        said = []
+        settings = []
         if preview.config.background.method == "sliding" and window != preview.window:
-            said.append(f"--set background.window_frames={window}")
+            settings.append(f"--set background.window_frames={window}")
         if abs(threshold - preview.threshold(window)) > 10.0 ** -self.threshold.decimals():
             alarms = preview.false_alarms(threshold, window)
-            said.append(f"--set detection.false_alarms_per_movie={alarms:.3g}")
-        return "as in the configuration" if not said else " ".join(said)
+            settings.append(f"--set detection.false_alarms_per_movie={alarms:.3g}")
+        return "as in the configuration" if not settings else " ".join(settings)
 
     def show_ratio(self) -> None:
         """Add the contrast of the windows at every frame as a movie."""
@@ -281,7 +281,7 @@ class Explorer(QWidget):
         movie = self.movie.currentData()
         if preview is None or movie is None:
             return
-        with self._told(), _busy():
+        with self._errors_shown(), _busy():
             frames = RatioFrames(preview, movie.data.shape, self.window_frames.value())
             low, high = limits_of(frames)
             limit = max(abs(low), abs(high))
@@ -318,7 +318,7 @@ class Explorer(QWidget):
         self.status.setText(text)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _errors_shown(self) -> Iterator[None]:
         """Show what is wrong with files and settings in place of raising it."""
         try:
             yield

@@ -23,11 +23,11 @@ AnyArray = NDArray[Any]
 AnyFloatArray = NDArray[np.floating[Any]]
 IntArray = NDArray[np.int64]
 
-_STIFFER, _STIFFEST = 1e-3, 1.0
+_LEAST_DAMPING, _LARGEST_DAMPING = 1e-3, 1.0
 """What is added to F, relative to its diagonal, for rows that cannot be told from each other: the
 least, and the most where rounding makes of F what no information is."""
 
-_SHY = 0.1
+_LEAST_DAMPING_LINKED = 0.1
 """The same, where rows follow one another: what two of them hardly tell apart stays as it is."""
 
 
@@ -78,7 +78,7 @@ def keep_slopes(
 
 
 @kernel(fastmath=FAST, _nrt=False)
-def look(image: FloatArray, square: IntArray, out: AnyFloatArray) -> int:
+def gather(image: FloatArray, square: IntArray, out: AnyFloatArray) -> int:
     """Fill `out` with the pixels of a square, line after line, and tell how many they are."""
     r0, r1, c0, c1 = square
     nx = c1 - c0
@@ -187,13 +187,15 @@ def join_rows(
                 joint[i, i] = 1.0
             scale[i] = 1.0 / np.sqrt(joint[i, i])
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)
-        shyly, stiffer = rows.size > 1 and clusters.steps.size > 0, _STIFFER
-        for turn in range(2 if shyly else 1):
+        damped_steps, damping = rows.size > 1 and clusters.steps.size > 0, _LEAST_DAMPING
+        for turn in range(2 if damped_steps else 1):
             out = low if turn == 0 else other
-            stiffer = max(stiffer, _SHY if turn else _STIFFER)
-            while not factorise(joint, order[:n], scale, stiffer, out) and stiffer < _STIFFEST:
-                stiffer *= 10.0
-        if shyly:
+            damping = max(damping, _LEAST_DAMPING_LINKED if turn else _LEAST_DAMPING)
+            while (
+                not factorise(joint, order[:n], scale, damping, out) and damping < _LARGEST_DAMPING
+            ):
+                damping *= 10.0
+        if damped_steps:
             for i in range(n):
                 step[i] *= scale[i]
             solve(other, step[:n])
@@ -268,7 +270,7 @@ def follow_rows(
         n = k * rows.size
         for q in range(rows.size):
             r = rows[q]
-            size = look(move, slopes.squares[r], seen)
+            size = gather(move, slopes.squares[r], seen)
             for a in range(k):
                 step[k * q + a] = slopes.units[r, a] * product(slopes.values[r, a], seen, size)
         low = clusters.factors[clusters.corners[c] : clusters.corners[c + 1]].reshape(n, n)

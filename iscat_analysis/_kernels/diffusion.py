@@ -106,11 +106,11 @@ def displacement_likelihoods(
             p[i], z[i], product[i], quad[i] = 1.0, 0.0, 1.0, 0.0
         for k in range(n):
             main, turn, step = error[c, k], rate[k], steps[c, k]
-            beside, beside_turn = 0.0, 0.0
+            off_diagonal, off_diagonal_slope = 0.0, 0.0
             if k:
-                beside, beside_turn = error_next[c, k - 1], rate_next[k - 1]
+                off_diagonal, off_diagonal_slope = error_next[c, k - 1], rate_next[k - 1]
             for i in range(diffusion.size):
-                band = beside + diffusion[i] * beside_turn
+                band = off_diagonal + diffusion[i] * off_diagonal_slope
                 ratio = band / p[i]
                 z[i] = step - ratio * z[i]
                 p[i] = main + diffusion[i] * turn - band * ratio

@@ -14,7 +14,7 @@ BoolArray = NDArray[np.bool_]
 
 
 @kernel()
-def look(
+def count_and_test(
     kind: int,
     data: FloatArray,
     level: float,

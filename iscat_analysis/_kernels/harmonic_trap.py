@@ -46,7 +46,7 @@ def harmonic_likelihoods(
     m = diffusion.size
     wells, state = np.empty((7, m)), np.empty((8, m))
     width, decay, mean, var_end, var_mean = wells[0], wells[1], wells[2], wells[3], wells[4]
-    both, kept, place, unit, spread = wells[5], wells[6], state[0], state[1], state[2]
+    both, dark_decay, place, unit, spread = wells[5], wells[6], state[0], state[1], state[2]
     product, q11, q12, q22, log_determinant = state[3], state[4], state[5], state[6], state[7]
     for i in range(m):
         width[i] = diffusion[i] / stiffness[i]
@@ -74,11 +74,11 @@ def harmonic_likelihoods(
             if k < 2 or gaps[k - 1] != gaps[k - 2]:
                 dark = gaps[k - 1] - exposure if k else 0.0
                 for i in range(m):
-                    kept[i] = math.exp(-stiffness[i] * dark)
+                    dark_decay[i] = math.exp(-stiffness[i] * dark)
             here, error = positions[c, k], variance[c, k]
             for i in range(m):
-                before, one = kept[i] * place[i], kept[i] * unit[i]
-                wide = width[i] + kept[i] * kept[i] * (spread[i] - width[i])
+                before, one = dark_decay[i] * place[i], dark_decay[i] * unit[i]
+                wide = width[i] + dark_decay[i] * dark_decay[i] * (spread[i] - width[i])
                 s = mean[i] * mean[i] * wide + var_mean[i] + error
                 inverse = 1.0 / s
                 e1, e2 = here - mean[i] * before, 1.0 - mean[i] * one

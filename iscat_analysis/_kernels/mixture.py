@@ -17,13 +17,11 @@ from iscat_analysis._kernels.lattice import FAST
 FloatArray = NDArray[np.float64]
 
 _LOG_2PI = math.log(2.0 * math.pi)
-_SURE = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
+_CERTAIN_SIGMAS = 9.0  # standard deviations above the threshold: a chance of 1 to the last digit
 _TINY = 1e-250  # a density below it is added up by logarithms
 _BLOCK = 128  # events whose numbers stay in the cache
-_LN2_HIGH, _LN2_LOW = (
-    0.6931471803691238,
-    1.90821492927058770002e-10,
-)  # ln 2; the first has few digits
+# Ln 2; the first has few digits
+_LN2_HIGH, _LN2_LOW = 0.6931471803691238, 1.90821492927058770002e-10
 _HALVES = np.exp2(-np.arange(1024.0))
 _LAST_HALF = np.uint32(_HALVES.size - 1)
 
@@ -235,7 +233,7 @@ def detection_score(
         for j in range(k):
             reach[j] = 1.0 / math.sqrt(variance[j] + noise[i])
             at[j] = (mean[j] - threshold) * reach[j]
-            if at[j] > _SURE:
+            if at[j] > _CERTAIN_SIGMAS:
                 part[j], edge[j] = weight[j], 0.0
             else:
                 part[j] = weight[j] * 0.5 * math.erfc(-at[j] * math.sqrt(0.5))

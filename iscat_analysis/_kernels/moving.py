@@ -44,7 +44,7 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
-ASTRAY = 4
+DIVERGED = 4
 """How a fit ended, besides the ways of `scoring`: its plain steps lead nowhere."""
 
 
@@ -142,7 +142,7 @@ def fit_frames(
                     outcome[r], last_one, gain[r] = _climb(
                         near, group[r], pixels, data, search, p, both, value, room
                     )
-                    if outcome[r] == ASTRAY:
+                    if outcome[r] == DIVERGED:
                         place[2], place[3], place[4], place[5], place[6] = r, r0, r1, c0, c1
                         return False
                 here = both[last_one]
@@ -180,7 +180,7 @@ def _climb(
     """Fit one row from p, at which both[0] is drawn and its value, score and information known.
 
     As long as they lie inside the box and improve, the steps of Fisher scoring are taken as they
-    are: every picture is drawn once.  Where they do not, the fit is `ASTRAY`.
+    are: every picture is drawn once.  Where they do not, the fit is `DIVERGED`.
 
     Returns how the fit ended, which of `both` holds the picture at the estimate minus the step, so
     small at last that the gradient tells the rest, and the log-likelihood over that without the
@@ -208,7 +208,7 @@ def _climb(
     for i in range(5):
         if search.free[i]:
             p[i] = min(max(p[i], lower[i]), upper[i])
-    return ASTRAY, at, value
+    return DIVERGED, at, value
 
 
 @kernel(_nrt=False)

@@ -25,10 +25,10 @@ from iscat_analysis._kernels.stamp import STRIP, begin_stamp, stamp_strip
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-CONVERGED, STALLED, EXHAUSTED, HOPELESS = 0, 1, 2, 3
+CONVERGED, STALLED, EXHAUSTED, ABANDONED = 0, 1, 2, 3
 """How a fit ended: step below tolerance; no step improves; iterations used up; little to gain."""
 
-HOPE = 16.0
+LARGEST_GAIN_RATIO = 16.0
 """Multiple of the expected gain in log-likelihood that a fit is trusted to make."""
 
 _TOGETHER = 256
@@ -356,9 +356,9 @@ def maximize(
                 return value, passes, STALLED
             damping = max(10 * damping, 1e-3)
             continue
-        hoped = 0.0
+        largest_gain = 0.0
         for i in range(5):
-            hoped += 0.5 * HOPE * score[i] * step[i]
+            largest_gain += 0.5 * LARGEST_GAIN_RATIO * score[i] * step[i]
         shrink = 1.0
         for i in range(5):
             if active[i] and abs(step[i]) * shrink > max_step[i]:
@@ -373,10 +373,10 @@ def maximize(
             for i in range(5):
                 theta[i] = trial[i]
             return value + gain, passes, CONVERGED
-        if damping == 0.0 and value + hoped < least:
+        if damping == 0.0 and value + largest_gain < least:
             for i in range(5):
                 theta[i] = trial[i]
-            return value + gain, passes, HOPELESS
+            return value + gain, passes, ABANDONED
         if free[2]:
             start, stop = span(lens, pixels, trial, width)
             profile_at(axial, trial[2], start, stop, profile)

@@ -175,7 +175,7 @@ def in_shadow(
 
     Shapes: `peaks` (n, 4), result (n,).
     """
-    hidden = np.zeros(len(peaks), dtype=np.bool_)
+    is_lobe = np.zeros(len(peaks), dtype=np.bool_)
     for own in range(len(peaks)):
         for higher in range(own):
             apart = abs(peaks[own, 0] - peaks[higher, 0])
@@ -188,6 +188,6 @@ def in_shadow(
             if (away < distances[2] and peaks[own, 3] < share * peaks[higher, 3]) or (
                 apart < frames[0] and math.hypot(dx, dy) < distances[0]
             ):
-                hidden[own] = True
+                is_lobe[own] = True
                 break
-    return hidden
+    return is_lobe

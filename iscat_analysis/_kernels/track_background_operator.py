@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
-from iscat_analysis._kernels.background_response import Slopes, look, mix, product, put
+from iscat_analysis._kernels.background_response import Slopes, gather, mix, product, put
 from iscat_analysis._kernels.lattice import FAST
 
 FloatArray = NDArray[np.float64]
@@ -30,7 +30,7 @@ def own_shares(
     k = slopes.values.shape[1]
     for q in range(rows.size):
         values, units = slopes.values[rows[q]], slopes.units[rows[q]]
-        size = look(weight, squares[q], work)
+        size = gather(weight, squares[q], work)
         for a in range(k):
             slope, unit = values[a], units[a]
             for j in range(size):
@@ -70,7 +70,7 @@ def follow(
     for q in range(rows.size):
         values, units, square = slopes.values[rows[q]], slopes.units[rows[q]], squares[q]
         for v in range(images.shape[0]):
-            size = look(images[v], square, work)
+            size = gather(images[v], square, work)
             for a in range(k):
                 felt[q, v, a] = units[a] * product(values[a], work, size)
             for a in range(k):

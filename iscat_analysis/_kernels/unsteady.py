@@ -95,9 +95,9 @@ def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> N
     """
     rows, columns = image.shape
     for i in range(rows):
-        above, below = _beside(i, rows)
+        above, below = _neighbour_range(i, rows)
         for j in range(columns):
-            left, right = _beside(j, columns)
+            left, right = _neighbour_range(j, columns)
             own = image[i, j]
             squares[i, j] += own**2
             products[0, i, j] += own * (image[above, j] + image[below, j]) / 2
@@ -105,7 +105,7 @@ def add_image(image: FloatArray, squares: FloatArray, products: FloatArray) -> N
 
 
 @kernel()
-def _beside(place: int, size: int) -> tuple[int, int]:
+def _neighbour_range(index: int, size: int) -> tuple[int, int]:
     """Give the places on both sides, at the border twice the one inside, alone twice itself."""
     last = size - 1
-    return min(abs(place - 1), last), max(last - abs(last - 1 - place), 0)
+    return min(abs(index - 1), last), max(last - abs(last - 1 - index), 0)

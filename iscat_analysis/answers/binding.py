@@ -276,7 +276,7 @@ def check_reaction(
     *,
     names: tuple[str, str] = ("model", "masses_kda"),
 ) -> None:
-    """See that there is such a reaction, and that the masses are of its partners."""
+    """Check the reaction and the masses of its partners."""
     choice_in(f"`{names[0]}`", model, get_args(Model))
     parts = len(CONCENTRATIONS[model])  # type: ignore[index]
     if masses_kda is None:
@@ -301,12 +301,12 @@ def _read_samples(path: Path) -> pd.DataFrame:
         what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
         raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
     except ValueError as error:
-        said = str(error).splitlines()[0] if str(error) else "it is empty"
-        raise DataError(f"{path}: is no CSV file with a first line of names ({said})") from None
+        reason = str(error).splitlines()[0] if str(error) else "it is empty"
+        raise DataError(f"{path}: is no CSV file with a first line of names ({reason})") from None
 
 
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
-    """Keep the rows that are samples, and give which ones they were."""
+    """Select rows that are samples, and give their indices."""
     rows = rows.rename(columns=lambda column: str(column).strip())
     used = {column for columns in CONCENTRATIONS.values() for column in columns}
     refuse_twice(list(rows.columns), ["path", "role", "report", "movie", *sorted(used)], name)
@@ -320,7 +320,7 @@ def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
 
 
 def with_events(tables: Sequence[EventTable]) -> tuple[list[bool], tuple[str, ...]]:
-    """Tell which tables have events enough for an equilibrium."""
+    """Tell which tables have enough events for an equilibrium."""
     enough = [table.mass_kda.size >= LEAST_EVENTS for table in tables]
     few = [table.name for table, keep in zip(tables, enough, strict=True) if not keep]
     return enough, (
@@ -435,7 +435,7 @@ def _monomer(tables: Sequence[EventTable]) -> tuple[float, str]:
 
 
 def _to_fit(table: EventTable) -> Events:
-    """Give a table's events; where only their edge tells what was missed, that is learned."""
+    """Select a table's events; without a limit of detection, it is fitted too."""
     return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
 
 

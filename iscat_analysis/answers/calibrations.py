@@ -231,11 +231,11 @@ def mass_calibration(
 def analysed_with(events: Path) -> Config | None:
     """Read the configuration with which a table of this package was made; None where it is lost."""
     path = _table(events)
-    beside = path.with_name("config.toml")
-    if path.name != "fits.csv" or not is_file(beside):
+    config_path = path.with_name("config.toml")
+    if path.name != "fits.csv" or not is_file(config_path):
         return None
     try:
-        return load_config(beside)
+        return load_config(config_path)
     except ConfigError:
         return None
 
@@ -285,7 +285,7 @@ def read_contrasts(path: Path) -> pd.DataFrame:
 
 
 def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Landing:
-    """Read the sign of landing off the masses that the table has; dark where it has none."""
+    """Find the sign of landing from the masses of a table; dark where there are none."""
     product = contrast * mass
     product = product[np.isfinite(product)]
     return "bright" if product.size and float(np.median(product)) > 0 else "dark"

@@ -1,4 +1,4 @@
-"""Samples beside each other: which differ, in which masses and fractions."""
+"""Comparison of many samples: which ones differ, in masses or fractions."""
 
 from __future__ import annotations
 
@@ -278,12 +278,12 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
 
 
 def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[str]:
-    """Say what the tests do not hold."""
+    """List what the tests assume."""
     notes = list(dict.fromkeys(note for table in tables for note in table.remarks))
     if any(table.scale_error is not None for table in tables):
         notes.append(
-            "shifts hold no error of the mass scale: samples of different calibrations may differ "
-            "by theirs (systematic_mass_kda of the tables)"
+            "errors of shifts do not include that of the mass scale: samples with different "
+            "calibrations may differ by it (systematic_mass_kda of the tables)"
         )
     if len(found) > _MANY:
         notes.append(

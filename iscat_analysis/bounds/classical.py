@@ -26,10 +26,10 @@ SINGULAR = 1e-9
 It is the squared angle between the derivatives; below it the angle is less than a hundred times the
 3e-7 to which the image's gradient is known, and an inverse would report that error."""
 
-BLIND = 1e-12
+LEAST_INFORMATION_SHARE = 1e-12
 """Share of the light's information below which a parameter is not seen at all."""
 
-TAKES_PART = 1e-3
+LEAST_COMPONENT = 1e-3
 """Component of an unidentifiable direction below which a parameter is not part of it."""
 
 
@@ -41,7 +41,7 @@ class Unidentifiable:
     direction: tuple[float, ...]
 
     def __str__(self) -> str:
-        """Say it in one line."""
+        """Describe it in one line."""
         if len(self.names) == 1:
             return f"{self.names[0]}: the image does not change with it"
         moves = (f"{n} {d:+.3g}" for n, d in zip(self.names, self.direction, strict=True))
@@ -106,35 +106,39 @@ def bounds_from_matrices(
     index = [i for i, name in enumerate(PARAMETERS) if name in free]
     seen = np.diag(fisher).copy()
     limit = np.diag(quantum)
-    seen[~(seen > BLIND * limit)] = np.nan
+    seen[~(seen > LEAST_INFORMATION_SHARE * limit)] = np.nan
     single, joint, qcrb = (np.full(4, np.nan) for _ in range(3))
     single[index] = 1 / np.sqrt(seen[index])
     positive = [i for i in index if limit[i] > 0]
     qcrb[positive] = 1 / np.sqrt(limit[positive])
-    hidden = [Unidentifiable((PARAMETERS[i],), (1.0,)) for i in index if not math.isfinite(seen[i])]
+    unidentifiable = [
+        Unidentifiable((PARAMETERS[i],), (1.0,)) for i in index if not math.isfinite(seen[i])
+    ]
     visible = [i for i in index if math.isfinite(seen[i])]
     if not visible:
-        return EventBounds(single, joint, qcrb, fisher, quantum, tuple(hidden), (), math.nan)
+        return EventBounds(
+            single, joint, qcrb, fisher, quantum, tuple(unidentifiable), (), math.nan
+        )
     scale = single[visible]
     values, vectors = np.linalg.eigh(fisher[np.ix_(visible, visible)] * np.outer(scale, scale))
     null = values < SINGULAR
     for vector in vectors.T[null]:
         step = vector * scale
-        parts = [k for k in range(len(visible)) if abs(vector[k]) > TAKES_PART]
+        parts = [k for k in range(len(visible)) if abs(vector[k]) > LEAST_COMPONENT]
         first = step[parts[0]]
-        hidden.append(
+        unidentifiable.append(
             Unidentifiable(
                 tuple(PARAMETERS[visible[k]] for k in parts),
                 tuple(float(step[k] / first) for k in parts),
             )
         )
-    involved = np.any(np.abs(vectors[:, null]) > TAKES_PART, axis=1)
+    involved = np.any(np.abs(vectors[:, null]) > LEAST_COMPONENT, axis=1)
     variance = np.sum(vectors[:, ~null] ** 2 / values[~null], axis=1)
     joint[visible] = np.where(involved, np.nan, scale * np.sqrt(variance))
     weakest = np.full(4, 0.0)
     weakest[visible] = vectors[:, 0]
-    inflation = math.nan if hidden else 1 / math.sqrt(values[0])
+    inflation = math.nan if unidentifiable else 1 / math.sqrt(values[0])
     return EventBounds(
-        single, joint, qcrb, fisher, quantum, tuple(hidden),
+        single, joint, qcrb, fisher, quantum, tuple(unidentifiable),
         tuple(float(weakest[i]) for i in index), inflation,
     )  # fmt: skip

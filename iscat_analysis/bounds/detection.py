@@ -61,7 +61,7 @@ def power_searched(snr: float, threshold: float) -> float:
 
 
 def detection_limit(experiment: Experiment) -> DetectionLimit | None:
-    """Tell the smallest mass that can be detected."""
+    """Compute the smallest detectable mass."""
     model, at = experiment.model, experiment.config.bounds
     if not model.rho:
         return None

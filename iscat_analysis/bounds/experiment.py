@@ -178,7 +178,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
     root_camera = math.sqrt(experiment.on_camera)
     root_light = math.sqrt(experiment.collected)
     exact = experiment.quantum
-    single, together = quantum_bounds(exact)
+    single, joint_bounds = quantum_bounds(exact)
     index = [PARAMETERS.index(name) for name in free]
     steps = per_step[index]
     light = experiment.collected * exact[np.ix_(index, index)] / np.outer(steps, steps)
@@ -188,14 +188,14 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         "crb_single": _named(NAMES, whole.crb_single * to_rel * root_camera),
         "crb_joint": _named(NAMES, joint.crb_joint * to_rel * root_camera),
         "qcrb": _named(NAMES, single * per_step * to_rel),
-        "qcrb_joint": _named(NAMES, together * per_step * to_rel),
+        "qcrb_joint": _named(NAMES, joint_bounds * per_step * to_rel),
         "qcrb_dong2021": _named(NAMES, paper * per_step * to_rel),
     }
     actual = {
         "crb_single": _named(PARAMETERS, whole.crb_single),
         "crb_joint": _named(PARAMETERS, joint.crb_joint),
         "qcrb": _named(PARAMETERS, single * per_step / root_light),
-        "qcrb_joint": _named(PARAMETERS, together * per_step / root_light),
+        "qcrb_joint": _named(PARAMETERS, joint_bounds * per_step / root_light),
         "qcrb_dong2021": _named(PARAMETERS, paper * per_step / root_light),
     }
     losses = {}
@@ -260,13 +260,13 @@ def information_fraction(bounds: EventBounds) -> FloatArray:
 
 
 def warnings_of(experiment: Experiment) -> list[str]:
-    """Say what makes the numbers unattainable or wrong, one line each."""
+    """Warn of what makes the bounds unattainable or wrong, one line each."""
     config, lines = experiment.config, []
-    well = config.camera.well_depth_e
-    if well is not None and experiment.peak_e >= well:
+    well_depth_e = config.camera.well_depth_e
+    if well_depth_e is not None and experiment.peak_e >= well_depth_e:
         lines.append(
             f"the brightest pixel expects {experiment.peak_e:.3g} e per frame, above "
-            f"camera.well_depth_e = {well:.3g}: lower bounds.photons_per_pixel"
+            f"camera.well_depth_e = {well_depth_e:.3g}: lower bounds.photons_per_pixel"
         )
     if experiment.on_camera > (1 + LOST_LIGHT) * experiment.collected:
         lines.append(

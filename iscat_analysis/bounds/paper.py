@@ -251,7 +251,7 @@ def _model(scheme: str, emission: str = "dong2021") -> ForwardModel:
 
 def table1() -> pd.DataFrame:
     """Make Table 1: quantum bounds per collected photon, five ways."""
-    ways = {
+    conventions = {
         "authors": {s: rectangle_rule_bounds(s) for s in ("iscat", "cobri")},
         "dong2021": {s: _single(_model(s), "dong2021") for s in ("iscat", "cobri")},
         "exact": {s: _single(_model(s), "exact") for s in ("iscat", "cobri")},
@@ -268,7 +268,9 @@ def table1() -> pd.DataFrame:
         ("mass", "relative", 3, "iscat"),
     ):
         row: dict[str, Any] = {"quantity": name, "unit": unit, "printed": PRINTED[name]}
-        rows.append(row | {way: found[scheme][index] for way, found in ways.items()})
+        rows.append(
+            row | {convention: found[scheme][index] for convention, found in conventions.items()}
+        )
     return pd.DataFrame(rows)
 
 

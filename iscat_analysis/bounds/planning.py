@@ -72,8 +72,8 @@ def optimize(
         grid = np.logspace(-ATTENUATION_DECADES, 0, 20 * ATTENUATION_DECADES + 1)
         note = "light on the particle held; the background follows the attenuation squared"
     coarse = scan(config, line, grid, progress=progress)
-    well = config.camera.well_depth_e or math.inf
-    score = coarse.table[column].where(coarse.table["peak_e"] < well).to_numpy(float)
+    well_depth_e = config.camera.well_depth_e or math.inf
+    score = coarse.table[column].where(coarse.table["peak_e"] < well_depth_e).to_numpy(float)
     if not np.isfinite(score).any():
         raise ConfigError(
             f"`optimize` = {axis}: {parameter} is unidentifiable or the camera saturated at every "
@@ -85,7 +85,7 @@ def optimize(
 
     def bound(value: float) -> float:
         experiment = plan(changed(config, line, value), scale=scale)
-        if experiment.peak_e >= well:
+        if experiment.peak_e >= well_depth_e:
             return out_of_reach
         found = experiment.bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]
         return float(found) if math.isfinite(found) else out_of_reach
@@ -145,12 +145,12 @@ def effort(config: Config, goal: Goal) -> list[Effort]:
     """How many frames and photons a precision takes."""
     before = config.bounds.n_before
     finite = config.optics.scheme != "darkfield" or config.background.level_e is not None
-    ways: list[tuple[str, Callable[[int], int]]] = []
+    backgrounds: list[tuple[str, Callable[[int], int]]] = []
     if before and finite:
-        ways.append((f"{before} frames before", lambda _: before))
-        ways.append(("as many frames before as after", lambda n: n))
-    ways.append(("known", lambda _: 0))
-    return [_effort(config, goal, name, way) for name, way in ways]
+        backgrounds.append((f"{before} frames before", lambda _: before))
+        backgrounds.append(("as many frames before as after", lambda n: n))
+    backgrounds.append(("known", lambda _: 0))
+    return [_effort(config, goal, name, frames_before) for name, frames_before in backgrounds]
 
 
 def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int]) -> Effort:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.experiment import Experiment, plan
 from iscat_analysis.bounds.holevo import Holevo, holevo_bound
-from iscat_analysis.bounds.pupil_search import HOPELESS, KNOBS, OTHER_TERMS, Search, setting, sigmas
+from iscat_analysis.bounds.pupil_search import KNOBS, NO_BOUND, OTHER_TERMS, Search, setting, sigmas
 from iscat_analysis.bounds.quantum import transmitted_over_collected
 from iscat_analysis.bounds.scan import calibrated_scale
 from iscat_analysis.config import Config, Optics
@@ -143,7 +143,7 @@ def optimize_pupil(
     whole = Search(config, scale, chosen, free)
     _, best = min((whole.value(optics) for _, optics in found[:3]), key=lambda item: item[0])
     value, best = whole.simplified(best)
-    if not value < HOPELESS:
+    if not value < NO_BOUND:
         raise ConfigError(
             "`optimize` = pupil: the parameters are unidentifiable or the camera saturates with "
             "every pupil; lower bounds.photons_per_pixel, or free fewer parameters with fit.mode"
@@ -183,7 +183,7 @@ def _result(
     )
     before, _ = sigmas(here)
     joint = FREE_PARAMETERS[config.fit.mode]
-    together = dict(zip(joint, bound.sigma, strict=True))
+    holevo_sigma = dict(zip(joint, bound.sigma, strict=True))
 
     def named(values: FloatArray) -> dict[str, float]:
         return {PARAMETERS[i]: float(values[i]) for i in at}
@@ -194,7 +194,7 @@ def _result(
         settings={key: (setting(config.optics, key), setting(best.optics, key)) for key in keys},
         sigma=named(sigma),
         sigma_configured=named(before),
-        sigma_holevo={name: float(together[name]) for name in chosen},
+        sigma_holevo={name: float(holevo_sigma[name]) for name in chosen},
         sigma_quantum=named(own),
         sum=float(np.sum((sigma[at] / own[at]) ** 2)),
         sum_configured=float(np.sum((before[at] / own[at]) ** 2)),

@@ -1,4 +1,4 @@
-"""The search for a pupil: what may change, how good a pupil is, and the way down from a start."""
+"""Search for the best pupil: its variables, its figure of merit, and descents from starts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ FULL_WELL = 0.99
 SAME = 1e-4
 """Relative change of F below which a knob returns to where it was configured: simpler is better."""
 
-HOPELESS = 50.0
+NO_BOUND = 50.0
 """ln F of a pupil that does not identify the parameters or saturates the camera."""
 
 _DIGITS = {"focus_nm": 1, "reference_phase_deg": 1, "mask_na": 3}  # of what is written; others 1
@@ -84,21 +84,21 @@ class Search:
         )
 
     def value(self, optics: Optics) -> tuple[float, Optics]:
-        """Tell ln F and the optics, dimmed where the well asks for it."""
-        well = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
+        """Compute ln F and the optics, dimmed where the well depth requires it."""
+        largest_e = FULL_WELL * (self.config.camera.well_depth_e or math.inf)
         for _ in range(4):
             self.evaluations += 1
             experiment = plan(self.config_of(optics), scale=self.scale)
-            if experiment.peak_e <= well:
+            if experiment.peak_e <= largest_e:
                 sigma, own = sigmas(experiment)
                 at = [PARAMETERS.index(name) for name in self.chosen]
                 total = float(np.sum((sigma[at] / own[at]) ** 2))
-                return (math.log(total) if math.isfinite(total) else HOPELESS), optics
+                return (math.log(total) if math.isfinite(total) else NO_BOUND), optics
             if "attenuation" not in self.free:
                 break
-            dimmed = optics.attenuation * math.sqrt(0.99 * well / experiment.peak_e)
+            dimmed = optics.attenuation * math.sqrt(0.99 * largest_e / experiment.peak_e)
             optics = optics.model_copy(update={"attenuation": dimmed})
-        return HOPELESS, optics
+        return NO_BOUND, optics
 
     def valleys(self, starts: int, seed: int) -> list[tuple[list[str], FloatArray]]:
         """Choose starts: the configured pupil, and the best of a sample with and without mask."""
@@ -114,11 +114,13 @@ class Search:
             low, high = np.array([self.range(key)[0] for key in names]).T
             points = low + (high - low) * rng.random((SAMPLED * len(names), len(names)))
             values = [self.value(self.decode(names, point))[0] for point in points]
-            kept: list[FloatArray] = []
+            distinct: list[FloatArray] = []
             for point in points[np.argsort(values)]:
-                if len(kept) < starts and all(np.linalg.norm(point - p) > APART for p in kept):
-                    kept.append(point)
-            chosen += [(names, point) for point in kept]
+                if len(distinct) < starts and all(
+                    np.linalg.norm(point - p) > APART for p in distinct
+                ):
+                    distinct.append(point)
+            chosen += [(names, point) for point in distinct]
         return chosen
 
     def descend(self, keys: list[str], start: FloatArray) -> tuple[float, Optics]:
@@ -138,7 +140,7 @@ class Search:
         return self.value(self.decode(keys, found.x))
 
     def simplified(self, best: Optics) -> tuple[float, Optics]:
-        """Round the settings to what a laboratory can set, and undo those that change nothing."""
+        """Round the settings, and undo those that change nothing."""
         best = self._with(
             best, {key: _rounded(key, setting(best, key)) for key in self.keys if key != "mask_na"
                    or best.mask_na}
@@ -193,8 +195,8 @@ class Search:
         terms = {k: v for k, v in changes.items() if k not in Optics.model_fields}
         update: dict[str, Any] = {k: v for k, v in changes.items() if k not in terms}
         if terms:
-            kept = {k: v for k, v in (optics.aberrations_nm | terms).items() if v}
-            update["aberrations_nm"] = kept
+            distinct = {k: v for k, v in (optics.aberrations_nm | terms).items() if v}
+            update["aberrations_nm"] = distinct
         return optics.model_copy(update=update | {"file": None, "covariance": None})
 
 

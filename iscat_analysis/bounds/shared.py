@@ -53,7 +53,7 @@ def joint_information(
 
 
 def eliminated(information: FloatArray, shared: int) -> FloatArray:
-    """Information about the first parameters once all others are fitted: the Schur complement.
+    """Information about the first parameters after all others are fitted: the Schur complement.
 
     Shapes: `information` (n, n), result (shared, shared).
     """
@@ -62,7 +62,7 @@ def eliminated(information: FloatArray, shared: int) -> FloatArray:
 
 
 def imitation(information: FloatArray, shared: int) -> FloatArray:
-    """How the last parameters move, per unit error of the first ones.
+    """Change of the last parameters per unit error of the first ones.
 
     Shapes: `information` (n, n), result (n − shared, shared).
     """
@@ -82,7 +82,7 @@ def displacement(
     *,
     level: bool = True,
 ) -> FloatArray:
-    """How the estimates of a particle move with the microscope that is assumed.
+    """Change of the estimates of a particle with the assumed microscope.
 
     Shapes: `theta` (5,), result (len(free).
     """

@@ -31,7 +31,7 @@ _BLOCK_BYTES = 16 * 2**20
 _CLIP_SIGMAS = 3.0
 _NEIGHBOURS = 5  # pixels along each side, whose median tells what a pixel should hold
 _NEIGHBOURHOOD = 7  # pixels, on which a faint background is averaged for the weights
-_OUTSHONE = 0.1
+_LARGEST_SIGNAL_SHARE = 0.1
 _LEAST_TOTAL_E = 1e6  # fewer background photoelectrons leave the power uncertain by over 0.1 %
 
 Check = Callable[[NDArray[Any], int], None]
@@ -99,7 +99,7 @@ def measure_windows(
 
 
 def add_frames(windows: Windows, camera: Camera, counts: NDArray[Any], first: int) -> Windows:
-    """Replace the frames after landing by others.
+    """Replace the frames after landing.
 
     Shapes: `counts` (t, y, x).
     """
@@ -120,18 +120,18 @@ def add_frames(windows: Windows, camera: Camera, counts: NDArray[Any], first: in
 
 
 def start_power(windows: Windows) -> Windows:
-    """Estimate ρ from the pixels that no particle has changed noticeably."""
+    """Estimate ρ from pixels that no particle has changed noticeably."""
     return replace(windows, power_ratio=_robust_ratio(windows))
 
 
 def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> Windows:
-    """Estimate ρ again with the fitted particles accounted for.
+    """Estimate ρ again, over the fitted particles.
 
     Shapes: `explained` (y, x).
     """
     used = ~windows.masked
     if additive:
-        used &= explained < _OUTSHONE * windows.power_ratio * windows.before_e
+        used &= explained < _LARGEST_SIGNAL_SHARE * windows.power_ratio * windows.before_e
     if windows.before_e[used].sum() < _LEAST_TOTAL_E:
         return windows
     after, before = windows.after_e[used], windows.before_e[used]
@@ -145,10 +145,10 @@ def refine_power(windows: Windows, explained: FloatArray, *, additive: bool) -> 
 def smooth_background(
     before_e: FloatArray, variance_e2: FloatArray, masked: BoolArray
 ) -> FloatArray:
-    """Smooth a background where its own counts are too few to tell it pixel by pixel.
+    """Smooth a background whose counts per pixel are too few.
 
-    Weights made of a pixel's own fluctuating background favour the pixels that happened to be dark
-    before, and those seem to have brightened.
+    With weights from a pixel's own fluctuating background, pixels that happened to be dark before
+    get too much weight, and seem to have brightened.
 
     Notes
     -----
@@ -239,7 +239,7 @@ def _median(
 
 
 def find_defects(before_e: FloatArray, read_variance_e2: FloatArray) -> BoolArray:
-    """Dead and hot pixels: far from their neighbours' median, and not by noise.
+    """Find dead and hot pixels: far from the median of their neighbours, beyond noise.
 
     Shapes: `before_e` (y, x), `read_variance_e2` (y, x), result (y, x).
     """

@@ -30,9 +30,9 @@ CEILING_REPEATS = 4
 
 _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is within it
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
-_LEAP = 0.75  # of the largest number, from one frame to the next
-_BRIGHT = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
-_OVERFLOWN = 1e-4  # of a frame's pixels that leap; more than blink
+_OVERFLOW_JUMP = 0.75  # of the largest number, from one frame to the next
+_BRIGHT_QUANTILE = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
+_LARGEST_OVERFLOW_SHARE = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
 
@@ -190,7 +190,7 @@ def read_map(path: Path, key: str, shape_yx: tuple[int, int]) -> FloatArray:
 
 
 def _first(bad: BoolArray) -> str:
-    """Say how many pixels are bad and where the first one is."""
+    """Say how many pixels are bad, and where the first one is."""
     y, x = np.unravel_index(int(np.argmax(bad)), bad.shape)
     count = int(np.count_nonzero(bad))
     return f"in {count} {'pixel' if count == 1 else 'pixels'}, the first at y = {y}, x = {x}"
@@ -263,7 +263,7 @@ def _refuse_negative(frame: NDArray[Any], floor: float | FloatArray, where: str)
 
 
 def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatArray:
-    """Lowest believable count: offset less six standard deviations of read noise and rounding."""
+    """Lowest plausible count: offset less six standard deviations of read noise and rounding."""
     rounding = 1 / 12 if np.issubdtype(dtype, np.integer) else 0.0
     sigma = np.sqrt(np.square(np.divide(camera.read_noise_e, camera.gain_e_per_adu)) + rounding)
     floor: float | FloatArray = camera.offset_adu - _NEGATIVE_SIGMAS * sigma
@@ -271,7 +271,7 @@ def _negative_floor_adu(camera: Camera, dtype: np.dtype[Any]) -> float | FloatAr
 
 
 def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
-    """Refuse a frame that was divided by another: floats around 1, or around 0 as contrasts.
+    """Refuse a frame that was divided by another: values near 1, or near 0 as contrasts.
 
     Shapes: `frame` (y, x).
     """
@@ -301,12 +301,12 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     if not np.issubdtype(counts.dtype, np.unsignedinteger) or counts.dtype.itemsize > 2:
         return
     largest = int(np.iinfo(counts.dtype).max)
-    if not counts.size or int(counts.max()) - int(counts.min()) < _LEAP * largest:
+    if not counts.size or int(counts.max()) - int(counts.min()) < _OVERFLOW_JUMP * largest:
         return
     for before, after in pairwise(counts):
         high = np.maximum(before, after)
-        leap = (high - np.minimum(before, after) > _LEAP * largest) & (high < largest)
-        if _OVERFLOWN < leap.mean() < 1 / 2 and not _lights_up(before, after):
+        leap = (high - np.minimum(before, after) > _OVERFLOW_JUMP * largest) & (high < largest)
+        if _LARGEST_OVERFLOW_SHARE < leap.mean() < 1 / 2 and not _is_shutter(before, after):
             y, x = np.unravel_index(int(np.argmax(leap)), leap.shape)
             raise DataError(
                 f"{name}: counts have overflowed {8 * counts.dtype.itemsize} bits: pixels leap "
@@ -316,9 +316,9 @@ def refuse_overflow(counts: NDArray[Any], name: str) -> None:
             )
 
 
-def _lights_up(before: NDArray[Any], after: NDArray[Any]) -> bool:
+def _is_shutter(before: NDArray[Any], after: NDArray[Any]) -> bool:
     """Whether a shutter opens or closes: even the brightest pixels of one frame are dark."""
-    low, high = sorted(float(np.quantile(frame, _BRIGHT)) for frame in (before, after))
+    low, high = sorted(float(np.quantile(frame, _BRIGHT_QUANTILE)) for frame in (before, after))
     return low < high / 2
 
 
@@ -337,7 +337,7 @@ def converter_ceiling(counts: NDArray[Any]) -> float:
 
 
 def _ceiling_adu(camera: Camera) -> float | FloatArray:
-    """Count from which a pixel is saturated."""
+    """Count from which on a pixel is saturated."""
     ceiling: float | FloatArray = math.inf
     if camera.well_depth_e is not None:
         ceiling = camera.offset_adu + np.divide(camera.well_depth_e, camera.gain_e_per_adu)

@@ -35,17 +35,17 @@ REACH_PX = 4
 
 _STILL_PX = 16.0  # standard deviation of what is smoothed away of the pattern; speckle is finer
 _PASSES = 4
-_CLIP = 4.0  # robust standard deviations beyond which a pixel does not count
+_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a pixel does not count
 _SETTLED_PX = 1e-5
-_POOR = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
-_PATTERN = 1.0  # least squared gradient of the pattern over that of its noise
-_SPIKE = 6.0  # robust standard deviations of a pixel from the median of those around it
-_PEAK = 8.0  # least peak of a phase correlation over the noise of one of random phases
+_POOR_MISMATCH = 3.0  # mismatch over shot noise that asks for another start: the stage has jumped
+_LEAST_PATTERN_POWER = 1.0  # least squared gradient of the pattern over that of its noise
+_SPIKE_SIGMAS = 6.0  # robust standard deviations of a pixel from the median of those around it
+_LEAST_PEAK_RATIO = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Where the fixed pattern was."""
+    """Shift of the fixed pattern with time."""
 
     frames: FloatArray
     shift_px: FloatArray
@@ -57,7 +57,7 @@ class Trajectory:
         return float(np.median(self.error_px.max(axis=1)))
 
     def at(self, frames: FloatArray | float) -> FloatArray:
-        """Shift in some frames, shape (…, 2); a straight line between blocks and beyond them."""
+        """Shift in some frames, shape (…, 2); linear between blocks and beyond them."""
         at, known = np.asarray(frames, dtype=float), self.frames
         if known.size < 2:
             return np.broadcast_to(self.shift_px[0], (*at.shape, 2)).copy()
@@ -76,7 +76,7 @@ def follow_pattern(
     *,
     mapper: Mapper = map,
 ) -> Trajectory | None:
-    """Follow the fixed pattern from block to block.
+    """Measure the shift of the fixed pattern from block to block.
 
     Shapes: `blocks_e` (k, y, x), `power` (k,), `frames` (k,), `usable` (y, x), `read_variance_e2`
     (y, x).
@@ -90,20 +90,20 @@ def follow_pattern(
     usable = trusted(usable)
     mover = Mover((usable.shape[0], usable.shape[1]))
 
-    def one(place: int) -> tuple[FloatArray, FloatArray, float]:
-        here, before = lit[place], lit[place - 1]
+    def one(number: int) -> tuple[FloatArray, FloatArray, float]:
+        here, before = lit[number], lit[number - 1]
         return _register(
             mover, (blocks_e[before] / still)[nearest], blocks_e[here] / still, usable,
             power[before] * noise, power[here] * noise, float(power[here] / power[before]),
         )  # fmt: skip
 
     found = list(mapper(one, range(1, lit.size)))
-    if not found or not np.median([clear for _, _, clear in found]) > _PATTERN:
+    if not found or not np.median([clear for _, _, clear in found]) > _LEAST_PATTERN_POWER:
         return None
     steps = np.array([step for step, _, _ in found])
     errors = np.array([error for _, error, _ in found])
-    way = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
-    return Trajectory(frames[lit], way, np.vstack([errors[:1], errors]))
+    shift = np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+    return Trajectory(frames[lit], shift, np.vstack([errors[:1], errors]))
 
 
 def _register(
@@ -133,7 +133,14 @@ def _register(
                 return nowhere
             scale = max(1.4826 * float(np.nanmedian(some)), 1.0)
             spurious = shift_equations(
-                moved, pattern_read, image_read, ratio, deviation, _CLIP * scale, normal, right
+                moved,
+                pattern_read,
+                image_read,
+                ratio,
+                deviation,
+                _CLIP_SIGMAS * scale,
+                normal,
+                right,
             )
             clear = float(normal[0, 0] + normal[1, 1]) / max(2 * spurious, 1e-300)
             if not clear > 0 or np.linalg.eigvalsh(normal)[0] <= 0:
@@ -146,7 +153,7 @@ def _register(
         return scale, shift, scale * np.sqrt(np.diag(inverse)[:2]), clear
 
     found = refined(np.zeros(2))
-    if found[0] > _POOR:
+    if found[0] > _POOR_MISMATCH:
         far = np.array(measure_drift(pattern, np.where(usable, image, ratio * pattern)))
         if np.isfinite(far).all():
             found = min(found, refined(far), key=lambda result: result[0])
@@ -167,7 +174,7 @@ class Mover:
 
     @property
     def waves(self) -> tuple[ComplexArray, ComplexArray]:
-        """What multiplies a spectrum where the image is differentiated by y or by x."""
+        """Factors that differentiate a spectrum by y and by x."""
         return 2j * np.pi * self._fy[:, None], 2j * np.pi * self._fx[None]
 
     def spectrum(self, image: FloatArray) -> ComplexArray:
@@ -184,7 +191,7 @@ class Mover:
         return image
 
     def transfer(self, shift_px: FloatArray, weights: FloatArray) -> ComplexArray:
-        """Give what multiplies a spectrum where the image is a weighted sum of moved ones.
+        """Factors that make a spectrum that of a weighted sum of shifted images.
 
         Shapes: `shift_px` (n, 2), `weights` (n,), result (v, u).
         """
@@ -218,7 +225,7 @@ def trusted(usable: BoolArray, moved_px: float = 0.0) -> BoolArray:
 
 
 def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
-    """Index that puts the nearest usable pixel's value in place of an unusable one's.
+    """Index that gives unusable pixels the value of the nearest usable one.
 
     Shapes: `usable` (y, x).
     """
@@ -227,7 +234,7 @@ def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
 
 
 def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
-    """Give the light that stays where it is while the pattern moves.
+    """Estimate the light that does not move with the pattern.
 
     Shapes: `blocks_e` (k, y, x), `usable` (y, x), result (y, x).
     """
@@ -263,7 +270,7 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
         return math.nan, math.nan
     surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=taper.shape)
     at = np.unravel_index(int(np.argmax(surface)), surface.shape)
-    if surface[at] * math.sqrt(surface.size) < _PEAK:
+    if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
         return math.nan, math.nan
     y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, taper.shape, strict=True))
     fy, fx = np.meshgrid(fft.fftfreq(rows), fft.rfftfreq(columns), indexing="ij")
@@ -277,7 +284,7 @@ def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, 
 
 
 def _without_spikes(image: FloatArray) -> FloatArray:
-    """Put the median of those around in the place of pixels that stand out of them."""
+    """Replace outlying pixels by the median of their neighbours."""
     around = median_filter(image, size=3)
     out = np.abs(image - around)
-    return np.where(out > _SPIKE * 1.4826 * np.median(out), around, image)
+    return np.where(out > _SPIKE_SIGMAS * 1.4826 * np.median(out), around, image)

@@ -22,26 +22,28 @@ from scipy.special import chdtri
 from iscat_analysis.camera.light_changes import Changes
 from iscat_analysis.records import BoolArray, FloatArray
 
-_MOST = 6  # waves: a source with two interfering reflections has one, with three three
-_SIDE = 160  # squares along an axis, at most, of which a spectrum is made
-_ABOVE = 100.0  # times what is around it, beyond noise, that a wave has in the spectrum: of a
+_MOST_WAVES = 6  # waves: a source with two interfering reflections has one, with three three
+_MOST_SQUARES = 160  # squares along an axis, at most, of which a spectrum is made
+# Times what is around it, beyond noise, that a wave has in the spectrum: of a
+_LEAST_POWER_RATIO = 100.0
 # pattern that moves, the largest of 1e4 points has half of that
 _BY_CHANCE = 1e-10  # that a point is as far above noise: a field has some 1e4
-_CLIP = 5.0  # robust standard deviations of the changes of a pixel
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_CLIP_SIGMAS = 5.0  # robust standard deviations of the changes of a pixel
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _ZOOMS = 4  # each to half the step, from half a wave over the field
 _TURNS = 4  # of the fit of wave vectors that follows
 _DEGREES_PER_WAVE = 4  # of a polynomial that follows waves of the field
-_SLOWEST = 2.5  # waves over the field that are left to polynomials
-_BESIDE = 8  # degree of the polynomial beside which waves are looked for: it follows fewer of them
-_STEEPEST = 4  # degree of the heights of waves
+_FEWEST_PERIODS = 2.5  # waves over the field that are left to polynomials
+# Degree of the polynomial beside which waves are looked for: it follows fewer of them
+_SMOOTH_DEGREE = 8
+_MOST_AMPLITUDE_DEGREE = 4  # degree of the heights of waves
 _PIXELS_PER_TERM = 150  # as of the polynomial
 _LEAST_SQUARES = 24  # along an axis
 
 
 @dataclass(frozen=True, eq=False)
 class Fringes:
-    """Plane waves whose heights and phases change."""
+    """Plane waves whose amplitudes and phases change."""
 
     waves: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
     degree: int = 0
@@ -75,23 +77,25 @@ NO_FRINGES = Fringes()
 
 
 def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
-    """Look for plane waves among changes of the light."""
-    side = max(1, -(-max(changes.light_e.shape) // _SIDE))
+    """Find plane waves among changes of the light."""
+    side = max(1, -(-max(changes.light_e.shape) // _MOST_SQUARES))
     change, light = changes.binned(side)
     if min(light.shape) < _LEAST_SQUARES:
         return NO_FRINGES
-    beside = min(highest, _BESIDE)
-    spread = _NORMAL * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
-    change = _without_smooth(np.clip(change, -_CLIP * spread, _CLIP * spread), beside)
-    slowest = min(highest / _DEGREES_PER_WAVE, _SLOWEST)
+    smooth_degree = min(highest, _SMOOTH_DEGREE)
+    spread = _SIGMA_PER_MAD * np.median(np.abs(change[:, light > 0]), axis=1)[:, None, None]
+    change = _without_smooth(
+        np.clip(change, -_CLIP_SIGMAS * spread, _CLIP_SIGMAS * spread), smooth_degree
+    )
+    slowest = min(highest / _DEGREES_PER_WAVE, _FEWEST_PERIODS)
     least = changes.least(window) / changes.error
     waves, square, rest = np.empty((0, 2)), 0.0, change
-    while len(waves) < _MOST:
+    while len(waves) < _MOST_WAVES:
         peak = _peak(rest, slowest)
         if peak is None:
             break
-        found = _refined(change, light, np.vstack([waves, peak]), beside)
-        beyond, left = _explained(change, light, Fringes(found), beside)
+        found = _refined(change, light, np.vstack([waves, peak]), smooth_degree)
+        beyond, left = _explained(change, light, Fringes(found), smooth_degree)
         if beyond - square < least:
             break
         waves, square, rest = found, beyond, left
@@ -99,18 +103,24 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
     if not len(waves):  # the others are the foot of what the polynomial follows
         return NO_FRINGES
     room = changes.used.sum() / _PIXELS_PER_TERM
-    most = max(k for k in range(_STEEPEST + 1) if not k or len(waves) * (k + 1) * (k + 2) <= room)
+    most = max(
+        k
+        for k in range(_MOST_AMPLITUDE_DEGREE + 1)
+        if not k or len(waves) * (k + 1) * (k + 2) <= room
+    )
     squares = np.array([
-        _explained(change, light, Fringes(waves, k), beside)[0] for k in range(most + 1)
+        _explained(change, light, Fringes(waves, k), smooth_degree)[0] for k in range(most + 1)
     ])  # fmt: skip
     degree = int(np.flatnonzero(squares > squares.max() - least).min())
     return Fringes(waves / side, degree, math.sqrt(max(squares[degree], 0.0) * changes.error))
 
 
-def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: int) -> FloatArray:
-    """Give waves the vectors with which they leave least, beside a polynomial.
+def _refined(
+    change: FloatArray, light: FloatArray, waves: FloatArray, smooth_degree: int
+) -> FloatArray:
+    """Refine wave vectors by Gauss–Newton steps, over a smooth polynomial.
 
-    A wave whose vector is off by d leaves i d·r of itself (Gauss-Newton).
+    A wave whose vector is wrong by d leaves the residual i d·r times itself.
     """
     y, x = (np.arange(n) - (n - 1) / 2 for n in light.shape)
     flat, root = change.reshape(len(change), -1), np.sqrt(light)
@@ -118,7 +128,7 @@ def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: i
         phase = waves[:, :1, None] * y[:, None] + waves[:, 1:, None] * x
         both = root * np.stack([np.cos(phase), np.sin(phase)])
         parts = np.concatenate([both, both * y[:, None], both * x])
-        terms = _without_smooth(parts.reshape(-1, *light.shape), beside)
+        terms = _without_smooth(parts.reshape(-1, *light.shape), smooth_degree)
         found, *_ = np.linalg.lstsq(terms.reshape(len(terms), -1).T, flat.T, rcond=None)
         ahead, behind = np.moveaxis(found.reshape(3, 2, len(waves), -1), 1, 0)
         height, slope = ahead[0] - 1j * behind[0], ahead[1:] - 1j * behind[1:]
@@ -128,33 +138,33 @@ def _refined(change: FloatArray, light: FloatArray, waves: FloatArray, beside: i
 
 
 def _explained(
-    change: FloatArray, light: FloatArray, fringes: Fringes, beside: int
+    change: FloatArray, light: FloatArray, fringes: Fringes, smooth_degree: int
 ) -> tuple[float, FloatArray]:
-    """Fit fringes beside a polynomial, which is no part of the changes any more.
+    """Fit fringes over a smooth polynomial, which `change` has no part of.
 
-    Gives their mean square beyond that of noise, in its variances, and what they leave.
+    Returns their mean square beyond noise, in variances of it, and the residual.
     """
     rows, columns, products = fringes.axes(light.shape)
     down, along = np.nonzero(products)
     terms = np.sqrt(light) * rows.T[down][:, :, None] * columns.T[along][:, None]
-    basis, _ = np.linalg.qr(_without_smooth(terms, beside).reshape(len(terms), -1).T)
+    basis, _ = np.linalg.qr(_without_smooth(terms, smooth_degree).reshape(len(terms), -1).T)
     seen = change.reshape(len(change), -1) @ basis
     rest = change - (seen @ basis.T).reshape(change.shape)
     return float((np.square(seen) - 1).sum()) / len(change), rest
 
 
 def _without_smooth(change: FloatArray, degree: int) -> FloatArray:
-    """Take the polynomial of a degree off changes (pairs, y, x)."""
+    """Subtract the polynomial of a degree from changes (pairs, y, x)."""
     rows, columns = (
         np.linalg.qr(legvander(np.linspace(-1, 1, n), degree))[0] for n in change.shape[1:]
     )
     degrees = np.arange(degree + 1)
-    kept = np.add.outer(degrees, degrees) <= degree
-    return np.asarray(change - rows @ (kept * (rows.T @ change @ columns)) @ columns.T)
+    low_orders = np.add.outer(degrees, degrees) <= degree
+    return np.asarray(change - rows @ (low_orders * (rows.T @ change @ columns)) @ columns.T)
 
 
 def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
-    """Give the wave vector of the point that stands out of the mean spectrum; None without one."""
+    """Find the wave vector of the highest peak of the mean spectrum; None without one."""
     pairs, high, wide = change.shape
     windows = np.hanning(high)[:, None] * np.hanning(wide)
     seen = change * (windows / math.sqrt(float(np.square(windows).mean())))
@@ -162,7 +172,7 @@ def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
     around = np.maximum(_around(power, wide), 1.0)
     waves = np.hypot(np.fft.fftfreq(high)[:, None] * high, np.fft.rfftfreq(wide) * wide)
     noise = float(chdtri(2 * pairs, _BY_CHANCE)) / (2 * pairs)
-    most = np.maximum(noise, around + _ABOVE * (around - 1))
+    most = np.maximum(noise, around + _LEAST_POWER_RATIO * (around - 1))
     above = np.where(waves > slowest, power / most, 0.0)
     at = np.unravel_index(int(above.argmax()), above.shape)
     if above[at] <= 1:
@@ -171,14 +181,14 @@ def _peak(change: FloatArray, slowest: float) -> FloatArray | None:
     wave = 2 * np.pi * np.array(sampled)
     step = np.pi / np.array([high, wide])
     for _ in range(_ZOOMS):
-        ways = wave[:, None] + step[:, None] * np.arange(-2, 3)
+        trial_waves = wave[:, None] + step[:, None] * np.arange(-2, 3)
         down, along = (
-            np.exp(-1j * np.outer(way, np.arange(n)))
-            for way, n in zip(ways, (high, wide), strict=True)
+            np.exp(-1j * np.outer(trial, np.arange(n)))
+            for trial, n in zip(trial_waves, (high, wide), strict=True)
         )
         near = np.square(np.abs(down @ seen @ along.T)).sum(axis=0)
         best = np.unravel_index(int(near.argmax()), near.shape)
-        wave = np.array([ways[0, best[0]], ways[1, best[1]]])
+        wave = np.array([trial_waves[0, best[0]], trial_waves[1, best[1]]])
         step = step / 2
     return wave
 

@@ -27,7 +27,7 @@ from iscat_analysis.camera.counts import (
     rounding_variance_adu2,
 )
 from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain
-from iscat_analysis.camera.pattern_jitter import without_shaking
+from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.response import Response, full_scale, linear, response_of
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.camera.successive import averaged_noise
@@ -43,21 +43,22 @@ EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 _MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at, a second
 _LEAST_FRAMES = 8
 _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
-_LOOKS = 24  # frames all over a movie, that tell how much light there is
-_FIRST = 64  # frames among which some may be dark
-_DARK = 0.5  # of the usual counts, below which a frame may be without light
-_LEAST = 0.01  # of the usual counts, by which dark frames may differ
-_TOLD, _LEAK = 0.1, 0.1  # of what the counts of dark frames would show, if they were light
-_BLINKS = 4.0  # times the median, of the noise of a pixel in the dark that is left out
-_QUIET = 0.5  # of the noise that its counts would have if they were light
+_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
+_FIRST_FRAMES = 64  # frames among which some may be dark
+_DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
+_DARK_SPREAD_SHARE = 0.01  # of the usual counts, by which dark frames may differ
+# of what the counts of dark frames would show, if they were light: its error, and itself
+_LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
+_LARGEST_NOISE_RATIO = 4.0  # times the median, of the noise of a pixel in the dark that is left out
+_DARK_NOISE_SHARE = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
 _FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
-_SHAKEN = 0.03  # of the noise, from where motion of the pattern is taken off before
+_LEAST_JITTER_SHARE = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
 _WORD = 16  # bits of most files
-_RESOLVED = 0.4  # of λ/NA, below which pixels are finer than any detail of light
+_RESOLVED_PIXEL = 0.4  # of λ/NA, below which pixels are finer than any detail of light
 _FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
 
@@ -96,8 +97,8 @@ class LearnedCamera:
         )
 
     @property
-    def said(self) -> str:
-        """Give the numbers and where they come from, in one line."""
+    def description(self) -> str:
+        """Describe the numbers and their sources in one line."""
         parts = []
         for key, words in (
             ("gain_e_per_adu", "{} e per count"),
@@ -135,11 +136,11 @@ class LearnedCamera:
 def with_camera(
     movie: Stack, config: Config, span: tuple[int, int]
 ) -> tuple[Stack, Config, LearnedCamera]:
-    """Give a movie through its response curve, and a configuration with numbers of the camera."""
+    """Apply the response curve to a movie, and set the numbers of its camera."""
     text = find_text(movie, span)
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
-    resolved = pixel_nm < _RESOLVED * optics.wavelength_nm / optics.na
+    resolved = pixel_nm < _RESOLVED_PIXEL * optics.wavelength_nm / optics.na
     learned = learn_camera(
         movie if text is None else patched(movie, text), config.camera, span,
         additive=optics.scheme == "darkfield",
@@ -194,23 +195,23 @@ def learn_camera(
 def _sample(
     movie: CountSource, span: tuple[int, int], pixels: int
 ) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Read the first frames with light that do not repeat each other, and those in the dark.
+    """Read the first frames with light, without repeats, and those in the dark.
 
     Shapes: `lit` (t, y, x), `dark` (k, y, x).
     """
     total = movie.shape[0]
-    looks = np.unique(np.linspace(span[0], span[1] - 1, _LOOKS).astype(int)).tolist()
+    looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
-    opening = _finite(movie.read(0, min(_FIRST, total)))
+    opening = _finite(movie.read(0, min(_FIRST_FRAMES, total)))
     if not levels or not len(opening):
         return opening, None
     usual = float(np.quantile(levels, 0.75))
     means = opening.mean(axis=(1, 2))
-    dim = (means < _DARK * usual) & (means > 0)
-    dim &= means - means.min() < _LEAST * usual  # and no shutter that is opening
+    dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
+    dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
     counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
-    lit = counts.mean(axis=(1, 2)) > _DARK * usual
+    lit = counts.mean(axis=(1, 2)) > _DARK_LIGHT_SHARE * usual
     repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
     counts = counts[lit & ~repeats]
     if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
@@ -220,7 +221,7 @@ def _sample(
 
 
 def _finite(frames: NDArray[Any]) -> NDArray[Any]:
-    """Leave out frames that have a pixel without a number; they are refused, or left out, later.
+    """Drop frames with pixels that are not numbers; these are handled later.
 
     Shapes: `frames` and result (t, y, x).
     """
@@ -229,7 +230,7 @@ def _finite(frames: NDArray[Any]) -> NDArray[Any]:
 
 
 def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
-    """Tell whether frames have not the pattern of light, nor its noise where that is even.
+    """Tell whether frames have neither the pattern of light nor its noise.
 
     Shapes: `dark` (k, y, x), `lit` (t, y, x).
     """
@@ -239,14 +240,14 @@ def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
     share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
     rest = float(np.mean((apart - share * pattern) ** 2))
     error = math.sqrt(rest / power) if power > 0 else math.inf
-    if error < _TOLD * as_light:
-        return abs(share) < _LEAK * as_light + 3 * error
+    if error < _LIT_SHARE_ERROR * as_light:
+        return abs(share) < _LIT_SHARE * as_light + 3 * error
     noise = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
-    return noise < _QUIET * as_light * _noise_adu2(lit)
+    return noise < _DARK_NOISE_SHARE * as_light * _noise_adu2(lit)
 
 
 class _Learning:
-    """What is known of a camera while it is being learned."""
+    """The numbers of a camera while they are being measured."""
 
     def __init__(
         self,
@@ -267,12 +268,12 @@ class _Learning:
         self._dark_variance: float | None = None
 
     def number(self, key: str) -> Number:
-        """Give one of the numbers, of a map the mean."""
+        """Value of a number; of a map, its mean."""
         value = float(np.mean(getattr(self.camera, key)))
         return Number(value, self._se[key], self._source[key])
 
     def response(self) -> Response | None:
-        """Give the curve that makes light of counts, where these bend in a way that is known."""
+        """Make the response curve where the counts follow a known law that is not linear."""
         law, found = self.law, self.transfer
         if law is None or found is None or not law.bent or not law.certain:
             return None
@@ -280,7 +281,7 @@ class _Learning:
         return response_of(law, found, self.camera, max(top, float(self.counts.max())))
 
     def take_metadata(self, metadata: StackMetadata) -> None:
-        """Begin with what the camera's driver wrote into the file."""
+        """Take the numbers that the driver of the camera wrote into the file."""
         step = 2 ** padded_bits(self.counts)  # whose driver counts in its own bits
         for key, per in (("gain_e_per_adu", 1 / step), ("offset_adu", step)):
             value = getattr(metadata, key)
@@ -298,11 +299,11 @@ class _Learning:
             self._set("offset_adu", float(np.mean(pixels)), error, DARK)
         if "read_noise_e" in self.free and len(dark) > 1:
             variance = np.mean(np.diff(dark.astype(np.float64), axis=0) ** 2, axis=0) / 2
-            usual = variance < _BLINKS * np.median(variance)
+            usual = variance < _LARGEST_NOISE_RATIO * np.median(variance)
             self._dark_variance = float(variance[usual].mean()) if usual.any() else None
 
     def learn(self) -> None:
-        """Learn what is free from the frames with light."""
+        """Measure what is not configured, on frames with light."""
         if len(self.counts) < 2:
             self._cannot("it has no two frames with light")
             return
@@ -320,7 +321,7 @@ class _Learning:
         self.changed.add(key)
 
     def _cannot(self, why: str) -> None:
-        """Say once that the gain keeps its assumption."""
+        """Say once that the gain keeps its default."""
         if self._source["gain_e_per_adu"] == ASSUMPTION:
             self.messages.append(
                 f"the camera's gain cannot be learned from this movie, because {why}: "
@@ -361,11 +362,13 @@ class _Learning:
         longer = averaged_noise(counts, seen)
         if longer is not None:
             return found.gain_e_per_adu / longer, found.gain_se / longer, EFFECTIVE
-        still = without_shaking(counts[:_FIRST], seen)
-        calm, rough = (_short(part, seen) for part in (still, counts[:_FIRST].astype(np.float64)))
+        still = without_pattern_jitter(counts[:_FIRST_FRAMES], seen)
+        calm, rough = (
+            _short(part, seen) for part in (still, counts[:_FIRST_FRAMES].astype(np.float64))
+        )
         if calm is not None and rough is not None:
             ratio = calm.noise_ratio / rough.noise_ratio
-            if ratio < 1 - _SHAKEN - 3 * calm.noise_ratio_se:
+            if ratio < 1 - _LEAST_JITTER_SHARE - 3 * calm.noise_ratio_se:
                 return found.gain_e_per_adu / ratio, found.gain_se / ratio, MEASURED
         spectrum = measure_spectrum(counts, seen)
         if spectrum is not None and spectrum.correlated:
@@ -375,7 +378,7 @@ class _Learning:
         return found.gain_e_per_adu, found.gain_se, MEASURED
 
     def _learn_slope(self) -> None:
-        """Measure the gain where the offset is most of the dark: by pixels of different light."""
+        """Measure gain against light, where most of the counts are offset."""
         if "gain_e_per_adu" not in self.free:
             return
         found = measure_transfer(self.counts, self.camera)
@@ -389,7 +392,7 @@ class _Learning:
             self._set("gain_e_per_adu", gain, gain * found.noise.se / found.level, MEASURED)
 
     def _learn_law(self) -> None:
-        """Find the law of the counts, and with it an offset or a read noise that are free."""
+        """Find the law of the counts, with offset and read noise where these are free."""
         self.transfer = found = measure_transfer(self.counts, self.camera)
         if found is None:
             return
@@ -417,7 +420,7 @@ class _Learning:
             self.law = None
 
     def _take_offset(self, law: Law, level_adu: float, error: float) -> None:
-        """Take the offset where the light ends, and look at the rest once more."""
+        """Take the offset from the zero of the light, and measure the rest again."""
         offset = float(np.mean(self.camera.offset_adu)) + law.value * level_adu
         self._set("offset_adu", offset, error, MEASURED)
         self.free.discard("offset_adu")
@@ -431,7 +434,7 @@ class _Learning:
         self._learn_law()
 
     def _mind_rounding(self) -> None:
-        """Count rounding as read noise, where it is not far below the light's noise."""
+        """Count rounding as read noise, unless it is far below the noise of the light."""
         gain = float(np.mean(self.camera.gain_e_per_adu))
         rounding = rounding_variance_adu2(self.counts) * gain**2 - 1 / 12
         light = float(np.median(self.camera.to_electrons(self.counts.mean(axis=0))))
@@ -442,7 +445,7 @@ class _Learning:
 
 def _noise_adu2(counts: NDArray[Any]) -> float:
     """Half the mean square of what successive frames differ by, without the laser's flicker."""
-    steps = np.diff(counts[:_FIRST].astype(np.float64), axis=0)
+    steps = np.diff(counts[:_FIRST_FRAMES].astype(np.float64), axis=0)
     steps -= steps.mean(axis=(1, 2), keepdims=True)
     return float(np.mean(steps**2)) / 2
 

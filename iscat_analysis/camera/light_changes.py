@@ -1,7 +1,7 @@
-"""How the light of a movie changed between frames that are apart, summed and counted in its noise.
+"""Changes of the light between frames that are far apart, in units of their noise.
 
-What is looked for in it: `camera.amplifier_boundaries` and `camera.fringes`, and
-smooth changes in `iscat_analysis.camera.lighting`.
+`camera.amplifier_boundaries`, `camera.fringes` and `iscat_analysis.camera.lighting` look for
+structure in them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray
 
-MATTERS = 0.02
+LEAST_CONTRAST_SHARE = 0.02
 """Of the noise variance of a pixel between two windows, below which no change does."""
 
 _LEAST_LIGHT = 0.1  # of the median pixel's
@@ -24,7 +24,7 @@ _LEAST_LIGHT = 0.1  # of the median pixel's
 
 @dataclass(frozen=True, eq=False)
 class Changes:
-    """Sums of frames before and after."""
+    """Sums of frames, before and after."""
 
     sums_e: FloatArray
     frames: NDArray[np.int64]
@@ -55,20 +55,20 @@ class Changes:
 
     @property
     def used(self) -> BoolArray:
-        """Pixels that say something of the light, shape (y, x)."""
+        """Pixels with enough light, shape (y, x)."""
         return self.light_e > 0
 
     @property
     def error(self) -> float:
-        """Variance of a contrast that is measured with all of the light."""
+        """Variance of a contrast that is measured with all the light."""
         return float(self.noises.mean() / self.light_e.sum())
 
     def least(self, window: int) -> float:
-        """Give the mean square contrast of two windows below which a change does not matter."""
-        return MATTERS * float(2 / (window * self.light_e[self.used].mean()))
+        """Mean square contrast of two windows below which a change is ignored."""
+        return LEAST_CONTRAST_SHARE * float(2 / (window * self.light_e[self.used].mean()))
 
     def divided(self, factors: FloatArray) -> Changes:
-        """Divide the sums.
+        """Divide the light of the sums by measured factors.
 
         Shapes: `factors` (pairs, 2, y, x).
         """
@@ -89,7 +89,7 @@ class Changes:
 
 
 def squares(values: FloatArray, side: int) -> FloatArray:
-    """Sum squares of pixels.
+    """Sum over squares of pixels.
 
     Shapes: `values` (…, y, x), result (…, y // side, x // side).
     """
@@ -104,7 +104,7 @@ def squares(values: FloatArray, side: int) -> FloatArray:
 def usable_pixels(
     pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]], light_e: FloatArray, camera: Camera
 ) -> BoolArray:
-    """Tell which pixels say something of the light.
+    """Tell which pixels have enough light.
 
     Shapes: `pairs` (t, y, x), `light_e` (y, x), result (y, x).
     """

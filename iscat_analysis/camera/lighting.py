@@ -44,69 +44,76 @@ _PIXELS_PER_TERM = 150  # fewer would take more of a particle's light than its n
 _CELLS = 20  # along each axis of the grid on which changes are looked for
 _PASSES = 4
 _ROUNDS = 2  # in which seams and fringes are looked for, each beside the other
-_CLIP = 4.0  # robust standard deviations beyond which a cell shows something else
-_SIGNIFICANT = 8.0  # standard errors beyond which a change is one: it repeats in time and place
-_SPREAD = 0.1  # of the cells, over which a change of the light is spread at least
-_SMOOTH = 3.0  # times what a smooth change leaves over in a cell, that it must make there
+_CLIP_SIGMAS = 4.0  # robust standard deviations beyond which a cell shows something else
+_LEAST_SIGMAS = 8.0  # standard errors beyond which a change is one: it repeats in time and place
+_LEAST_CELL_SHARE = 0.1  # of the cells, over which a change of the light is spread at least
+# Times what a smooth change leaves over in a cell, that it must make there
+_LEAST_SMOOTH_RATIO = 3.0
 _LOWEST_HIGHEST = 3  # degree without which smooth is not told from fine
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 _LEAST_SHARE = 1e-10  # of what is told of the best known combination of terms
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Measures what of frames changes over their mean one; `find_surface` makes it."""
+    """Measures how the light of frames differs from the mean light; made by `find_surface`."""
 
     light_e: FloatArray
     degree: int
     rms: float = math.nan
     fringes: Fringes = NO_FRINGES
-    seams: AmplifierBoundaries = ((), ())
-    haze: float = 0.0
+    amplifier_boundaries: AmplifierBoundaries = ((), ())
+    stray_light: float = 0.0
 
     @property
     def measures(self) -> bool:
         """Whether anything changes."""
-        return bool(self.degree or len(self.fringes.waves) or any(self.seams) or self.haze)
+        return bool(
+            self.degree
+            or len(self.fringes.waves)
+            or any(self.amplifier_boundaries)
+            or self.stray_light
+        )
 
     @property
     def messages(self) -> list[str]:
-        """What the user should know, one line each."""
-        said = []
+        """Messages for the user, one line each."""
+        lines = []
         if self.degree:
-            said.append(
+            lines.append(
                 f"the light changes slowly over the field, by {100 * self.rms:.2g} % rms between "
                 "frames that are compared, as where the beam wanders or fringes pass: each frame "
                 f"was divided by its own smooth light, a polynomial of degree {self.degree}"
             )
         if len(self.fringes.waves):
             periods = " and ".join(f"{period:.3g}" for period in self.fringes.periods_px)
-            said.append(
+            lines.append(
                 f"fringes with a period of {periods} pixels pass over the field, and change the "
                 f"light by {100 * self.fringes.rms:.2g} % rms between frames that are compared: "
                 "each frame was divided by its own; what reflects the laser beside the sample "
                 "makes them: tilt it, or take a source that is less coherent"
             )
-        if any(self.seams):
+        if any(self.amplifier_boundaries):
             parts = " and ".join(
                 f"{name} {', '.join(map(str, cuts))}"
-                for name, cuts in zip(("row", "column"), self.seams, strict=True)
+                for name, cuts in zip(("row", "column"), self.amplifier_boundaries, strict=True)
                 if cuts
             )
-            said.append(
+            lines.append(
                 f"parts of the field, which begin at {parts}, change as a whole, as where the "
                 "camera reads them out by amplifiers of their own: each part of each frame was "
                 "divided by its own light"
             )
-        if self.haze:
-            said.append(
+        if self.stray_light:
+            lines.append(
                 "dim pixels change by more of their light than bright ones, as where something is "
-                f"added to all of them that changes by {100 * self.haze:.2g} % of the mean light "
-                "within the movie: light that does not come through the objective, the offset of "
-                "a camera that warms up, or what focus does; each frame was divided by its own, "
-                "but what is added all the time is not known, and masses may be wrong by as much"
+                f"added to all of them that changes by {100 * self.stray_light:.2g} % of the mean "
+                "light within the movie: light that does not come through the objective, the "
+                "offset of a camera that warms up, or what focus does; each frame was divided by "
+                "its own, but what is added all the time is not known, and masses may be wrong by "
+                "as much"
             )
-        return said
+        return lines
 
     @cached_property
     def _axes(self) -> tuple[FloatArray, FloatArray]:
@@ -128,14 +135,14 @@ class Surface:
         parts = [
             (*(legvander(np.linspace(-1, 1, n), self.degree) for n in shape), smooth),
             self.fringes.axes(shape),
-            parts_of(shape, self.seams),
+            parts_of(shape, self.amplifier_boundaries),
         ]
         rows, columns, products = zip(*parts, strict=True)
         return np.hstack(rows), np.hstack(columns), block_diag(*products) > 0
 
     @cached_property
     def _inverse(self) -> FloatArray:
-        """Turns overlaps with the products into coefficients, the least where several would do."""
+        """Pseudoinverse that turns overlaps with the products into coefficients."""
         rows, columns = self._axes
         down, along = np.divmod(self._kept, columns.shape[1])
         gram = np.empty((self._kept.size, self._kept.size))
@@ -144,15 +151,15 @@ class Surface:
                 (rows * rows[:, i : i + 1]).T @ self.light_e @ (columns * columns[:, j : j + 1])
             )
             gram[k] = overlap[down, along]
-        if self.haze:
+        if self.stray_light:
             light, more = self.light_e, lift(self.light_e)
-            beside = (rows.T @ (light * more) @ columns)[down, along]
+            mixed = (rows.T @ (light * more) @ columns)[down, along]
             own = np.sum(light * more**2)
-            gram = np.block([[gram, beside[:, None]], [beside, own]])
+            gram = np.block([[gram, mixed[:, None]], [mixed, own]])
         return np.asarray(np.linalg.pinv(gram, rcond=_LEAST_SHARE, hermitian=True))
 
     def factors(self, electrons: FloatArray) -> FloatArray:
-        """Measure the change of frames.
+        """Give the light of frames over the mean light.
 
         Shapes: `electrons` (…, y, x), result (…, y, x).
         """
@@ -165,15 +172,17 @@ class Surface:
         change = np.where(lit, seen - self.light_e, 0.0)
         overlap = rows.T @ change @ columns
         flat = overlap.reshape(*overlap.shape[:-2], -1)
-        told = flat[..., self._kept]
-        if self.haze:
+        overlaps = flat[..., self._kept]
+        if self.stray_light:
             more = lift(self.light_e)
-            told = np.concatenate([told, np.sum(change * more, axis=(-2, -1))[..., None]], axis=-1)
-        found = told @ self._inverse
+            overlaps = np.concatenate(
+                [overlaps, np.sum(change * more, axis=(-2, -1))[..., None]], axis=-1
+            )
+        found = overlaps @ self._inverse
         terms = np.zeros_like(flat)
         terms[..., self._kept] = found[..., : self._kept.size]
         out = 1 + rows @ terms.reshape(overlap.shape) @ columns.T
-        if self.haze:
+        if self.stray_light:
             out += found[..., -1:, None] * more
         return np.where(out > 0, out, 1.0)
 
@@ -181,7 +190,7 @@ class Surface:
 def find_surface(
     pairs: Sequence[tuple[NDArray[Any], NDArray[Any]]], camera: Camera, window: int
 ) -> Surface | None:
-    """Look for changes of the distribution of the light between frames.
+    """Find changes of the distribution of the light between frames.
 
     Shapes: `pairs` (t, y, x).
     """
@@ -196,18 +205,18 @@ def find_surface(
     seamless = _even(changes, replace(found, fringes=NO_FRINGES))
     degree, rms = _smooth(seamless, window, highest, found.fringes)
     found = replace(found, degree=degree, rms=rms)
-    found = replace(found, haze=find_stray_light(_even(changes, found), window))
+    found = replace(found, stray_light=find_stray_light(_even(changes, found), window))
     return found if found.measures else None
 
 
 def _patterns(changes: Changes, window: int, highest: int) -> Surface:
-    """Look for seams and fringes, which hide each other."""
+    """Find amplifier boundaries and fringes, in turns, because each hides the other."""
     found = Surface(changes.light_e, 0, 0.0)
     for _ in range(_ROUNDS):
-        seams = find_amplifier_boundaries(_even(changes, found), window, found.seams)
-        if len(found.fringes.waves) and seams == found.seams:
+        seams = find_amplifier_boundaries(_even(changes, found), window, found.amplifier_boundaries)
+        if len(found.fringes.waves) and seams == found.amplifier_boundaries:
             break
-        found = replace(found, seams=seams, fringes=NO_FRINGES)
+        found = replace(found, amplifier_boundaries=seams, fringes=NO_FRINGES)
         fringes = find_fringes(_even(changes, found), window, highest)
         found = replace(found, fringes=fringes)
         if not len(fringes.waves):
@@ -216,7 +225,7 @@ def _patterns(changes: Changes, window: int, highest: int) -> Surface:
 
 
 def _even(changes: Changes, found: Surface) -> Changes:
-    """Divide sums by what was found in them."""
+    """Divide sums by the changes found in them."""
     if not found.measures:
         return changes
     return changes.divided(found.factors(changes.sums_e))
@@ -234,15 +243,15 @@ def _smooth(changes: Changes, window: int, highest: int, fringes: Fringes) -> tu
     beyond = np.cumsum(excess[::-1])[::-1]  # what polynomials of lower degree leave
     terms = np.cumsum([s.shape[1] for s in of_degree[::-1]])[::-1]
     least = changes.least(window) / changes.error
-    seen = (beyond > least) & (beyond > _SIGNIFICANT * np.sqrt(2 * terms / count))
-    if not seen[0] or beyond[0] < _SMOOTH * left * grid.basis.shape[0]:
+    seen = (beyond > least) & (beyond > _LEAST_SIGMAS * np.sqrt(2 * terms / count))
+    if not seen[0] or beyond[0] < _LEAST_SMOOTH_RATIO * left * grid.basis.shape[0]:
         return 0, 0.0
     return int(np.flatnonzero(seen).max()) + 1, math.sqrt(float(beyond[0]) * changes.error)
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Frames summed in cells, and what they are made of there."""
+    """Sums of frames in cells, and the basis functions in the same cells."""
 
     changes: FloatArray  # (pairs, cells) in standard deviations of shot noise
     basis: FloatArray  # (cells, terms) orthonormal: waves, then polynomials
@@ -284,9 +293,9 @@ class _Grid:
         return cls(out, basis, degrees)
 
     def squares(self) -> tuple[FloatArray, float]:
-        """Squared coefficients (pairs, terms) in their variances, and what they leave of a cell's.
+        """Squared coefficients (pairs, terms) and residual, in variances of a cell.
 
-        Where nothing but noise is left, the mean of that over cells and pairs is 0.
+        Where there is only noise, the mean of the residual over cells and pairs is 0.
         """
         out: list[FloatArray] = []
         whole = np.eye(self.basis.shape[1])
@@ -294,7 +303,7 @@ class _Grid:
         for change in self.changes:
             # what landed and is large would bend the first fit so that nothing stands out of it
             away = np.abs(change - np.median(change))
-            kept = away <= _CLIP * max(1.0, _NORMAL * float(np.median(away)))
+            kept = away <= _CLIP_SIGMAS * max(1.0, _SIGMA_PER_MAD * float(np.median(away)))
             if kept.sum() <= self.basis.shape[1]:
                 kept[:] = True
             for _ in range(_PASSES):
@@ -304,12 +313,12 @@ class _Grid:
                 found = part.T @ change[kept]
                 fitted = self.basis @ np.linalg.solve(turned, found)
                 rest = np.abs(change - fitted)
-                inside = rest <= _CLIP * max(1.0, _NORMAL * float(np.median(rest)))
+                inside = rest <= _CLIP_SIGMAS * max(1.0, _SIGMA_PER_MAD * float(np.median(rest)))
                 if np.array_equal(inside, kept) or inside.sum() <= found.size:
                     break
                 kept = inside
             squares = np.square(fitted - np.median(fitted))
-            if squares.sum() ** 2 < _SPREAD * squares.size * np.square(squares).sum():
+            if squares.sum() ** 2 < _LEAST_CELL_SHARE * squares.size * np.square(squares).sum():
                 continue  # dust that landed, which is nowhere else
             out.append(np.square(found))
             left += float(np.square(rest[kept]).sum())

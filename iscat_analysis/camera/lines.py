@@ -35,7 +35,7 @@ _LEAST_LIT = 0.25  # of a line's pixels that must be usable
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Which lines flicker together, and how smoothly the light changes; `find_lines` makes it."""
+    """Flicker of rows and columns and smooth changes of the light; made by `find_lines`."""
 
     light_e: FloatArray
     shares: tuple[float, float]
@@ -43,13 +43,13 @@ class Lines:
 
     @property
     def messages(self) -> list[str]:
-        """What the user should know, one line each."""
-        said = []
+        """Messages for the user, one line each."""
+        lines = []
         if self.surface is not None:
-            said += self.surface.messages
+            lines += self.surface.messages
         if any(self.shares):
-            said.append(self._flicker)
-        return said
+            lines.append(self._flicker)
+        return lines
 
     @property
     def _flicker(self) -> str:
@@ -71,13 +71,13 @@ class Lines:
             "smooth_rms": surface.rms,
             "fringe_periods_px": surface.fringes.periods_px.tolist(),
             "fringe_rms": surface.fringes.rms,
-            "seam_rows": list(surface.seams[0]),
-            "seam_columns": list(surface.seams[1]),
-            "haze": surface.haze,
+            "seam_rows": list(surface.amplifier_boundaries[0]),
+            "seam_columns": list(surface.amplifier_boundaries[1]),
+            "haze": surface.stray_light,
         }
 
     def factors(self, electrons: FloatArray) -> FloatArray:
-        """Measure the smooth change of the light, and that of the lines over that of the frame.
+        """Measure the smooth change of the light, and the light of lines over that of the frame.
 
         Shapes: `electrons` (…, y, x), result (…, y, x).
         """
@@ -99,7 +99,7 @@ class Lines:
         return out
 
     def divided(self, counts: NDArray[Any], camera: Camera) -> NDArray[Any]:
-        """Divide frames by what is measured of their light.
+        """Divide frames by their unsteady light.
 
         Shapes: `counts` (t, y, x), result (t, y, x).
         """
@@ -115,14 +115,14 @@ class Lines:
         return out
 
     def taken(self, signal: FloatArray) -> FloatArray:
-        """Give what frames are divided by because of a signal.
+        """Give the change of the divisor that a signal makes.
 
         Shapes: `signal` (…, y, x), result (…, y, x).
         """
         return np.broadcast_to(self.factors(self.light_e * (1 + signal)), signal.shape)
 
     def left(self, signal: FloatArray) -> FloatArray:
-        """Give what is left of a signal.
+        """Give what is left of a signal after the division.
 
         Shapes: `signal` (y, x), result (y, x).
         """
@@ -163,7 +163,7 @@ def find_lines(
     *,
     mapper: Mapper = map,
 ) -> Lines | None:
-    """Look for rows and columns that flicker.
+    """Find rows and columns that flicker.
 
     Shapes: `counts` (t, y, x).
     """
@@ -184,5 +184,5 @@ def find_lines(
 
 
 def steady(movie: Stack, lines: Lines | None, camera: Camera) -> Stack:
-    """Give a movie as it is analysed, without the flicker of its lines."""
+    """Divide the unsteady light of a movie out."""
     return movie if lines is None else movie.seen_as(SteadyFrames(movie, lines, camera))

@@ -1,8 +1,4 @@
-"""What a movie says of its camera, and whether its noise agrees.
-
-`resolve_metadata` fills the configuration from the file; `diagnose_gain` measures the gain from the
-noise itself.
-"""
+"""Metadata of a movie, and whether its noise agrees with them."""
 
 from __future__ import annotations
 
@@ -34,7 +30,7 @@ _OUTLIER_FRAMES = 16  # fewer, and the variance of one pixel is too uncertain to
 
 
 def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
-    """Fill what the configuration leaves out from what the movie says of itself."""
+    """Set what the configuration leaves open from the metadata of the movie."""
     notes = []
     found: dict[str, float] = {}
     for key, unit, words in (
@@ -69,15 +65,15 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
             "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
         )
     camera = config.camera.model_copy(update=found)
-    optics, said = _with_optics(config.optics, metadata)
-    notes += said
+    optics, taken_from_file = _with_optics(config.optics, metadata)
+    notes += taken_from_file
     config = config.model_copy(update={"camera": camera, "optics": optics})
     source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
     return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
 
 
 def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
-    """Put what the movie says of its optics in the place of what is as by default."""
+    """Replace defaults of the optics by the metadata of the movie."""
     found: dict[str, float] = {}
     notes = []
     for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
@@ -110,19 +106,19 @@ def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[
 
 
 def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
-    """Say that pixels are larger than a particle's spot is wide; refuse twice that."""
+    """Warn that pixels are larger than the spot of a particle; refuse twice that size."""
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
     spot_nm = optics.wavelength_nm / (2 * optics.na)
     if pixel_nm is None or pixel_nm <= spot_nm:
         return
-    said = (
+    problem = (
         f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
         f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
     )
     advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
     if pixel_nm > 2 * spot_nm:
-        raise DataError(f"{said}; {advice}")
-    yield f"{said}, so that pictures are not resolved; unless it was binned so far, {advice}"
+        raise DataError(f"{problem}; {advice}")
+    yield f"{problem}, so that pictures are not resolved; unless it was binned so far, {advice}"
 
 
 def _refuse_unlikely(pixel_nm: float, source: str) -> None:
@@ -136,7 +132,7 @@ def _refuse_unlikely(pixel_nm: float, source: str) -> None:
 
 @dataclass(frozen=True)
 class GainDiagnosis:
-    """Measured noise beside what the configured gain predicts."""
+    """Measured noise over that of the configured gain."""
 
     noise_ratio: float
     noise_ratio_se: float
@@ -146,7 +142,7 @@ class GainDiagnosis:
     n_frames: int
     n_pixels: int
     noise_counts: float = math.inf
-    shaking: PatternJitter | None = None
+    pattern_jitter: PatternJitter | None = None
 
     @property
     def off(self) -> bool:
@@ -156,32 +152,36 @@ class GainDiagnosis:
     @property
     def shakes(self) -> bool:
         """Whether motion of the fixed pattern explains most of an excess."""
-        return self.off and self.shaking is not None and self.shaking.share > MOST_EXPLAINED
+        return (
+            self.off
+            and self.pattern_jitter is not None
+            and self.pattern_jitter.share > MOST_EXPLAINED
+        )
 
     @property
     def message(self) -> str | None:
         """One sentence for the user where the gain is off; else None."""
         if not self.off:
             return None
-        said = (
+        problem = (
             f"the noise variance is {self.noise_ratio:.3g} ± {self.noise_ratio_se:.1g} times what "
             f"camera.gain_e_per_adu = {self.configured_gain:.4g} predicts"
         )
         if self.noise_counts < 1:
             return (
-                f"{said}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
+                f"{problem}, but the noise is smaller than a count ({self.noise_counts:.2g}) and "
                 "rounding hides it: record or export the movie with more bits"
             )
-        if self.shaking is not None and self.shakes:
+        if self.pattern_jitter is not None and self.shakes:
             return (
-                f"{said}; the gain is not the cause: the fixed pattern shakes by "
-                f"{self.shaking.rms_px:.2g} pixels from frame to frame, which explains "
-                f"{min(self.shaking.share, 1.0):.0%} of what is too much: damp vibrations of the "
-                "stage and the beam"
+                f"{problem}; the gain is not the cause: the fixed pattern shakes by "
+                f"{self.pattern_jitter.rms_px:.2g} pixels from frame to frame, which explains "
+                f"{min(self.pattern_jitter.share, 1.0):.0%} of what is too much: damp vibrations "
+                "of the stage and the beam"
             )
         # Noise that grows with the light itself can only add, so only an excess has two causes.
         cause = "unless the light itself is noisy, " if self.noise_ratio > 1 else ""
-        return f"{said}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
+        return f"{problem}; {cause}set camera.gain_e_per_adu = {self.gain_e_per_adu:.4g}"
 
 
 def diagnose_gain(
@@ -271,23 +271,23 @@ def diagnose_gain(
         n_pixels=int(np.count_nonzero(kept)),
         noise_counts=float(per_count) if whole else math.inf,
     )
-    return with_shaking(found, counts, camera, masked=~used)
+    return with_pattern_jitter(found, counts, camera, masked=~used)
 
 
-def with_shaking(
+def with_pattern_jitter(
     found: GainDiagnosis, counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None
 ) -> GainDiagnosis:
-    """Measure what motion of the fixed pattern explains of an excess, where there is one.
+    """Measure how much of an excess of noise the motion of the fixed pattern explains.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
-    if not found.off or found.noise_ratio < 1 or found.shaking is not None:
+    if not found.off or found.noise_ratio < 1 or found.pattern_jitter is not None:
         return found
-    return replace(found, shaking=measure_pattern_jitter(counts, camera, masked=masked))
+    return replace(found, pattern_jitter=measure_pattern_jitter(counts, camera, masked=masked))
 
 
 def _without_outliers(ratios: FloatArray, n_frames: int) -> BoolArray:
-    """Leave out pixels that blink, whose variance would outweigh all the others'."""
+    """Leave out blinking pixels, whose variance would outweigh that of all others."""
     if n_frames < _OUTLIER_FRAMES:
         return np.ones(ratios.shape, dtype=np.bool_)
     # Relative spread of half the mean squared successive difference of normal numbers

@@ -1,6 +1,6 @@
-"""Noise that is none of the light's: a fixed pattern that shakes, counts that are too coarse.
+"""Noise that is not the light's: a fixed pattern that shakes, or counts that are too coarse.
 
-Both look like a wrong gain to whoever compares variance with mean.
+In variance against mean, both look like a wrong gain.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ MOST_EXPLAINED = 0.5
 
 @dataclass(frozen=True)
 class PatternJitter:
-    """How much the fixed pattern moves from frame to frame."""
+    """Motion of the fixed pattern from frame to frame."""
 
     share: float
     rms_px: float
@@ -29,10 +29,10 @@ class PatternJitter:
 def measure_pattern_jitter(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> PatternJitter | None:
-    """Compare what differs between neighbouring frames with the gradient of their mean.
+    """Fit the difference of neighbouring frames with the gradient of their mean.
 
-    A pattern B that moves by δ changes by −δ·∇B: the difference of two frames is fitted with ∂_y B
-    and ∂_x B, weighted by shot noise.  Of noise alone each explains 1 of χ².
+    A pattern B that moves by δ changes by −δ·∇B.  The difference of two frames is fitted with ∂_y B
+    and ∂_x B, weighted by shot noise.  Of noise alone each of them explains 1 of χ².
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
@@ -51,10 +51,10 @@ def measure_pattern_jitter(
     return PatternJitter(explained / beyond, float(rms))
 
 
-def without_shaking(
+def without_pattern_jitter(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> NDArray[Any]:
-    """Take the motion of the fixed pattern off frames, to first order.
+    """Remove the motion of the fixed pattern from frames, to first order.
 
     Shapes: `counts` (t, y, x), `masked` (y, x), result (t, y, x).
     """
@@ -68,7 +68,7 @@ def without_shaking(
 
 @dataclass(frozen=True)
 class _Pattern:
-    """Frames of equal power, their mean, and how well they tell its motion."""
+    """Frames of equal power, their mean, and the Fisher information on its motion."""
 
     light: FloatArray  # (t, y, x) [e]
     power: FloatArray  # (t,), that was divided out
@@ -99,7 +99,7 @@ class _Pattern:
         return cls(light, power, mean, slopes, used, variance, information)
 
     def motion(self, changes: FloatArray) -> FloatArray:
-        """Fit the slopes to changes (k, p) at the pixels used: how far each is along −y and −x."""
+        """Fit the slopes to changes (k, p) in the used pixels: the motion along −y and −x."""
         there = self.slopes[:, self.used]
         seen = np.einsum("kp,ip,p->ki", changes, there, 1 / self.variance)
         return np.asarray(np.linalg.solve(self.information, seen.T).T)

@@ -20,18 +20,18 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
 _PAIRS = 48  # of neighbouring frames, all over the movie
-_FEWEST = 8  # of them that tell
+_FEWEST_PAIRS = 8  # of them that tell
 _SIDE_PX = 512  # of the middle of the field, that is looked at
 _LEAST_E = 20.0  # photoelectrons of a pixel, below which noise is far from normal
 _FINEST = 0.5  # cycles per pixel, beyond which only noise is: the corners of the spectrum
 _COARSE = (0.1, 0.3)  # cycles per pixel that they are compared with
-_STILL = 0.9  # quantile of their ratio, of pairs of frames between which little vibrates
-_OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
-_SIGNIFICANT = 6.0  # standard errors
-_UNEVEN = 0.1  # of the finest noise, by which it must change from frame to frame
+_STILL_QUANTILE = 0.9  # quantile of their ratio, of pairs of frames between which little vibrates
+_OUTLIER_SIGMAS = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_LEAST_SIGMAS = 6.0  # standard errors
+_LEAST_NOISE_CHANGE = 0.1  # of the finest noise, by which it must change from frame to frame
 _WEAK, _STRONG = 0.5, 2.0  # finest noise over that at coarser patterns
 _MEDIAN_ERROR = 2.33  # √n times the relative error of a variance by the median deviation of n
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
 
 Kind = Literal["interpolated", "smoothed", "sharpened"]
 
@@ -50,7 +50,7 @@ class Processing:
 
     @property
     def message(self) -> str:
-        """What the user should know."""
+        """Message for the user."""
         what = {
             "interpolated": "the frames were interpolated, as where a movie is aligned by parts of "
             f"a pixel: the noise of the finest patterns changes by {100 * self.uneven:.0f} % "
@@ -90,7 +90,7 @@ def find_processing(
         spectrum = _spectrum(movie, camera, start, (rows, columns))
         if spectrum is not None:
             found.append((spectrum[fine].mean(), spectrum[coarse].mean()))
-    if len(found) < _FEWEST:
+    if len(found) < _FEWEST_PAIRS:
         return None
     finest, coarser = np.array(found).T
     # |z|² of a complex normal number scatters by its mean; a normalised movie's noise changes at
@@ -99,8 +99,8 @@ def find_processing(
     uneven = min(
         _uneven(finest, 1 / sizes[0]), _uneven(finest / coarser, 1 / sizes[0] + 1 / sizes[1])
     )
-    ratio = float(np.quantile(finest / coarser, _STILL))
-    if uneven > _UNEVEN:
+    ratio = float(np.quantile(finest / coarser, _STILL_QUANTILE))
+    if uneven > _LEAST_NOISE_CHANGE:
         return Processing("interpolated", ratio, uneven)
     if moving:
         return None
@@ -115,9 +115,9 @@ def _uneven(values: FloatArray, chance: float) -> float:
     Some that lie far off do not count, as of frames that are cut off.
     """
     middle = float(np.median(values))
-    scatter = _NORMAL * float(np.median(np.abs(values - middle))) / middle
+    scatter = _SIGMA_PER_MAD * float(np.median(np.abs(values - middle))) / middle
     excess = scatter**2 - chance
-    significant = excess > _SIGNIFICANT * chance * _MEDIAN_ERROR / math.sqrt(len(values))
+    significant = excess > _LEAST_SIGMAS * chance * _MEDIAN_ERROR / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
 
 
@@ -155,6 +155,6 @@ def _spectrum(
     change = np.where(used, (after - before) / np.sqrt(np.where(used, light, 1.0)), 0.0)
     # shot noise over the light: alike in all frames, whatever the laser does
     change *= math.sqrt(2 / (1 / powers[0] + 1 / powers[1]))
-    limit = _OUTLIER * _NORMAL * float(np.median(np.abs(change[used])))
+    limit = _OUTLIER_SIGMAS * _SIGMA_PER_MAD * float(np.median(np.abs(change[used])))
     waves = fft.rfft2(np.clip(change, -limit, limit))
     return np.asarray(np.square(waves.real) + np.square(waves.imag))

@@ -1,8 +1,7 @@
-"""A camera whose counts are no line in light: the curve that makes photoelectrons of its counts.
+"""A camera whose counts are not linear in light, and the curve that linearises them.
 
-The curve is a CSV file of two columns, ``counts`` and ``photoelectrons``, both of which rise.  Each
-frame goes through it before anything else, so that all stages see photoelectrons: a camera of gain
-1 and offset 0.
+The curve is a CSV file of two rising columns, ``counts`` and ``photoelectrons``.  Each frame is
+converted before anything else, so that all later stages see a camera of gain 1 and offset 0.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _HIGHEST = 0.98  # of the counts at which a camera saturates, up to which the cu
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """Photoelectrons of counts, linear between points; beyond the last one a pixel is full.
+    """Photoelectrons against counts, linear between points; beyond the last one a pixel is full.
 
     Shapes: `counts` (n,), `photoelectrons` (n,).
     """
@@ -42,7 +41,7 @@ class Response:
     photoelectrons: FloatArray
 
     def of(self, counts: NDArray[Any]) -> FloatArray:
-        """Convert counts; below the first point, where noise goes, by the slope that is there."""
+        """Convert counts; below the first point with the slope there, because of noise."""
         seen = np.asarray(counts, dtype=np.float64)
         out: FloatArray = np.interp(seen, self.counts, self.photoelectrons)
         below = np.minimum(seen - self.counts[0], 0.0)
@@ -100,14 +99,14 @@ class LinearFrames:
 
 
 def linear(movie: Stack, config: CameraConfig) -> Stack:
-    """Give a movie as its response curve has it."""
+    """Linearise a movie with its response curve."""
     if config.response is None:
         return movie
     return movie.seen_as(LinearFrames(movie, read_response(Path(config.response))))
 
 
 def full_scale(config: CameraConfig, dtype: DTypeLike) -> float | None:
-    """Give the number that no pixel exceeds: the end of the curve, or of the stored type."""
+    """Largest number that a pixel can have: the end of the curve, or of the stored type."""
     if config.response is not None:
         return read_response(Path(config.response)).full
     stored = np.dtype(dtype)

@@ -27,13 +27,13 @@ MARGIN_PX = REACH_PX + 2
 
 _PAIRS = 64  # of frames that are compared
 _LIGHT_E = 20.0  # mean photoelectrons of a pixel and frame below which noise is far from normal
-_OUTLIER = 5.0  # robust standard deviations beyond which a pixel's change is no noise
-_LANDED = 4  # such pixels more than in most pairs of frames, where something has landed
-_GLANCES = 9  # pairs whose median number of such pixels is that of a pair in which nothing lands
-_SOME = 8  # of as many pixels, whose median tells how large the noise is
-_SIGNIFICANT = 4.5  # standard errors beyond which a correlation is one
-_NEGLIGIBLE = 0.01  # of the expected variance, below which nothing is corrected
-_LEAST = 0.05  # of the variance, that every frequency is taken to have
+_OUTLIER_SIGMAS = 5.0  # robust standard deviations beyond which a pixel's change is no noise
+_MOST_MORE_OUTLIERS = 4  # such pixels more than in most pairs of frames, where something has landed
+_FIRST_PAIRS = 9  # their median number of such pixels is that of a pair in which nothing lands
+_EVERY_NTH_PIXEL = 8  # of as many pixels, whose median tells how large the noise is
+_LEAST_SIGMAS = 4.5  # standard errors beyond which a correlation is one
+_LEAST_CORRECTION = 0.01  # of the expected variance, below which nothing is corrected
+_LEAST_VARIANCE = 0.05  # of the variance, that every frequency is taken to have
 _NORMAL_QUARTILE = 0.6744897501960817
 
 
@@ -55,17 +55,17 @@ class NoiseSpectrum:
 
     @property
     def alike(self) -> float:
-        """How many times fewer pixels would tell as much of the variance, were they independent."""
+        """Factor by which correlation reduces the number of independent pixels."""
         covariance = fft.irfft2(self.power, s=self.shape)
         return float(np.sum(np.square(covariance / covariance[0, 0])))
 
     @property
     def correlated(self) -> bool:
-        """Whether neighbouring pixels are."""
-        return max(map(abs, self.neighbours)) > _NEGLIGIBLE
+        """Whether neighbouring pixels are correlated."""
+        return max(map(abs, self.neighbours)) > _LEAST_CORRECTION
 
     def whitened(self, weighted: NDArray[Any], weight: NDArray[Any]) -> NDArray[Any]:
-        """Turn a signal, times its information, into what a template's overlap is taken with.
+        """Divide a signal, times its information, by the spectrum of the noise.
 
         Shapes: `weighted` (y, x), `weight` (y, x).
         """
@@ -105,7 +105,7 @@ class NoiseSpectrum:
 
     @property
     def message(self) -> str:
-        """One line about what is not as expected; empty where nothing but the variance is."""
+        """One line about what differs from white noise; empty where only the variance differs."""
         parts = []
         x, y = self.neighbours
         if self.correlated:
@@ -119,8 +119,8 @@ class NoiseSpectrum:
             return ""
         return (
             " and ".join(parts)
-            + ": the search allows for it, and its false alarms are as many as configured; the "
-            "fits take pixels for independent, so their σ are not right"
+            + ": the search accounts for it, so that false alarms are as configured; the fits "
+            "assume independent pixels, so that their σ are wrong"
         )
 
 
@@ -176,15 +176,15 @@ def measure_spectrum(
         z = after / powers[1] - before / powers[0]
         z /= np.sqrt(by_light * expected + by_frame * read_noise)
         z[~used] = 0.0
-        middle = float(np.median(np.abs(z[used][::_SOME])))
-        return z, _OUTLIER * middle / _NORMAL_QUARTILE
+        middle = float(np.median(np.abs(z[used][::_EVERY_NTH_PIXEL])))
+        return z, _OUTLIER_SIGMAS * middle / _NORMAL_QUARTILE
 
     def outliers(found: tuple[NDArray[np.float32], float] | None) -> int:
         return 0 if found is None else int(np.count_nonzero(np.abs(found[0]) > found[1]))
 
     # a pixel that blinks is in every pair; where something bright lands, its rings are no noise
-    few = starts[:: max(1, pairs // _GLANCES)].tolist()
-    most = float(np.median([outliers(change(start)) for start in few])) + _LANDED
+    few = starts[:: max(1, pairs // _FIRST_PAIRS)].tolist()
+    most = float(np.median([outliers(change(start)) for start in few])) + _MOST_MORE_OUTLIERS
 
     def periodogram(start: int) -> FloatArray | None:
         found = change(start)
@@ -226,7 +226,7 @@ def _spectrum_of(
         """
         mean: FloatArray = lines.mean(axis=0)
         # a distance and its opposite have the same covariance: half as many are independent
-        limit = _SIGNIFICANT * error * math.sqrt(2 / len(lines))
+        limit = _LEAST_SIGMAS * error * math.sqrt(2 / len(lines))
         return mean if abs(mean[here]) > limit else 0 * mean
 
     by_row, by_column = shared(covariance[lags, far_x].T), shared(covariance[far_y, lags])
@@ -237,10 +237,10 @@ def _spectrum_of(
         line if line[here] > 0 else np.zeros_like(line) for line in (by_row, by_column)
     )
     common = by_row[:, None] + by_column[None, :]
-    beside = np.abs(local)
-    beside[here, here] = 0.0
-    if beside.max() < max(_SIGNIFICANT * error, _NEGLIGIBLE * variance):
-        if abs(variance - 1) < _NEGLIGIBLE and not common.any():
+    neighbours = np.abs(local)
+    neighbours[here, here] = 0.0
+    if neighbours.max() < max(_LEAST_SIGMAS * error, _LEAST_CORRECTION * variance):
+        if abs(variance - 1) < _LEAST_CORRECTION and not common.any():
             return None
         local = np.zeros_like(local)
         local[here, here] = variance - common[here, here]
@@ -249,7 +249,7 @@ def _spectrum_of(
     whole[lags, :] += by_row[:, None]
     whole[:, lags] += by_column[None, :]
     whole[np.ix_(lags, lags)] += local
-    power = np.maximum(fft.rfft2(whole).real, _LEAST * variance)
+    power = np.maximum(fft.rfft2(whole).real, _LEAST_VARIANCE * variance)
     # signals are multiplied by the root of the light before they meet the whitening filter
     alike = fft.irfft2(np.abs(fft.rfft2(light)) ** 2, s=light.shape)
     kernel = fft.irfft2(1 / power, s=light.shape) * alike / alike[0, 0]

@@ -1,8 +1,9 @@
-"""Light, or counts of the dark camera, that are added to all pixels alike and change.
+"""Light, or dark counts, that are added to all pixels equally and change with time.
 
-Where a room's light or the camera's offset drifts, dim pixels change by more of themselves than
-bright ones: by one over their light.  In every part of the field that is the same number, whatever
-smooth light does there; what a pattern that moves makes of it differs from part to part.
+Where light of the room or the offset of the camera drifts, pixels change relative to their own
+light by one over it, dim ones most.  The size of that change is the same in all parts of the field.
+Smooth changes of the light do not affect it; a pattern that moves makes it differ from part to
+part.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from iscat_analysis.records import FloatArray
 
 _PARTS = 8  # along each axis
 _SIGNIFICANT = 30.0  # squared standard errors, which follow from the differences of the parts
-_DOUBT = 4.0  # standard errors of what is left over in a part
-_PATTERN = 10.0  # times what the noise of the mean frame tells, that its pattern must
-_ALIKE = 4.0  # times what the median part tells, more than which none should
-_MOST = 0.25  # of the mean light, more than which is not added between windows
+_RESIDUAL_SIGMAS = 4.0  # standard errors of what is left over in a part
+_LEAST_PATTERN_RATIO = 10.0  # times what the noise of the mean frame tells, that its pattern must
+_MOST_PATTERN_RATIO = 4.0  # times what the median part tells, more than which none should
+_MOST_ADDED_SHARE = 0.25  # of the mean light, more than which is not added between windows
 _LEAST_PARTS = 16
-_LEAST_TOLD = 1e-3  # by a part, of what others tell
+_LEAST_PATTERN_POWER = 1e-3  # by a part, of what others tell
 
 
 def lift(light_e: FloatArray) -> FloatArray:
-    """Give the relative change of pixels to which the same is added.
+    """Relative change of pixels to which the same number is added.
 
     Shapes: `light_e` (y, x), result (y, x).
     """
@@ -34,7 +35,7 @@ def lift(light_e: FloatArray) -> FloatArray:
 
 
 def find_stray_light(changes: Changes, window: int) -> float:
-    """Look for something that is added to all pixels alike, and changes."""
+    """Measure a change that is added to all pixels equally, over the mean light; 0 if none."""
     light, more = changes.light_e, lift(changes.light_e)
     rows, columns = (
         np.equal.outer(np.arange(_PARTS), np.arange(n) * _PARTS // n).astype(np.float64)
@@ -49,36 +50,43 @@ def find_stray_light(changes: Changes, window: int) -> float:
     each = sums * (light.sum() / sums.sum(axis=(2, 3), keepdims=True)) - light
     change = each[:, 1] - each[:, 0]
     held, once, twice = summed(light), summed(light * more), summed(light * more**2)
-    told = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
-    if not (told > 0).any():
+    pattern_power = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
+    if not (pattern_power > 0).any():
         return 0.0
-    lit = (told > 0) & (told < _ALIKE * np.median(told[told > 0]))  # without dust and particles
+    usual = np.median(pattern_power[pattern_power > 0])
+    lit = (pattern_power > 0) & (
+        pattern_power < _MOST_PATTERN_RATIO * usual
+    )  # without dust and particles
     if lit.sum() < _LEAST_PARTS:
         return 0.0
-    mean, told = once[lit] / held[lit], told[lit]
+    mean, pattern_power = once[lit] / held[lit], pattern_power[lit]
     pixels = summed((light > 0).astype(np.float64))[lit]
-    if told.sum() < _PATTERN * pixels.sum() * changes.noises.mean() / len(changes.noises):
+    if pattern_power.sum() < _LEAST_PATTERN_RATIO * pixels.sum() * changes.noises.mean() / len(
+        changes.noises
+    ):
         return 0.0
     even = summed(change)[:, lit]
     seen = summed(change * more)[:, lit] - even * mean
-    added = seen.sum(axis=1, keepdims=True) / told.sum()
-    rest = seen - added * told
-    spread = np.square(rest) / np.maximum(told, told.mean() * _LEAST_TOLD)
-    error = spread.sum(axis=1) / (lit.sum() - 1) / told.sum()
+    added = seen.sum(axis=1, keepdims=True) / pattern_power.sum()
+    rest = seen - added * pattern_power
+    spread = np.square(rest) / np.maximum(
+        pattern_power, pattern_power.mean() * _LEAST_PATTERN_POWER
+    )
+    error = spread.sum(axis=1) / (lit.sum() - 1) / pattern_power.sum()
     square = float(np.median(np.square(added)))
-    if square > _MOST**2:
+    if square > _MOST_ADDED_SHARE**2:
         return 0.0
-    if square * told.sum() / light.sum() < changes.least(window) + changes.error:
+    if square * pattern_power.sum() / light.sum() < changes.least(window) + changes.error:
         return 0.0
     if np.median(np.square(added[:, 0]) / error) < _SIGNIFICANT:
         return 0.0
     # in variances of noise, of the pixels of a part
     noises = changes.noises[:, None]
     squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
-    gain = np.square(added) * told / noises
+    gain = np.square(added) * pattern_power / noises
     left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)
-    doubt = _DOUBT * math.sqrt(2 * float(pixels.mean()) / left.size)
+    doubt = _RESIDUAL_SIGMAS * math.sqrt(2 * float(pixels.mean()) / left.size)
     if np.median(left) > np.median(gain) + doubt:
         return 0.0
     here = summed(each * more)[..., lit] - summed(each)[..., lit] * mean
-    return float(np.ptp(here.sum(axis=-1))) / float(told.sum())
+    return float(np.ptp(here.sum(axis=-1))) / float(pattern_power.sum())

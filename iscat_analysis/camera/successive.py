@@ -1,8 +1,8 @@
-"""Frames that hold light of those before them: averaged, interpolated or filtered in time.
+"""Frames that contain light of earlier frames: averaged, interpolated or filtered in time.
 
-Of independent frames any two differ alike, but for what changes slowly.  Where each was averaged
-with the one before, neighbours differ less than frames farther apart, and these all alike; where
-light or the stage drift, or the laser flickers, differences go on growing.
+Of independent frames any two differ by the same noise, apart from slow changes.  If each was
+averaged with the one before, neighbours differ less than frames farther apart, and those all differ
+equally.  Where light or stage drift, or the laser flickers, differences go on growing.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from iscat_analysis.records import BoolArray
 
 _APART, _FAR = 8, 16  # frames: filters are forgotten by then
 _FEWEST, _FRAMES = 40, 256  # frames that tell, and as many as are asked
-_PIXELS = 4096  # that are asked, all over the field
-_LEAST = 0.1  # by which the variance between neighbours falls short
-_GROWS = 0.15  # of that, by which it may still grow farther on
+_MOST_PIXELS = 4096  # that are asked, all over the field
+_LEAST_DEFICIT = 0.1  # by which the variance between neighbours falls short
+_MOST_GROWTH = 0.15  # of that, by which it may still grow farther on
 
 
 def shared_light(
     counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> float | None:
-    """Tell whether successive frames have light in common.
+    """Test whether successive frames have light in common.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
@@ -34,7 +34,7 @@ def shared_light(
         return None
     counts, shape = counts[:_FRAMES], counts.shape[1:]
     places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
-    places = places[:: max(1, -(-places.size // _PIXELS))]
+    places = places[:: max(1, -(-places.size // _MOST_PIXELS))]
     offset, gain = (
         np.broadcast_to(value, shape).flat[places]
         for value in (camera.offset_adu, camera.gain_e_per_adu)
@@ -56,7 +56,11 @@ def shared_light(
     if apart <= 0 or far <= 0:
         return None
     short = 1 - near / apart
-    return near / apart if short > _LEAST and abs(far / apart - 1) < _GROWS * short else None
+    return (
+        near / apart
+        if short > _LEAST_DEFICIT and abs(far / apart - 1) < _MOST_GROWTH * short
+        else None
+    )
 
 
 def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:

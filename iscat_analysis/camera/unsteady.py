@@ -24,26 +24,27 @@ from iscat_analysis.units import count, listed
 
 _CHANCE = 1e-9  # that noise alone makes a pixel unsteady
 _AROUND = 5  # pixels along each side, whose median tells how counts scatter there
-_CHANGING = 3.0  # times shot noise, by which most pixels change slowly where it is not the pixels
-_LINE = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
+# Times shot noise, by which most pixels change slowly where it is not the pixels
+_SLOW_CHANGE_RATIO = 3.0
+_LEAST_LINE_EXCESS = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
 _LINE_SIGMAS = 8.0  # robust standard deviations of all lines
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
-_FEWEST = 20  # frames that tell
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
+_FEWEST_FRAMES = 20  # frames that tell
 _LEAST_E = 20.0  # of light, below which noise is far from normal
-_WHOLE = 0.5  # of the pixels of a line that is named as such
-_MOST = 0.1  # of the pixels: where more are, it is not the pixels that are odd
+_LINE_SHARE = 0.5  # of the pixels of a line that is named as such
+_MOST_PIXEL_SHARE = 0.1  # of the pixels: where more are, it is not the pixels that are odd
 
 
-def unsteady_said(pixels: BoolArray) -> str:
+def unsteady_message(pixels: BoolArray) -> str:
     """Say which pixels are unsteady.
 
     Shapes: `pixels` (y, x).
     """
     number = int(pixels.sum())
     where = [
-        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _WHOLE), 4)}"
+        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _LINE_SHARE), 4)}"
         for axis, name in ((1, "row"), (0, "column"))
-        if (pixels.mean(axis=axis) > _WHOLE).any()
+        if (pixels.mean(axis=axis) > _LINE_SHARE).any()
     ]
     if not where:
         y, x = np.nonzero(pixels)
@@ -51,20 +52,20 @@ def unsteady_said(pixels: BoolArray) -> str:
     verb = "has" if number == 1 else "have"
     return (
         f"{count(number, 'pixel')} ({' and '.join(where)}) {verb} noise that is not the light's, "
-        "as where a pixel switches, an amplifier is noisy or a text is burnt in: taken for dead"
+        "as where a pixel switches, an amplifier is noisy or a text is burnt in; not used"
     )
 
 
 def find_unsteady(
     blocks: Sequence[NDArray[Any]], camera: Camera, least_beside: float
 ) -> BoolArray | None:
-    """Find pixels that flicker, switch or repeat themselves.
+    """Find pixels that flicker, switch, or repeat their values.
 
     Shapes: `blocks` (t, y, x), result (y, x).
     """
     frames = np.array([len(block) for block in blocks])
     freedom = int((frames - 1).sum()), len(blocks) - 1
-    if freedom[0] < _FEWEST or freedom[1] < 4:
+    if freedom[0] < _FEWEST_FRAMES or freedom[1] < 4:
         return None
     shape = blocks[0].shape[1:]
     summed = np.zeros(shape)
@@ -94,23 +95,25 @@ def find_unsteady(
     for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
         ratio = np.where(lit, scatter.squares / variance / number, 0.0)
         usual = float(np.median(ratio[lit]))
-        if scatter is slow and usual > _CHANGING:  # by the light or the stage, and in what pattern
+        if (
+            scatter is slow and usual > _SLOW_CHANGE_RATIO
+        ):  # by the light or the stage, and in what pattern
             continue
         limit = chdtri(number, _CHANCE) / number
         more = ratio > usual * limit
-        more &= scatter.beside < least_beside * scatter.squares
-        more &= _beside(ratio) - usual < least_beside * (ratio - usual)
+        more &= scatter.neighbour_products < least_beside * scatter.squares
+        more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
         if more.any():  # by those around as well, which takes longest
             more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
             found |= more
         if scatter is fast:
             found |= _noisy_lines(ratio, lit, usual, least_beside)
     found &= lit
-    return found if 0 < found.mean() < _MOST else None
+    return found if 0 < found.mean() < _MOST_PIXEL_SHARE else None
 
 
-def _beside(values: FloatArray) -> FloatArray:
-    """Give the larger of the two values beside each, along the axis where that is less."""
+def _largest_neighbour(values: FloatArray) -> FloatArray:
+    """Larger one of the two neighbours, along the axis where it is smaller."""
     padded = np.pad(values, 1, mode="reflect")
     along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
     along_x = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
@@ -118,7 +121,7 @@ def _beside(values: FloatArray) -> FloatArray:
 
 
 class _Scatter:
-    """Squares of what pixels have beyond their mean, and how far those beside them follow."""
+    """Mean square deviations of pixels, and their products with neighbouring pixels."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self.squares = np.zeros(shape)
@@ -129,25 +132,25 @@ class _Scatter:
         add_image(image, self.squares, self.products)
 
     @property
-    def beside(self) -> FloatArray:
-        """Products with the pixels beside along y or x, whichever follow more."""
+    def neighbour_products(self) -> FloatArray:
+        """Products with the neighbours along y or x, whichever are larger."""
         largest: FloatArray = self.products.max(axis=0)
         return largest
 
 
 def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:
-    """Find rows and columns most of whose pixels scatter more than those of the lines beside."""
+    """Find rows and columns in which most pixels scatter more than in the neighbouring lines."""
     noisy = np.zeros(ratio.shape, dtype=np.bool_)
     for axis in (0, 1):
-        lines = np.flatnonzero(lit.mean(axis=axis) > _WHOLE)
+        lines = np.flatnonzero(lit.mean(axis=axis) > _LINE_SHARE)
         if lines.size < _AROUND:
             continue
         seen = np.where(lit, ratio, np.nan).take(lines, axis=1 - axis)
         excess = np.nanmedian(seen, axis=axis) - usual
-        spread = _NORMAL * float(np.median(np.abs(excess - np.median(excess))))
+        spread = _SIGMA_PER_MAD * float(np.median(np.abs(excess - np.median(excess))))
         padded = np.pad(excess, 1, mode="reflect")
-        beside = np.maximum(padded[:-2], padded[2:])
-        off = excess > max(_LINE * usual, _LINE_SIGMAS * spread)
-        odd = lines[off & (beside < least_beside * excess)]
+        neighbours = np.maximum(padded[:-2], padded[2:])
+        off = excess > max(_LEAST_LINE_EXCESS * usual, _LINE_SIGMAS * spread)
+        odd = lines[off & (neighbours < least_beside * excess)]
         noisy[(slice(None), odd) if axis == 0 else odd] = True
     return noisy

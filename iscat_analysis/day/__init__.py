@@ -187,18 +187,20 @@ def batch(
     plan = make_plan(table, configure(config, settings=settings), named)
     claim_folder(folder)
     warn = notify or (lambda _: None)
-    said = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
+    command_text = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"
     outcomes: dict[str, Outcome] = {}
     try:
         where = (THREADS, None) if merge else (scheduler, scheduler_file)
-        with open_executor(*where) as place:
-            for remark in place.remarks(plan.config.compute.memory_limit_mb):
-                warn(remark)
-            runner = Runner(folder, Records(folder), merge, progress, warn, said, place, retry)
+        with open_executor(*where) as executor:
+            for warning in executor.warnings(plan.config.compute.memory_limit_mb):
+                warn(warning)
+            runner = Runner(
+                folder, Records(folder), merge, progress, warn, command_text, executor, retry
+            )
             day = calibrate_day(plan, runner)
             wanted = part_of(plan.movies, only)
             progress("movies", 0, len(wanted))
-            analysed = place.each(lambda movie: _analyse(plan, day, movie, runner), wanted)
+            analysed = executor.each(lambda movie: _analyse(plan, day, movie, runner), wanted)
             with closing(analysed):
                 for index, outcome in analysed:
                     name = wanted[index].name
@@ -265,7 +267,7 @@ def _gathered(
     ran: tuple[str, ...],
     failed: tuple[tuple[str, str], ...],
 ) -> Batch:
-    """Make tables and page of everything, unless they are there already."""
+    """Make tables and page of all results, unless they are up to date."""
     out = runner.out
     by_path = {movie.row.path: movie for movie in (*plan.flats, *plan.movies)}
     ordered = [by_path[row.path] for row in plan.table.rows]

@@ -1,6 +1,7 @@
-"""The calibrations of a day: camera from flats, optics and mass from calibrants.
+"""Calibrations of a batch: camera from flats, optics and masses from calibrants.
 
-What cannot be calibrated stays as configured, and is told: the movies go on.
+Where a calibration fails, the configuration is used, and the user is told; the movies are analysed
+all the same.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _OPTICS = (
 
 @dataclass(frozen=True)
 class Day:
-    """What the calibrations of a day found."""
+    """The calibrations of a batch."""
 
     settings: Mapping[str, Any] = field(default_factory=dict)
     outcomes: Mapping[str, Outcome] = field(default_factory=dict)
@@ -44,7 +45,7 @@ class Day:
 
 
 def calibrate_day(plan: Plan, runner: Runner) -> Day:
-    """Make the calibrations of a day, as far as they are not made yet."""
+    """Make the calibrations of a batch that are not made yet."""
     settings: dict[str, Any] = {}
     outcomes: dict[str, Outcome] = {}
     failed: list[tuple[str, str]] = []
@@ -69,8 +70,8 @@ def calibrate_day(plan: Plan, runner: Runner) -> Day:
             outcomes[movie.name] = outcome
             continue
         tables[movie.name] = folder / "fits.csv"
-        if learned is None and (told := _optics(folder, plan.config)) is not None:
-            learned, origin = told
+        if learned is None and (optics := _optics(folder, plan.config)) is not None:
+            learned, origin = optics
             origins["optics"] = f"{origin} by {movie.name}"
     settings |= learned or {}
     standards: tuple[float, ...] = ()
@@ -123,14 +124,14 @@ def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outco
 
 
 def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
-    """Read what a calibrant's analysis says of the optics; None where it could not tell."""
+    """Read the optics from the analysis of a calibrant; None where it could not test them."""
     if config.optics.file is not None:
         return None
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    told = summary.get("optics", {})
-    if not told or told.get("reason"):
+    optics = summary.get("optics", {})
+    if not optics or optics.get("reason"):
         return None
-    if not told["calibrated"]:
+    if not optics["calibrated"]:
         return {}, "confirmed"
     learned = read_toml(folder / "config.toml")["optics"]
     keys = {f"optics.{key}": learned[key] for key in _OPTICS if key in learned}
@@ -138,7 +139,7 @@ def _optics(folder: Path, config: Config) -> tuple[dict[str, Any], str] | None:
 
 
 def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outcome, dict[str, Any]]:
-    """Put the events of all calibrants together and fit the line through the standards."""
+    """Fit the line through the standards to the events of all calibrants."""
     if not tables:
         return Outcome("failed", "no calibrant could be analysed"), {}
     folder = runner.out / "calibration"
@@ -160,7 +161,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
             )
         except SignError as error:  # which way they land is what the configuration says
             raise DataError(
-                f"{error.said}, correct the sign of calibration.gradient_per_kda, or "
+                f"{error.problem}, correct the sign of calibration.gradient_per_kda, or "
                 "optics.focus_nm or optics.reference_phase_deg"
             ) from None
         masses = [float(mass) for mass in found.standards["mass_kda"]]
@@ -177,7 +178,7 @@ def _mass(plan: Plan, tables: Mapping[str, Path], runner: Runner) -> tuple[Outco
 
 
 def _together(tables: Mapping[str, Path]) -> tuple[list[pd.DataFrame], Config]:
-    """Read the events of all calibrants, their contrasts as with the optics of the first."""
+    """Read the events of all calibrants, with contrasts converted to the optics of the first."""
     configs = {name: load_config(path.with_name("config.toml")) for name, path in tables.items()}
     first = next(iter(configs.values()))
     frames = []

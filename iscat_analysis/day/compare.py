@@ -39,10 +39,10 @@ _Z95 = 1.959964
 
 
 def match_species(species: pd.DataFrame) -> pd.DataFrame:
-    """Give species of one mass in different movies one number, their kind.
+    """Group species of one mass in different movies; a group is called a kind.
 
-    The two nearest groups are joined, again and again, as long as they are within `SAME_MASS` or
-    three standard errors, and hold no two species of one movie.
+    The two nearest groups are merged repeatedly, as long as they are within `SAME_MASS` or three
+    standard errors and have no movie in common.
     """
     real = species[~species["outlier"]].sort_values(["mass_kda", "movie"])
     masses = real["mass_kda"].to_numpy(float)
@@ -86,7 +86,7 @@ class _Group:
 
 @dataclass(frozen=True)
 class Means:
-    """Means of samples, with errors that hold the scatter between their movies."""
+    """Means of samples; their errors include the scatter between movies."""
 
     value: FloatArray
     se: FloatArray

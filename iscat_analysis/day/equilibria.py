@@ -49,7 +49,7 @@ class Series:
 
 
 def reaction_of(kd: Model | None, kd_masses_kda: Sequence[float] | None) -> Reaction | None:
-    """Check what K_D is asked for."""
+    """Check the arguments of a K_D fit."""
     if kd is None:
         if kd_masses_kda is not None:
             raise ConfigError("`kd_masses_kda` is of K_D: give `kd`, dimer or ab, as well")
@@ -102,7 +102,7 @@ def kd_name(condition: str) -> str:
 
 
 def _totals(each: Found, columns: Sequence[str]) -> tuple[str, ...]:
-    """Give the concentrations of a movie; nothing where the table leaves one out."""
+    """Concentrations of a movie; empty where the table lacks one."""
     row = each.movie.row
     given = {"concentration_nm": row.concentration_nm, **row.further}
     values = tuple(str(given.get(name, "")).strip() for name in columns)

@@ -1,4 +1,4 @@
-"""From the results of single movies to the tables of the day."""
+"""Tables of a batch, made from the results of its movies."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _MASSES = ("mass_kda", "status", "p_value")
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What one movie gave."""
+    """Results of one movie."""
 
     movie: Movie
     outcome: Outcome
@@ -164,7 +164,7 @@ def _shares(species: Sequence[Mapping[str, Any]]) -> list[dict[str, float]]:
 
 
 def movie_table(plan: Plan, day: Day, found: Sequence[Found], out: Path) -> pd.DataFrame:
-    """Put what is to be said of every movie into one table."""
+    """Make the table of movies."""
     rows = []
     for each in found:
         row = {
@@ -184,7 +184,7 @@ def movie_table(plan: Plan, day: Day, found: Sequence[Found], out: Path) -> pd.D
 
 
 def _numbers(each: Found, day: Day, out: Path) -> dict[str, Any]:
-    """Give what the result says of itself."""
+    """Read numbers from the summary of a result."""
     if not each.summary:
         return {"cautions": ""}
     summary, landing = each.summary, each.summary.get("landing", {})

@@ -1,4 +1,4 @@
-"""From the table to a plan: what each movie is called, and its configuration."""
+"""Names of results and configurations of movies, made from the table of a batch."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day.table import Row, Table
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie.addresses import beside, split_address
+from iscat_analysis.movie.addresses import path_beside, split_address
 from iscat_analysis.text import printable
 
 
@@ -24,7 +24,7 @@ class Movie:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be done."""
+    """The movies of a batch, their configurations and the names of their results."""
 
     table: Table
     config: Config
@@ -37,7 +37,7 @@ class Plan:
 def make_plan(
     table: Table, config: Config, standards: tuple[tuple[float, float], ...] = ()
 ) -> Plan:
-    """Lay out the work of a day."""
+    """Plan a batch."""
     for row in table.rows:
         try:
             configured(config, {}, row)
@@ -78,7 +78,7 @@ def part_of(movies: tuple[Movie, ...], only: tuple[int, int] | None) -> tuple[Mo
 def _names(table: Table) -> list[str]:
     """Name each result after its movie, with as many folders as it takes to tell it from others."""
     files = [split_address(row.path)[0] for row in table.rows]
-    stems = [beside(row.path, "") for row in table.rows]
+    stems = [path_beside(row.path, "") for row in table.rows]
     same = Counter(stems)
     ends = [
         f"{stem.name}-{file.suffix[1:]}" if same[stem] > 1 else stem.name

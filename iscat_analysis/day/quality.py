@@ -1,4 +1,4 @@
-"""How far a movie can be trusted, from what its result says: numbers, and cautions in words."""
+"""Quality of each movie of a batch: numbers, and warnings in words."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from iscat_analysis.units import count
 SMALL_P = 0.01
 """A p-value below which a fit is counted as poor."""
 
-MANY_SMALL = 0.1
+MOST_SMALL_P_SHARE = 0.1
 """Share of small p-values, ten times the expected one, above which the model is doubted."""
 
-LOUD = 1.5
+LARGEST_NOISE_RATIO = 1.5
 """Noise over that of the photoelectrons, as a variance, that is told."""
 
 FAR_PX = 1.0
 """Drift of the fixed pattern that is told [px]."""
 
-FEW = 10
+FEW_EVENTS = 10
 """Fewer events tell no species."""
 
-OUTSIDE = 0.1
+MOST_OUTSIDE_SHARE = 0.1
 """Share of the masses beyond the standards that is told."""
 
 NEAR_STANDARD = 0.05
@@ -54,13 +54,13 @@ def judge(
     p_values: FloatArray,
     day: Day,
 ) -> dict[str, Any]:
-    """Judge one movie.
+    """Describe the quality of one movie.
 
     Shapes: `masses_kda` (n,), `p_values` (n,).
     """
     cautions: list[str] = []
     noise, frames = noise_of(summary)
-    if noise is not None and noise > LOUD:
+    if noise is not None and noise > LARGEST_NOISE_RATIO:
         cautions.append(f"noise {noise:.2g} times shot noise at {frames} frames")
     landing = summary.get("landing") or summary.get("background") or {}
     drift = landing.get("drift_px")
@@ -68,11 +68,11 @@ def judge(
     if moved is not None and moved > FAR_PX and not landing.get("drift_corrected"):
         cautions.append(f"the pattern drifts {moved:.1f} px")
     small = float(np.mean(p_values < SMALL_P)) if p_values.size else None
-    if small is not None and small > MANY_SMALL and p_values.size >= FEW:
+    if small is not None and small > MOST_SMALL_P_SHARE and p_values.size >= FEW_EVENTS:
         cautions.append(f"{100 * small:.0f} % of p-values below {SMALL_P:g}")
     if summary.get("repeats", {}).get("understated"):
         cautions.append("σ is smaller than the measured spread")
-    if summary["events"] < FEW and movie.row.role != "blank":
+    if summary["events"] < FEW_EVENTS and movie.row.role != "blank":
         cautions.append(f"{count(summary['events'], 'event')}, too few for species")
     optics, focus = _optics(summary, config, day)
     if optics.startswith(("learned from this", "rejected")):
@@ -83,7 +83,7 @@ def judge(
     if scale.startswith(("none", "another")):
         cautions.append(f"mass scale: {scale}")
     outside = _outside(masses_kda, day)
-    if outside is not None and outside > OUTSIDE and masses_kda.size >= FEW:
+    if outside is not None and outside > MOST_OUTSIDE_SHARE and masses_kda.size >= FEW_EVENTS:
         low, high = min(day.standards_kda), max(day.standards_kda)
         cautions.append(
             f"{100 * outside:.0f} % of masses are beyond the standards, {low:g} to {high:g} kDa"
@@ -110,19 +110,19 @@ def _optics(
     summary: Mapping[str, Any], config: Config | None, day: Day
 ) -> tuple[str, float | None]:
     """Say where the optics are from, and by how much the focus was moved."""
-    told = summary.get("optics")
+    optics = summary.get("optics")
     source = "of the day" if day.settings.get("optics.focus_nm") is not None else "as configured"
     if config is not None and config.optics.file is not None:
         source = "of a file"
-    if not told:
+    if not optics:
         return f"{source}, not tested", None
-    if told.get("calibrated") and config is not None:
+    if optics.get("calibrated") and config is not None:
         reference = day.settings.get("optics.focus_nm")
         shift = None if reference is None else config.optics.focus_nm - float(reference)
         return "learned from this movie", shift
-    if "median_p" not in told and "left_over" not in told:
+    if "median_p" not in optics and "left_over" not in optics:
         return f"{source}, too few bright particles to test them", None
-    if told.get("reason"):
+    if optics.get("reason"):
         return f"rejected by this movie ({source}), and not learned", None
     return f"{source}, confirmed", None
 

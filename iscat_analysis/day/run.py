@@ -1,4 +1,4 @@
-"""One job at a time: what is finished is left alone, what fails costs only itself."""
+"""Jobs of a batch: finished ones are skipped, and a failure affects only its own job."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ State = Literal["done", "failed", "missing"]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job."""
+    """Result of a job."""
 
     state: State
     why: str = ""
@@ -42,7 +42,7 @@ class Runner:
     progress: Progress
     notify: Notify
     command: str
-    place: Executor
+    executor: Executor
     retry: bool = True
 
     def job(
@@ -102,7 +102,7 @@ class Runner:
         """Fit a movie unless that is done."""
 
         def work() -> dict[str, Any]:
-            return self.place.call(
+            return self.executor.call(
                 analyse_movie,
                 self.out.absolute(),
                 name,

@@ -69,7 +69,7 @@ class Records:
 
     @contextmanager
     def held(self, name: str, notify: Callable[[str], None]) -> Iterator[None]:
-        """Wait until no other run does a job, and keep others from it."""
+        """Lock a job, so that no other run does it at the same time."""
         path = self._path(name).with_suffix(".lock")
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = FileLock(path, thread_local=False, fallback_to_soft=False, poll_interval=_POLL_S)
@@ -111,13 +111,13 @@ def claim_folder(out: Path) -> None:
 
 
 def write_whole(path: Path, content: str) -> None:
-    """Write a text file that is there whole or not at all."""
+    """Write a text file atomically."""
     with whole_file(path) as partial:
         partial.write_text(content, encoding="utf-8")
 
 
 def key_of(config: Config, *further: Any) -> str:
-    """Hash what an analysis is asked for."""
+    """Hash the input of an analysis."""
     compute = type(config.compute)(seed=config.compute.seed)
     settings = config.model_copy(update={"compute": compute})
     numbers = config.camera.assumed
@@ -126,7 +126,7 @@ def key_of(config: Config, *further: Any) -> str:
 
 
 def hash_of(*parts: Any) -> str:
-    """Hash what a job is asked for, and the version that does it."""
+    """Hash the input of a job, and the version of the program."""
     text = json.dumps([version("iscat-analysis"), *parts])
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -140,7 +140,7 @@ def sha256_of(path: Path) -> str:
 
 
 def saw(record: Mapping[str, Any], path: Path) -> bool:
-    """Tell whether a movie is the one that a record is of."""
+    """Tell whether a record belongs to a movie in its present state."""
     try:
         if record.get("fingerprint") == _fingerprint(path):
             return True
@@ -178,7 +178,7 @@ def _reads(path: Path, size: int, changed_ns: int) -> str:
 
 
 def seen(path: Path) -> str:
-    """Hash a movie's size, time and ends; empty where it cannot be read."""
+    """Hash size, time and both ends of a movie; empty where it cannot be read."""
     try:
         return _fingerprint(path)
     except OSError:

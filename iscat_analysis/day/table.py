@@ -18,7 +18,7 @@ from typing import Any
 from iscat_analysis.calibration.mass import STANDARD_ERROR
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie.addresses import MARK, beside, split_address
+from iscat_analysis.movie.addresses import MARK, path_beside, split_address
 from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
 from iscat_analysis.movie.text_tables import separator
@@ -36,8 +36,8 @@ COLUMNS = (
 TABLES = ("samples.csv", "samples.toml")
 """The table of a folder that is watched."""
 
-_CLOSE = 0.85  # likeness of a column's name to one that has a meaning
-_SAID = 5  # complaints in one line
+_LEAST_LIKENESS = 0.85  # likeness of a column's name to one that has a meaning
+_LISTED_PROBLEMS = 5  # complaints in one line
 
 
 Records = list[tuple[str, dict[str, Any]]]
@@ -94,11 +94,11 @@ def read_growing(folder: Path, movies: Sequence[Path]) -> Table:
     if len(tables) > 1:
         raise ConfigError(f"{folder}: holds {' and '.join(TABLES)}; leave one table of the movies")
     root = folder.resolve()
-    told = _read_file(tables[0], partial=True) if tables else Table(folder, root, ())
-    known = {file for row in told.rows for file in members_of(row.path)}
+    listed = _read_file(tables[0], partial=True) if tables else Table(folder, root, ())
+    known = {file for row in listed.rows for file in members_of(row.path)}
     others = [path for path in movies if known.isdisjoint(members_of(path.resolve()))]
     more = _checked(folder, folder, _named(others), written=True, partial=True)
-    return Table(folder, root, (*told.rows, *more.rows), told.absent)
+    return Table(folder, root, (*listed.rows, *more.rows), listed.absent)
 
 
 def _named(movies: Sequence[Path]) -> Records:
@@ -139,8 +139,9 @@ def _checked(
             )
         first.setdefault(movie, row.where)
     if problems:
-        more = f"; and {len(problems) - _SAID} more" if len(problems) > _SAID else ""
-        raise ConfigError(f"{source}: {'; '.join(problems[:_SAID])}{more}")
+        left = len(problems) - _LISTED_PROBLEMS
+        more = f"; and {left} more" if left > 0 else ""
+        raise ConfigError(f"{source}: {'; '.join(problems[:_LISTED_PROBLEMS])}{more}")
     return Table(source, root, tuple(rows), tuple(absent))
 
 
@@ -229,9 +230,9 @@ def _names(source: Path, cells: list[str]) -> list[str]:
 
 
 def _check_names(source: Path, names: Sequence[str], where: str) -> None:
-    """Refuse a table without paths, and a column that is nearly one with a meaning."""
+    """Refuse a table without paths, and a column whose name is a misspelled key."""
     for name in names:
-        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_CLOSE)
+        near = difflib.get_close_matches(name.lower(), COLUMNS, n=1, cutoff=_LEAST_LIKENESS)
         if near and name not in COLUMNS and near[0] not in names:
             raise ConfigError(
                 f"{source}: {where} has the column {name}: did you mean {near[0]}? If not, give it "
@@ -297,8 +298,8 @@ def _row(
             )
     standards: tuple[tuple[float, float], ...] = ()
     try:
-        said = known["standards"]
-        standards = read_standards([said] if isinstance(said, (int, float)) else said)
+        masses = known["standards"]
+        standards = read_standards([masses] if isinstance(masses, (int, float)) else masses)
     except (TypeError, ValueError) as error:
         wrong.append(f"standards: {error}")
     if standards and role != "calibrant":
@@ -308,7 +309,7 @@ def _row(
         where=where,
         path=path,
         given=printable(given),
-        sample=printable(str(known["sample"]) or beside(path, "").name),
+        sample=printable(str(known["sample"]) or path_beside(path, "").name),
         condition=str(known["condition"]),
         replicate=str(known["replicate"]),
         concentration_nm=concentration,

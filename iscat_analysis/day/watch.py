@@ -32,7 +32,7 @@ from iscat_analysis.species.mass_action import Model
 
 __all__ = ["watch"]
 
-PATIENCE = 6
+MOST_CHECKS = 6
 """Looks without a change after which a movie that cannot be read, or is gone, is taken as it is."""
 
 FOLDER = "batch"
@@ -41,7 +41,7 @@ FOLDER = "batch"
 _PAGES = 0.1  # share of the time that pages between two movies may take
 
 State = tuple[tuple[str, int, int], ...]
-Look = tuple[Table, tuple[State | None, ...]]
+Ready = tuple[Table, tuple[State | None, ...]]
 Notify = Callable[[str], None]
 
 
@@ -101,12 +101,12 @@ def watch(
     DataError
         The folder of the batch holds something else.
     """
-    place = path_in("`folder`", folder)
-    if not is_folder(place):
-        raise ConfigError(f"{place}: there is no such folder; give the one movies are saved in")
+    watched = path_in("`folder`", folder)
+    if not is_folder(watched):
+        raise ConfigError(f"{watched}: there is no such folder; give the one movies are saved in")
     number_in("`interval_s`", interval_s, above=0.0)
-    results = place / FOLDER if out is None else path_in("`out`", out)
-    if results.resolve() == place.resolve():
+    results = watched / FOLDER if out is None else path_in("`out`", out)
+    if results.resolve() == watched.resolve():
         raise ConfigError(f"{results}: is where the movies are; choose another `out`")
     try:
         read_standards(standards or ())
@@ -127,16 +127,16 @@ def watch(
         notify=warn,
         command=command or f"iscat_analysis.watch({str(folder)!r})",
     )
-    run, seen = _Run(analyse, standards, warn), _Folder(place, results, warn)
+    run, seen = _Run(analyse, standards, warn), _Folder(watched, results, warn)
     ended = stop or threading.Event()
-    done: Look | None = None
+    done: Ready | None = None
     try:
-        seen.look()
+        seen.check()
         claim_folder(results)
         Records(results).forget_failed()
-        warn(f"looks at {place} every {interval_s:g} s; Ctrl-C ends it")
+        warn(f"looks at {watched} every {interval_s:g} s; Ctrl-C ends it")
         while not ended.wait(interval_s):
-            found = seen.look()
+            found = seen.check()
             if found is not None and found != done:
                 try:
                     run.bring_up_to_date(found[0], ended)
@@ -159,37 +159,37 @@ def _of_one_movie(progress: Progress) -> Progress:
 
 
 @dataclass
-class _ParticleImage:
-    """What was seen of a movie: its files, in how many looks since, and whether it can be read."""
+class _MovieFiles:
+    """Files of a movie when last checked, the number of equal checks, and if it is readable."""
 
     state: State | None
-    looks: int = 0
+    checks: int = 0
     readable: bool = False
 
     @property
     def settled(self) -> bool:
-        """Whether it is to be waited for no longer."""
-        return self.looks >= PATIENCE or (self.looks > 0 and self.readable)
+        """Whether the movie is complete, or no longer waited for."""
+        return self.checks >= MOST_CHECKS or (self.checks > 0 and self.readable)
 
 
 class _Folder:
-    """Looks at a folder."""
+    """A folder that is checked for new movies."""
 
     def __init__(self, folder: Path, out: Path, notify: Notify) -> None:
         self._folder, self._out = folder, out
         self._notify = notify
-        self._sights: dict[Path, _ParticleImage] = {}
+        self._files: dict[Path, _MovieFiles] = {}
         self._taken: set[Path] = set()
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
         self._begun = False
 
-    def look(self) -> Look | None:
-        """Give the movies that are whole, and what tells them from later ones.
+    def check(self) -> Ready | None:
+        """Give the movies that are complete, and their states.
 
         None where there is none, or where one that was given before is being changed.
         """
-        tables = [self._sight(self._folder / name, table=True) for name in TABLES]
-        if self._begun and not all(sight.state is None or sight.looks for sight in tables):
+        tables = [self._files_of(self._folder / name, table=True) for name in TABLES]
+        if self._begun and not all(each.state is None or each.checks for each in tables):
             return None
         inside = self._folder / self._out.name
         own = [inside] if inside.resolve() == self._out.resolve() else []
@@ -207,36 +207,36 @@ class _Folder:
         for given in table.absent:
             self.warn(f"{given}: is in the table, and waited for")
         known = dict.fromkeys([*self._taken, *(row.path for row in table.rows)])
-        sights = {path: self._sight(path) for path in known}
-        ready = tuple(row for row in table.rows if sights[row.path].settled)
-        if not ready or not all(sights[path].settled for path in self._taken):
+        files = {path: self._files_of(path) for path in known}
+        ready = tuple(row for row in table.rows if files[row.path].settled)
+        if not ready or not all(files[path].settled for path in self._taken):
             return None
         self._taken = {row.path for row in ready}
-        states = tuple(sights[row.path].state for row in ready)
+        states = tuple(files[row.path].state for row in ready)
         return replace(table, rows=ready, absent=()), states
 
-    def _sight(self, path: Path, *, table: bool = False) -> _ParticleImage:
+    def _files_of(self, path: Path, *, table: bool = False) -> _MovieFiles:
         state = _state(path)
-        before = self._sights.get(path)
+        before = self._files.get(path)
         if before is not None and before.state == state:
-            before.looks += 1
+            before.checks += 1
         else:
             if before is not None and before.state is not None and state is not None and not table:
                 self.warn(f"{path.name}: is being written, and waited for")
-            self._sights[path] = before = _ParticleImage(state)
-        if before.looks == 1 and state is not None and not table:
+            self._files[path] = before = _MovieFiles(state)
+        if before.checks == 1 and state is not None and not table:
             before.readable = _opens(path)
         return before
 
     def warn(self, text: str) -> None:
-        """Say something once."""
-        if text not in self._told:
-            self._told.add(text)
+        """Warn once of the same thing."""
+        if text not in self._reported:
+            self._reported.add(text)
             self._notify(text)
 
 
 def _state(address: Path) -> State | None:
-    """Give size and time of the files of a movie; None where it is not there."""
+    """Size and time of the files of a movie; None where there are none."""
     try:
         found = [(file, file.stat()) for file in files_of(address)]
     except OSError:
@@ -253,18 +253,18 @@ def _opens(address: Path) -> bool:
 
 
 class _Run:
-    """Brings a batch up to date, one movie after another, with a page in between now and then."""
+    """Keeps a batch up to date, movie by movie, and makes its page from time to time."""
 
     def __init__(
         self, analyse: Callable[..., Batch], standards: str | Sequence[float] | None, notify: Notify
     ) -> None:
         self._analyse, self._standards, self._notify = analyse, standards, notify
         self._table: Table | None = None
-        self._told: set[tuple[str, str]] = set()
+        self._reported: set[tuple[str, str]] = set()
         self._analysed: list[str] = []
 
     def bring_up_to_date(self, table: Table, stop: threading.Event) -> None:
-        """Analyse what is new or has changed."""
+        """Analyse movies that are new or have changed."""
         self._table = table
         number = sum(row.role != "flat" for row in table.rows)
         self._batch(table, only=(number + 1, number + 1))  # without a movie: the calibrations
@@ -277,17 +277,17 @@ class _Run:
             if stop.is_set():
                 return
             part = self._batch(table, only=(k, number))
-            self._told.update(pair for pair in part.failed if pair[0] in part.analysed)
+            self._reported.update(pair for pair in part.failed if pair[0] in part.analysed)
             self._analysed += part.analysed
             if k == waiting[-1] or time.monotonic() > due:
                 page, due = self._page(table)
         if waiting:
             counts = Counter(page.movies["state"])
-            said = ", ".join(f"{counts[name]} {name}" for name in sorted(counts))
-            self._notify(f"{said}; the page is {page.page}")
+            summary = ", ".join(f"{counts[name]} {name}" for name in sorted(counts))
+            self._notify(f"{summary}; the page is {page.page}")
 
     def last_page(self, progress: Progress) -> Batch | None:
-        """Put everything that is finished on the page."""
+        """Make the page of everything that is finished."""
         if self._table is None:
             return None
         progress("report", 0, 1)
@@ -301,8 +301,8 @@ class _Run:
         found = self._batch(table, merge=True)
         missing = set(found.movies["movie"][found.movies["state"] == "missing"])
         for name, why in found.failed:
-            if name not in missing and (name, why) not in self._told:
-                self._told.add((name, why))
+            if name not in missing and (name, why) not in self._reported:
+                self._reported.add((name, why))
                 self._notify(f"{name}: failed: {why}")
         ended = time.monotonic()
         return found, ended + (ended - begun) / _PAGES

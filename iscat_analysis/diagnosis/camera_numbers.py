@@ -1,4 +1,4 @@
-"""Which number of the camera is wrong: what the noise and the zero of the light say of it."""
+"""Which number of the camera is wrong, as noise and zero of the light show it."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from iscat_analysis.camera.learned import LearnedCamera
 from iscat_analysis.camera.metadata import GainDiagnosis
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 
-_SUSPICIOUS = 0.03  # of the noise, and of masses if it is the offset, that is not left unsaid
+# Of the noise, and of masses if it is the offset, that is not left unsaid
+_LEAST_NOISE_ERROR = 0.03
 _MOST_LEFT = 1.1  # of the noise that the light has, with an offset that the noise alone tells
-SAID = ("other light", "read noise")
-"""Laws by which noise is not what the camera's numbers predict, as `law_said` has it."""
+REPORTED_LAWS = ("other light", "read noise")
+"""Laws by which noise is not what the camera's numbers predict, as `law_messages` has it."""
 
 _OTHERS = {
     "offset": "an offset that is too high",
@@ -25,18 +26,18 @@ _OTHERS = {
     "noisy light": "light that is noisy by itself",
     "other light": "light that does not follow the laser",
 }
-_SUBTRACTED = 4.0  # standard errors below no counts, where no camera has its offset
+_SUBTRACTED_SIGMAS = 4.0  # standard errors below no counts, where no camera has its offset
 
 
 def zero_by_law(law: Law, level_e: float) -> LightZero | None:
-    """Give where the light ends by the law that the movie's counts follow."""
+    """Give the zero of the light that follows from the law of the counts."""
     if law.kind == "offset":
         return LightZero(law.value, law.se, law.value * level_e, law.flickers)
     return LightZero(0.0, law.se, 0.0, law.flickers) if law.kind == "linear" else None
 
 
-def law_said(known: LearnedCamera) -> tuple[str, ...]:
-    """Say that counts are not in proportion to light, by which law, and what to do."""
+def law_messages(known: LearnedCamera) -> tuple[str, ...]:
+    """Say that counts are not proportional to light, which law they follow, and what to do."""
     law = known.camera.law
     if law is None:
         return ()
@@ -91,10 +92,10 @@ def law_said(known: LearnedCamera) -> tuple[str, ...]:
 
 
 def offset_is_wrong(zero: LightZero, gain: GainDiagnosis) -> bool:
-    """Tell whether it is the offset that is wrong, where the noise is not the only one to say so.
+    """Tell whether the offset is wrong, where an excess of noise could be the cause as well.
 
-    Light that is noisy by itself, or shakes, bends the line of variance against mean, which then
-    meets zero elsewhere; but it leaves more noise than the light has, whatever the offset.
+    Noise of the light itself, or motion, bends the line of variance against mean, which then has
+    another zero.  But then there is more noise than the light has, whatever the offset is.
     """
     if not zero.off or gain.shakes:
         return False
@@ -112,42 +113,46 @@ def _offset_of(camera: Camera) -> str:
 
 
 def _effect(share: float) -> str:
-    """Say what a part of the light that is none does to masses."""
+    """Describe how the mass changes where a part of the counts is no light."""
     percent = float(f"{100 * abs(share):.2g}")  # in full where it is hundreds
     return f"masses {percent:g} % too {'small' if share > 0 else 'large'}"
 
 
-def offset_said(zero: LightZero, camera: Camera) -> str:
-    """Say where the light is zero, and what a wrong offset does."""
+def offset_message(zero: LightZero, camera: Camera) -> str:
+    """Say where the light is zero, and what a wrong offset does to masses."""
     per_count = float(np.mean(camera.gain_e_per_adu))
     counts = zero.electrons / per_count
     se = zero.se * counts / zero.share
     found = float(np.mean(camera.offset_adu)) + counts
     how = "pixels follow the laser's power" if zero.flickers else "the noise grows with the light"
     read = zero.electrons < 0 and not zero.flickers
-    said = (
+    message = (
         f"{_offset_of(camera)} is too {'low' if zero.share > 0 else 'high'} by {abs(counts):.4g} ± "
         f"{se:.2g} counts, as {how}, and makes {_effect(zero.share)}: "
     )
     if np.ndim(camera.offset_adu):
-        said += "record a dark for `iscat calibrate camera --maps`"
-    elif found < -_SUBTRACTED * se:
-        said += "see whether counts were subtracted from the movie; record raw counts"
+        message += "record a dark for `iscat calibrate camera --maps`"
+    elif found < -_SUBTRACTED_SIGMAS * se:
+        message += "see whether counts were subtracted from the movie; record raw counts"
     else:
-        said += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
+        message += f"set camera.offset_adu = {max(found, 0.0):.4g}, or the mean of a dark"
     if read:
         missing = math.sqrt(-zero.electrons)
-        said += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
-    return said
+        message += f" (unless {missing:.3g} e of read noise are missing in camera.read_noise_e)"
+    return message
 
 
-def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
-    """Say that an offset may be as wrong as a gain, where the noise fits both.
+def offset_or_gain_message(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> str:
+    """Say that either the offset or the gain may be wrong, where the noise fits both.
 
-    An offset that is wrong by a share s of the light leaves 1 − s of the noise that is expected.
+    An offset that is wrong by a share s of the light leaves 1 − s of the expected noise.
     """
     share = 1 - gain.noise_ratio
-    if gain.shakes or gain.noise_counts < 1 or abs(share) < _SUSPICIOUS + 3 * gain.noise_ratio_se:
+    if (
+        gain.shakes
+        or gain.noise_counts < 1
+        or abs(share) < _LEAST_NOISE_ERROR + 3 * gain.noise_ratio_se
+    ):
         return ""
     if zero is not None and not zero.may_be(share):
         return ""
@@ -162,7 +167,7 @@ def either_said(gain: GainDiagnosis, zero: LightZero | None, camera: Camera) -> 
 
 
 def allow_for_correlation(gain: GainDiagnosis, spectrum: NoiseSpectrum | None) -> GainDiagnosis:
-    """Judge the gain by the noise that neighbouring pixels have together.
+    """Correct the gain for noise that neighbouring pixels share.
 
     Notes
     -----

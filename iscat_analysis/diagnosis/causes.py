@@ -1,4 +1,4 @@
-"""What a movie reveals of lines, pixels, stage and model, in words."""
+"""Warnings about pixels, axes, stage, mass scale and model of a movie."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ FLAT = 0.05
 """Variance of the steps along z over that in the plane, below which particles move in a plane:
 near the coverslip those that do not have less along z too, but not so much less."""
 
-_RINGS = 0.01  # of the light, which rings of many bright particles make uneven
+_RING_UNEVENNESS = 0.01  # of the light, which rings of many bright particles make uneven
 _LEAST_PIXELS = 100  # away from particles, of which the light is said to be uneven
-_GAUSS = 1.4826  # standard deviation over the median deviation of a Gaussian
+_SIGMA_PER_MAD = 1.4826  # standard deviation over the median deviation of a Gaussian
 _BRIGHTEST = 8  # isolated particles on which the model is judged
 _DISTURBED = frozenset({Status.SATURATED, Status.SIDELOBE, Status.TOO_CLOSE})
-_CARRIED = 0.01  # change of the scale that makes it worth a line
-_SWAPPED = 10.0  # times less change along the axis of time than along both of space
+_LEAST_SCALE_CHANGE = 0.01  # change of the scale that makes it worth a line
+_LEAST_CHANGE_RATIO = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
-_MOSTLY = 0.5  # of fits that are poor
+_MOST_POOR_SHARE = 0.5  # of fits that are poor
 _SMEARED_NM = 20.0  # from where most fits of bright particles are,
 _DESCRIBED_NM = 15.0  # and where hardly any is
 _NORMAL = (0.4549, 1.3863)  # medians of χ² with one and two degrees of freedom
@@ -49,10 +49,10 @@ _MANY_SLOW = 0.1  # and their share of all events
 
 
 def axes_warning(name: str, counts: NDArray[Any]) -> str:
-    """Say that time seems to run along the rows or columns of the frames.
+    """Warn that time seems to run along the rows or columns of the frames.
 
-    What changes least from one to the next, in proportion to their means, are frames: light on a
-    pixel repeats but for its noise, and neighbouring pixels have different light.
+    Images along the time axis change least, relative to their means: a pixel's light repeats but
+    for noise, while neighbouring pixels have different light.
 
     Shapes: `counts` (t, y, x).
     """
@@ -70,7 +70,7 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
         changes.append(float(np.mean(steps**2)) if lit.sum() > 1 else math.nan)
     for axis, lines_of in ((1, "rows"), (2, "columns")):
         others = min(changes[0], changes[3 - axis])
-        if _SWAPPED * changes[axis] < others:
+        if _LEAST_CHANGE_RATIO * changes[axis] < others:
             return (
                 f"{name}: frames differ more from each other than neighbouring {lines_of} of one "
                 f"frame do ({math.sqrt(others / changes[axis]):.0f} times), as if time ran along "
@@ -82,20 +82,20 @@ def axes_warning(name: str, counts: NDArray[Any]) -> str:
 def pixel_warnings(defects: int, saturated: int) -> Iterator[str]:
     """Say how many pixels are left out, and why."""
     if defects:
-        yield f"{count(defects, 'dead, hot or noisy pixel')} {_be(defects)} left out"
+        yield f"{count(defects, 'dead, hot or noisy pixel')} {_verb_be(defects)} left out"
     if saturated:
         yield (
-            f"{count(saturated, 'pixel')} {_be(saturated)} saturated in some frame and left out; "
-            "lower the exposure or the laser power"
+            f"{count(saturated, 'pixel')} {_verb_be(saturated)} saturated in some frame and left "
+            "out; lower the exposure or the laser power"
         )
 
 
-def _be(number: int) -> str:
+def _verb_be(number: int) -> str:
     return "is" if number == 1 else "are"
 
 
 def repeats_warning(movie: Stack, windows: Windows) -> str:
-    """Say which frames repeat the one before them, which the sums count as frames of their own."""
+    """Warn of frames that repeat the one before, which sums count as frames of their own."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     same = (np.diff(windows.power) == 0) & (np.diff(numbers) == 1)
     same &= well_lit(windows.power, DARK)[1:]  # of dark ones something else is said
@@ -118,7 +118,7 @@ def _repeats(movie: Stack, number: int) -> bool:
 def uneven_warning(
     config: Config, name: str, windows: Windows, explained: FloatArray | None = None
 ) -> str:
-    """Say that the light is uneven where one level is taken for the background of all pixels.
+    """Warn that the light is uneven where one level is the background of all pixels.
 
     Shapes: `explained` (y, x).
     """
@@ -136,9 +136,9 @@ def uneven_warning(
     noise = after + windows.read_variance_after_e2[used]
     shot = math.sqrt(max(float(np.median(noise / expected**2)), 0.0))
     middle = float(np.median(light))
-    spread = _GAUSS * float(np.median(np.abs(light - middle)))
+    spread = _SIGMA_PER_MAD * float(np.median(np.abs(light - middle)))
     uneven = math.sqrt(max(spread**2 - shot**2, 0.0))
-    if uneven <= max(shot, 0.0 if explained is not None else _RINGS * middle):
+    if uneven <= max(shot, 0.0 if explained is not None else _RING_UNEVENNESS * middle):
         return ""
     times = float(f"{uneven / shot:.2g}")
     advice = "give frames without particles as background.frames"
@@ -155,7 +155,7 @@ def uneven_warning(
 
 
 def misfit_warning(config: Config, events: Sequence[Event]) -> str:
-    """Say what is probably wrong with the model, where it misses the brightest particles."""
+    """Say what is probably wrong with the model, where it fails for the brightest particles."""
     if config.optics.psf == "measured":
         return ""
     alone = [e for e in events if not _DISTURBED.intersection(e.flags)]
@@ -168,7 +168,7 @@ def misfit_warning(config: Config, events: Sequence[Event]) -> str:
 
 
 def line_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say which contrasts the line of the calibration turns into no single mass."""
+    """Warn of contrasts that the calibration line cannot convert into a single mass."""
     line = config.calibration
     if line is None or not line.offset:
         return ""
@@ -194,9 +194,9 @@ def line_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def scale_warning(scale: MassScale) -> str:
-    """Say how far the scale of masses was carried from the optics of its standards, or refused."""
+    """Say how the mass scale was transferred from the optics of its standards, or why not."""
     line = scale.calibration
-    if line is None or (not scale.refusal and abs(scale.carried - 1) < _CARRIED):
+    if line is None or (not scale.refusal and abs(scale.carried - 1) < _LEAST_SCALE_CHANGE):
         return ""
     whose = "the configured optics, at which its gradient is taken" if line.optics_assumed else (
         "the optics of its standards"
@@ -220,7 +220,7 @@ def scale_warning(scale: MassScale) -> str:
 
 
 def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
-    """Say which particles are too heavy for a line that faint standards gave."""
+    """Warn of particles that are too heavy for a line through faint standards."""
     bent = is_bent(scale, table)
     if not bent.any():
         return ""
@@ -238,7 +238,7 @@ def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
 
 
 def sign_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that nearly all particles change the light the other way than the model has it."""
+    """Warn that nearly all particles have the opposite sign of the model."""
     mass = table.loc[table["status"] == Status.OK.value, "mass_kda"].dropna()
     turned = int((mass < 0).sum())
     if turned < _FEWEST_TURNED or turned < _NEARLY_ALL * len(mass):
@@ -247,20 +247,19 @@ def sign_warning(config: Config, table: pd.DataFrame) -> str:
     seen, other = ("brighten", "darken") if brightens else ("darken", "brighten")
     by = "the configured optics" if config.calibration is None else "calibration.gradient_per_kda"
     return (
-        f"{turned} of {count(len(mass), 'particle')} have a negative mass, which is that of "
-        f"particles that leave: they {seen} the image, and by {by} those that land {other} it; if "
-        "they land, correct that sign, or optics.focus_nm"
+        f"{turned} of {count(len(mass), 'particle')} have a negative mass, as particles that "
+        f"leave: they {seen} the image, and by {by} particles that land {other} it; if these "
+        "particles land, correct that sign, or optics.focus_nm"
     )
 
 
 def landing_rate_warning(table: pd.DataFrame) -> str:
-    """Say that the light of many steps does not change from one frame to the next.
+    """Warn that the light of many steps changes slowly, not from one frame to the next.
 
-    Their pictures may agree with the model; `Status.CHANGING` is of the course of the light before
-    and after.
+    Their pictures may agree with the model; `Status.CHANGING` is about the light before and after.
     """
     flags = table["flags"].fillna("").astype(str).str.split(";")
-    slow = int(flags.map(lambda said: Status.CHANGING.value in said).sum())
+    slow = int(flags.map(lambda listed: Status.CHANGING.value in listed).sum())
     if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
         return ""
     return (
@@ -273,7 +272,7 @@ def landing_rate_warning(table: pd.DataFrame) -> str:
 
 
 def fixed_height_warning(config: Config, table: pd.DataFrame) -> str:
-    """Say that particles whose height was fitted in every frame do not move along z."""
+    """Warn that particles whose heights were fitted in every frame do not move along z."""
     if config.track.free != "joint":
         return ""
     good = table[table["status"] == Status.OK.value].sort_values(["track", "frame"])
@@ -296,10 +295,10 @@ def fixed_height_warning(config: Config, table: pd.DataFrame) -> str:
 
 
 def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> str:
-    """Say that particles go too far within an exposure for their heights to be fitted.
+    """Warn that particles move too far within an exposure for their heights to be fitted.
 
-    A picture is that of a normal distribution about the mean of the path, along z in phase too; of
-    a long path no two are alike.
+    A picture is modelled with a normal distribution of positions about the mean, along z in phase
+    too.  Of a long path no two pictures are alike.
 
     Shapes: `smear_nm` (n,).
     """
@@ -307,7 +306,7 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
         return ""
     poor = table["flags"].fillna("").str.contains(Status.POOR_FIT.value)
     smear = float(np.median(smear_nm))
-    if poor.mean() < _MOSTLY or smear < _SMEARED_NM:
+    if poor.mean() < _MOST_POOR_SHARE or smear < _SMEARED_NM:
         return ""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if exposure is None and rate is not None:
@@ -323,10 +322,10 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
     )
 
 
-def shaking_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
-    """Say that the fixed pattern shakes, where that is most of the noise beyond the light's.
+def pattern_jitter_warning(movie: Stack, camera: Camera, frames: tuple[int, int]) -> str:
+    """Warn that the fixed pattern shakes, where that is most of the noise beyond the light's.
 
-    Particles that move add noise too, but not along the gradient of the mean of all frames.
+    Moving particles add noise too, but not along the gradient of the mean frame.
     """
     counts = movie.read(frames[0], min(frames[1], frames[0] + SPECTRUM_FRAMES))
     try:

@@ -25,29 +25,31 @@ from iscat_analysis.medians import middle
 from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.smoothing import smoothed, spot_response
 
-CLEAR = 12.0
+LEAST_CHANGE_SIGMAS = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a
 tenth."""
 
-STAYS = 0.15
+LEAST_STEP_SHARE = 0.15
 """What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
 of others make less."""
 
-_PICTURE = 0.1  # singular value of a picture over the norm of the change
-_ABOVE = 1.5  # the same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
-_SHARED = 0.5  # of the picture's share beside its centre, which the pixels there have at least
-_QUIET = 4.0  # standard deviations of noise
-_SPOT = 0.21  # standard deviation of a spot, in wavelengths over NA
-_NORMAL = 1.4826  # standard deviation of a normal law over its median deviation
-_NEAR = 4.5  # standard deviations of a spot, within which a picture is looked at
+_LEAST_PICTURE_SHARE = 0.1  # singular value of a picture over the norm of the change
+# The same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
+_LEAST_NOISE_RATIO = 1.5
+# Of the picture's share beside its centre, which the pixels there have at least
+_LEAST_NEIGHBOUR_SHARE = 0.5
+_NOISE_SIGMAS = 4.0  # standard deviations of noise
+_SPOT_SIGMA = 0.21  # standard deviation of a spot, in wavelengths over NA
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
+_REACH_SIGMAS = 4.5  # standard deviations of a spot, within which a picture is looked at
 _AROUND = 2  # blocks on either side that are looked at
 _LEAST_BLOCKS = 5
-_ASKED = 500_000  # values, whose median has an error of a few thousandths
+_MOST_VALUES = 500_000  # values, whose median has an error of a few thousandths
 
 
 @dataclass(frozen=True)
 class Changes:
-    """Clear changes in a movie."""
+    """Statistics of clear changes in a movie."""
 
     number: int
     staying: float
@@ -59,7 +61,7 @@ NO_CHANGES = Changes(0, float("nan"), float("nan"))
 
 
 def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
-    """Look for changes from block to block, and at what becomes of them.
+    """Find changes from block to block, and test whether they stay.
 
     Shapes: `blocks` (k, y, x).
     """
@@ -70,28 +72,28 @@ def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
     between = narrow - wide
     for image, out in zip(blocks, smooth, strict=True):
         out[:] = smoothed(image - 1, between)  # whose noise single precision holds
-    noise = _NORMAL * _median_deviation(smooth[:-1], smooth[1:])
+    noise = _SIGMA_PER_MAD * _median_deviation(smooth[:-1], smooth[1:])
     size = smooth[3:-1] - smooth[1:-3]
     np.abs(size, out=size)
-    apart = round(2 * _NEAR * spot_px)
-    peaks = maxima(size, max(CLEAR * noise, 0.0), (_AROUND, apart, apart))
+    apart = round(2 * _REACH_SIGMAS * spot_px)
+    peaks = maxima(size, max(LEAST_CHANGE_SIGMAS * noise, 0.0), (_AROUND, apart, apart))
     peaks = peaks[_of_spots(blocks, peaks, spot_px)]
     if not len(peaks):
         return NO_CHANGES
-    block, *place = peaks.T
-    one, two, _, four, five = (smooth[block + n, *place] for n in range(_LEAST_BLOCKS))
-    change = size[block, *place]
-    beside = np.maximum(np.abs(two - one), np.abs(five - four)) / change
-    quiet = np.maximum(_QUIET * noise / change, STAYS)
-    pictures = _pictures(smooth, peaks, _NEAR * spot_px, noise)
-    staying = (beside < quiet) & (pictures == 1)
+    block, *position = peaks.T
+    one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
+    change = size[block, *position]
+    neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
+    quiet = np.maximum(_NOISE_SIGMAS * noise / change, LEAST_STEP_SHARE)
+    pictures = _pictures(smooth, peaks, _REACH_SIGMAS * spot_px, noise)
+    staying = (neighbouring < quiet) & (pictures == 1)
     return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
 
 
 def _pictures(
     smooth: NDArray[np.float32], peaks: NDArray[np.int64], reach_px: float, noise: float
 ) -> NDArray[np.int64]:
-    """Count the pictures around each change; `noise` is that of the difference of two blocks."""
+    """Count the pictures around each change; `noise` is that of a difference of two blocks."""
     row, column = np.ogrid[: smooth.shape[1], : smooth.shape[2]]
     count = np.empty(len(peaks), dtype=np.int64)
     for number, (t, y, x) in enumerate(peaks.tolist()):
@@ -100,7 +102,9 @@ def _pictures(
         seen = smooth[(slice(t, t + _LEAST_BLOCKS), *part)][:, near].astype(np.float64)
         strength = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
         change = np.linalg.norm(seen[_AROUND + 1] - seen[_AROUND - 1])
-        least = max(_PICTURE * change, _ABOVE * noise * math.sqrt(seen.shape[1] / 2))
+        least = max(
+            _LEAST_PICTURE_SHARE * change, _LEAST_NOISE_RATIO * noise * math.sqrt(seen.shape[1] / 2)
+        )
         count[number] = max(int((strength > least).sum()), 1)
     return count
 
@@ -108,7 +112,7 @@ def _pictures(
 def _of_spots(
     blocks: NDArray[np.floating], peaks: NDArray[np.int64], spot_px: float
 ) -> NDArray[np.bool_]:
-    """Tell changes whose neighbouring pixels change as well from pixels that blink."""
+    """Tell changes in which neighbouring pixels take part from single pixels that blink."""
     least = least_beside(spot_px)
     real = np.ones(len(peaks), dtype=np.bool_)
     _, rows, columns = blocks.shape
@@ -116,24 +120,24 @@ def _of_spots(
         if 0 < y < rows - 1 and 0 < x < columns - 1:
             part = slice(y - 1, y + 2), slice(x - 1, x + 2)
             change = blocks[t + 3][part] - blocks[t + 1][part]
-            beside = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
-            real[number] = beside * np.sign(change[1, 1]) > least * abs(change[1, 1])
+            neighbouring = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
+            real[number] = neighbouring * np.sign(change[1, 1]) > least * abs(change[1, 1])
     return real
 
 
 def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
     """Median deviation from the median of what other has more than one, of some values all over."""
-    every = 1 + one.size // _ASKED
+    every = 1 + one.size // _MOST_VALUES
     some = other.ravel()[::every] - one.ravel()[::every]
     deviation = some - middle(some.copy())
     return float(middle(np.abs(deviation, out=deviation)))
 
 
 def least_beside(spot_px: float) -> float:
-    """Give the part of a particle's change that the pixels beside its centre have at least."""
-    return _SHARED * math.exp(-0.5 / spot_px**2)
+    """Give the smallest share of a change that the pixels next to its centre have."""
+    return _LEAST_NEIGHBOUR_SHARE * math.exp(-0.5 / spot_px**2)
 
 
 def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
     """Give the standard deviation of a particle's picture."""
-    return max(_SPOT * wavelength_nm / na / pixel_nm, 0.5)
+    return max(_SPOT_SIGMA * wavelength_nm / na / pixel_nm, 0.5)

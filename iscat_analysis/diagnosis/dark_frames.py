@@ -21,8 +21,8 @@ _NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
-class _Darkened:
-    """A movie some of whose frames are dark; attributes as those of a `Stack`."""
+class _DarkFramesReplaced:
+    """A movie in which dark frames are replaced; attributes as those of a `Stack`."""
 
     source: Stack
     frames: NDArray[np.int64]
@@ -60,7 +60,7 @@ class _Darkened:
 
 
 def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, str]:
-    """Leave frames out of sums in which a part of the light is missing, and name the dark ones."""
+    """Leave frames with missing light out of sums, and list the dark ones."""
     numbers = np.concatenate([np.arange(*windows.frames_before), np.arange(*windows.frames_after)])
     power = windows.power
     usual = float(np.median(power))
@@ -82,5 +82,5 @@ def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Sta
     )
     if cut.size:
         dark = np.broadcast_to(np.floor(camera.offset_adu), movie.shape[1:]).astype(movie.dtype)
-        movie = movie.seen_as(_Darkened(movie, cut, dark))
+        movie = movie.seen_as(_DarkFramesReplaced(movie, cut, dark))
     return movie, message

@@ -26,7 +26,7 @@ _SIGNIFICANT = 4.0  # standard errors beyond which a drift is one
 
 
 def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[str, Any]:
-    """Measure noise against averaging, and how far the fixed pattern moved."""
+    """Measure the noise against averaging, and how far the fixed pattern moved."""
     curve: tuple[tuple[int, ...], tuple[float, ...]] = ((), ())
     limit = drift = error = None
     if windows.n_before >= 2 and is_lit(windows):
@@ -49,10 +49,10 @@ def examine_background(movie: Stack, camera: Camera, windows: Windows) -> dict[s
 
 
 def _pattern_moved(windows: Windows) -> tuple[FloatArray, FloatArray] | None:
-    """Give how far the pattern moved along y and x, and the errors; None where there is none.
+    """Measure the shift of the pattern along y and x, and its errors; None without a pattern.
 
-    A particle changes the light at its place as an edge that moved does, but in every part of the
-    field another way: the errors are at least what the parts differ by.
+    A particle changes the light like an edge that moved, but differently in every part of the
+    field.  The errors are therefore at least the differences between parts.
     """
     rows, columns = windows.before_e.shape
     whole = _part_moved(windows, np.s_[:rows, :columns])
@@ -78,20 +78,20 @@ def _part_moved(
     used = ~windows.masked[part]
     if min(used.shape) < _SMALLEST_PX:
         return None
-    way = follow_pattern(
+    motion = follow_pattern(
         np.stack([windows.before_e[part], windows.after_e[part]]),
         np.array([1.0, windows.power_ratio]),
         np.array([np.mean(windows.frames_before), np.mean(windows.frames_after)]),
         np.ascontiguousarray(used),
         np.ascontiguousarray(windows.read_variance_before_e2[part]),
     )
-    if way is None or not np.isfinite(way.error_px).all():
+    if motion is None or not np.isfinite(motion.error_px).all():
         return None
-    return way.shift_px[1], way.error_px[1]
+    return motion.shift_px[1], motion.error_px[1]
 
 
 def drift_warning(name: str, background: dict[str, Any]) -> str | None:
-    """Say that the fixed pattern moved, where that can be taken for particles."""
+    """Warn that the fixed pattern moved, where that can be taken for particles."""
     if background["drift_px"] is None:
         return None
     (y, x), (y_error, x_error) = background["drift_px"], background["drift_error_px"]

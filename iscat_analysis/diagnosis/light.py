@@ -1,4 +1,4 @@
-"""The light before anything is searched: pixels, lines and a smooth part that are unsteady."""
+"""Unsteady pixels and unsteady light, found before anything is searched."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lighting import find_surface
 from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
-from iscat_analysis.camera.unsteady import find_unsteady, unsteady_said
+from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import least_beside, spot_of
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
@@ -26,15 +26,17 @@ PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones."""
 
 _LEAST_PAIRS = 3  # of a range of frames
-_TOGETHER = 8  # frames that are summed there
+_FRAMES_SUMMED = 8  # frames that are summed there
 _SINGLE_PAIRS = 24  # places where particles are followed
-_NEARER = 0.62  # of half the movie, of every second of these: what comes again must not be missed
-_EVERY = 2  # of the places in a background whose frames are compared with those after it as well
+# Of half the movie, of every second of these: what comes again must not be missed
+_SHORTER_GAP = 0.62
+# Every how many-th place in the background is also compared with the frames after it.
+_BACKGROUND_STRIDE = 2
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
 class Pair(NamedTuple):
-    """Frames next to each other, and others a window later."""
+    """Two sets of successive frames, the second a window later than the first."""
 
     first: int
     before: NDArray[Any]
@@ -44,7 +46,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class JudgedLight:
-    """A movie whose light and pixels were looked at."""
+    """A movie without its unsteady pixels, and with its unsteady light divided out."""
 
     movie: Stack
     lines: Lines | None
@@ -53,11 +55,11 @@ class JudgedLight:
 
 
 def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
-    """Look for pixels and for parts of the light that are unsteady."""
+    """Find pixels and parts of the light that are unsteady."""
     if config.optics.scheme == "darkfield":
         return JudgedLight(movie, None, (), movie)
     pairs, window = _pairs(movie, config, camera)
-    said = []
+    messages = []
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm
     spot = spot_of(optics.wavelength_nm, optics.na, pixel_nm or optics.wavelength_nm / optics.na)
     odd = find_unsteady(_apart(pairs), camera, least_beside(spot))
@@ -66,25 +68,25 @@ def judge_light(movie: Stack, config: Config, camera: Camera) -> JudgedLight:
         for part in (part for pair in pairs for part in (pair.before, pair.after)):
             part[:, odd] = dark
         movie = movie.without(odd, dark)
-        said.append(unsteady_said(odd))
+        messages.append(unsteady_message(odd))
     lines = judge_lines(movie, config, camera, pairs, window)
     if lines is None:
-        return JudgedLight(movie, None, tuple(said), movie)
+        return JudgedLight(movie, None, tuple(messages), movie)
     steady = movie.seen_as(SteadyFrames(movie, lines, camera))
-    return JudgedLight(movie, lines, (*said, *lines.messages), steady)
+    return JudgedLight(movie, lines, (*messages, *lines.messages), steady)
 
 
 def judge_lines(
     movie: Stack, config: Config, camera: Camera, pairs: Sequence[Pair], window: int
 ) -> Lines | None:
-    """Look for rows, columns and a smooth part of the light that may be divided out."""
+    """Find rows, columns and smooth light that change and may be divided out."""
     background = config.background
-    way = background_mode(config)
+    mode = background_mode(config)
     if (
         not background.power_normalization
         or background.method == "known"
         or (background.method == "sliding" and background.follows_pattern)
-        or (way == "tracks" and config.track.free == "joint")
+        or (mode == "tracks" and config.track.free == "joint")
     ):
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
@@ -98,7 +100,7 @@ def judge_lines(
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:
-    """Give the frames of pairs that have none in common."""
+    """Select frames of pairs that have no frame in common."""
     parts = sorted(
         (part for p in pairs for part in ((p.first, p.before), (p.later, p.after))),
         key=lambda part: part[0],
@@ -119,35 +121,36 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     at by themselves, and then some of one with some of the other.  Frames in which particles move
     are compared one by one, half the movie apart: what they have in common is their background.
     """
-    total, way, places = movie.shape[0], background_mode(config), PAIRS
+    total, mode, pairs_wanted = movie.shape[0], background_mode(config), PAIRS
     given = config.background.recorded, config.fit.frames
-    together = _TOGETHER
-    if way != "fixed":
+    frames_each = _FRAMES_SUMMED
+    if mode != "fixed":
         first, last = given[1] or (0, total)
         spans = [(first, min(last, total))]
         window = config.background.window_frames or longest_window(last - first)
-        if way == "tracks":
-            window, together, places = (spans[0][1] - first) // 2, 1, _SINGLE_PAIRS
+        if mode == "tracks":
+            window, frames_each, pairs_wanted = (spans[0][1] - first) // 2, 1, _SINGLE_PAIRS
     else:
         before = given[0] or (0, 0)
         first, last = given[1] or (before[1], total)
         spans = [(before[0], min(before[1], total)), (first, min(last, total))]
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-    most = min(together, _SAMPLE_BYTES // (2 * places * frame_bytes) or 1)
-    places_read: list[tuple[int, int]] = []
+    most = min(frames_each, _SAMPLE_BYTES // (2 * pairs_wanted * frame_bytes) or 1)
+    pairs_read: list[tuple[int, int]] = []
     parts: list[NDArray[Any]] = []
     for start, stop in spans:
         gap = min(window, (stop - start) // 2)
-        together = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
-        if together < 1:
+        frames_each = min(most, gap, (stop - start - gap) // _LEAST_PAIRS)
+        if frames_each < 1:
             continue
-        room = stop - gap - together - start
-        number = min(places // len(spans), room // together + 1)  # none has another's frames
-        gaps = (gap, math.ceil(_NEARER * gap)) if way == "tracks" else (gap,)
-        for k, place in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
-            places_read.append((place, place + gaps[k % len(gaps)]))
-            parts += [movie.read(k, k + together) for k in places_read[-1]]
+        room = stop - gap - frames_each - start
+        # no pair has another's frames
+        number = min(pairs_wanted // len(spans), room // frames_each + 1)
+        gaps = (gap, math.ceil(_SHORTER_GAP * gap)) if mode == "tracks" else (gap,)
+        for k, frame in enumerate(np.linspace(start, start + room, number).astype(int).tolist()):
+            pairs_read.append((frame, frame + gaps[k % len(gaps)]))
+            parts += [movie.read(k, k + frames_each) for k in pairs_read[-1]]
     if not parts:
         return [], window
     measured = [measure_frames(part, camera) for part in parts]
@@ -158,14 +161,14 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         for part, seen, (_, repeats) in zip(parts, np.split(lit, cuts), measured, strict=True)
     ]
     read = [
-        Pair(place, before, later, after)
-        for (place, later), before, after in zip(places_read, good[::2], good[1::2], strict=True)
+        Pair(frame, before, later, after)
+        for (frame, later), before, after in zip(pairs_read, good[::2], good[1::2], strict=True)
     ]
     if len(spans) == 2:
         apart = [p for p in read if p.first >= spans[1][0]]
-        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_EVERY]
+        firsts = [p for p in read if p.first < spans[1][0]][-len(apart) :][::_BACKGROUND_STRIDE]
         read += [
             Pair(one.first, one.before, other.later, other.after)
-            for one, other in zip(firsts, apart[::_EVERY], strict=False)
+            for one, other in zip(firsts, apart[::_BACKGROUND_STRIDE], strict=False)
         ]
     return [p for p in read if len(p.before) and len(p.after)], window

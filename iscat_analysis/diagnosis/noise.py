@@ -1,4 +1,4 @@
-"""The noise before anything is searched: camera, correlation of pixels, length of the windows."""
+"""The noise before anything is searched: camera, correlation of pixels, window length."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.calibration import find_zero
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.metadata import diagnose_gain, with_shaking
-from iscat_analysis.camera.pattern_jitter import without_shaking
+from iscat_analysis.camera.metadata import diagnose_gain, with_pattern_jitter
+from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.camera.successive import shared_light
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.camera_numbers import (
-    SAID,
+    REPORTED_LAWS,
     allow_for_correlation,
-    either_said,
     offset_is_wrong,
-    offset_said,
+    offset_message,
+    offset_or_gain_message,
     zero_by_law,
 )
 from iscat_analysis.errors import DataError
@@ -48,16 +48,17 @@ SPECTRUM_FRAMES = 128
 
 _GAIN_FRAMES = 64  # on which the gain is judged
 _FEWEST_FRAMES = 8  # on which it is judged beside particles that move
-_FREE = 0.25  # share of the pixels that no particle may come near in the frames judged
-_AWAY = 1.5  # λ/NA from a particle, from where its light changes the variance by some per cent
+_LEAST_FREE_SHARE = 0.25  # share of the pixels that no particle may come near in the frames judged
+# λ/NA from a particle, from where its light changes the variance by some per cent
+_LEAST_DISTANCE = 1.5
 _ENOUGH_FITS = 10  # of which the best
 _BEST_FITS = 0.1  # leave over the noise and no more; this quantile is theirs
-_LESS = 0.75  # of the noise, which small pictures leave over by chance at least
+_MOST_NOISE_SHARE = 0.75  # of the noise, which small pictures leave over by chance at least
 
 
 @dataclass(frozen=True)
 class Noise:
-    """What some frames without particles, or nearly so, say of the noise."""
+    """The noise of frames without particles, compared with the camera's numbers."""
 
     messages: tuple[str, ...] = ()
     differs: bool = False
@@ -65,17 +66,17 @@ class Noise:
     spectrum: NoiseSpectrum | None = None
     shakes: bool = False
 
-    def said(self, name: str) -> Iterator[str]:
-        """Give what the user should know."""
+    def messages_of(self, name: str) -> Iterator[str]:
+        """List the messages for the user."""
         if self.spectrum is not None and self.spectrum.message:
             yield f"{name}: {self.spectrum.message}"
         yield from self.messages
 
-    def beside(self, chi2: FloatArray) -> Noise:
-        """Hold what noise around particles is said to be against what fits of them leave over.
+    def compared_with_fits(self, chi2: FloatArray) -> Noise:
+        """Withdraw an excess of noise that the fits of particles do not show.
 
-        Too much noise is in all fits alike.  Where some leave over less, what seems to be noise is
-        what a wrong model leaves over of rings, or the blur of motion.
+        Too much noise is in all fits alike.  Where some fits leave less, the excess is the residual
+        of a wrong model, or blur of moving particles.
 
         Shapes: `chi2` (n,).
         """
@@ -83,7 +84,7 @@ class Noise:
         if self.excess is None or len(known) < _ENOUGH_FITS:
             return self
         least = float(np.quantile(known, _BEST_FITS))
-        return Noise() if least < _LESS * self.excess.ratio else self
+        return Noise() if least < _MOST_NOISE_SHARE * self.excess.ratio else self
 
     @property
     def summary(self) -> dict[str, Any] | None:
@@ -110,15 +111,15 @@ def judge_counts(
     except DataError:  # too dark to tell
         return Noise(spectrum=spectrum)
     gain = allow_for_correlation(gain, spectrum)
-    gain = with_shaking(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
+    gain = with_pattern_jitter(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
-        still = without_shaking(counts, camera, masked=masked)
+        still = without_pattern_jitter(counts, camera, masked=masked)
         return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
     law = camera.law
-    if law is not None and (law.bent or law.kind in SAID):  # already
+    if law is not None and (law.bent or law.kind in REPORTED_LAWS):  # already
         excess = ExcessNoise(gain.noise_ratio, "") if gain.off and gain.noise_ratio > 1 else None
         return Noise((), gain.off, excess, spectrum)
     if law is not None:
@@ -130,15 +131,16 @@ def judge_counts(
         zero = None  # the variance of a pixel is then of its neighbours' light as well
     wrong = zero if zero is not None and offset_is_wrong(zero, gain) else None
     if wrong is not None:
-        said = offset_said(wrong, camera)
+        message = offset_message(wrong, camera)
     else:
-        said = ("" if additive else either_said(gain, zero, camera)) or gain.message or ""
+        message = "" if additive else offset_or_gain_message(gain, zero, camera)
+        message = message or gain.message or ""
     if gain.shakes and follows is False:
-        said += ", or set background.drift_correction = true, with which it is followed"
-    excess = ExcessNoise(gain.noise_ratio, said) if gain.off and gain.noise_ratio > 1 else None
+        message += ", or set background.drift_correction = true, with which it is followed"
+    excess = ExcessNoise(gain.noise_ratio, message) if gain.off and gain.noise_ratio > 1 else None
     if wrong is None:
-        return Noise((said,) if said else (), gain.off, excess, spectrum, gain.shakes)
-    messages = [said]
+        return Noise((message,) if message else (), gain.off, excess, spectrum, gain.shakes)
+    messages = [message]
     moved = replace(
         camera, offset_adu=camera.offset_adu + wrong.electrons / camera.gain_e_per_adu, law=None
     )
@@ -150,7 +152,7 @@ def judge_counts(
 
 
 def _filtered(shared: float) -> str:
-    """Say that frames are no independent measurements."""
+    """Say that successive frames are not independent measurements."""
     return (
         f"frames next to each other differ by {shared:.2g} times the variance of those farther "
         "apart: they were averaged, interpolated or filtered in time, so that their noise does not "
@@ -161,7 +163,7 @@ def _filtered(shared: float) -> str:
 def judge_background(
     movie: Stack, camera: Camera, windows: Windows, *, still: bool, additive: bool
 ) -> Noise:
-    """Judge the noise of the background frames; where it is known, of those with the particles."""
+    """Judge the noise of the background, or of the fitted frames where the background is known."""
     frames = windows.n_before or (windows.n_after if still else 0)
     if frames < 2 or not is_lit(windows):
         return Noise()
@@ -189,7 +191,7 @@ def judge_beside(
     Shapes: `seen` (n,), `used` (y, x).
     """
     optics = context.config.optics
-    away = _AWAY * optics.wavelength_nm / optics.na
+    away = _LEAST_DISTANCE * optics.wavelength_nm / optics.na
     y, x = np.indices(used.shape) * context.pixel_nm
     pixels = np.column_stack([x.ravel(), y.ravel()])
     frame, places_nm = seen
@@ -197,7 +199,7 @@ def judge_beside(
     while count >= _FEWEST_FRAMES:
         near = scipy.spatial.cKDTree(places_nm[(frame >= span[0]) & (frame < span[0] + count)])
         free = used & (near.query(pixels)[0] > away).reshape(used.shape)
-        if free.any() and free.sum() >= _FREE * used.sum():
+        if free.any() and free.sum() >= _LEAST_FREE_SHARE * used.sum():
             counts = movie.read(span[0], span[0] + count)
             additive = context.additive
             if judge_counts(counts, camera, masked=~free, additive=additive).messages:
@@ -210,7 +212,7 @@ def judge_beside(
 
 @dataclass(frozen=True)
 class NoiseSurvey:
-    """What the first frames of a landing movie say, and the frames themselves."""
+    """The noise of the first frames of a landing movie, and a reader of all frames."""
 
     reader: Reader
     noise: Noise
@@ -219,7 +221,7 @@ class NoiseSurvey:
 
 
 def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
-    """Judge the noise of a landing movie, and choose how many frames around a step are summed."""
+    """Judge the noise of a landing movie, and choose the window."""
     additive = config.optics.scheme == "darkfield"
     with threads(config.compute.workers) as pool:
         mapper = over_frames(pool, reader.shape)
@@ -277,7 +279,7 @@ def first_counts(movie: Stack, windows: Windows, most: int) -> NDArray[Any]:
 
 
 def is_lit(windows: Windows) -> bool:
-    """Tell whether there is light in the background, beyond the read noise."""
+    """Tell whether the background has more light than read noise."""
     used = ~windows.masked
     light, read = windows.before_e[used], windows.read_variance_before_e2[used]
     return bool(light.sum() > read.sum())

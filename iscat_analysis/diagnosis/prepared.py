@@ -1,4 +1,4 @@
-"""A movie whose camera, optics and kind are known."""
+"""A movie that is ready to be searched: camera, optics and background mode are known."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Prepared:
     steady: Stack
     config: Config
     camera: Camera
-    way: BackgroundMode
+    background_mode: BackgroundMode
     lines: Lines | None
     opening: NoiseSurvey | None
     other_kind: str
@@ -42,7 +42,7 @@ class Prepared:
 
     @property
     def flags(self) -> tuple[Status, ...]:
-        """What is wrong with all rows, because it is wrong with the movie."""
+        """Flags of all rows, because they are about the movie."""
         law = self.camera.law
         bent = law is not None and (law.bent or (law.dilutes and law.flickers))
         found = {Status.NONLINEAR: bent, Status.PROCESSED: self.processing is not None}

@@ -1,4 +1,4 @@
-"""A movie that was given to the wrong mode is recognised, and said."""
+"""Movies that were given to the wrong mode."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ is 0.14, and 0.36 at most."""
 
 _DIM = 0.5  # of the usual light, below which changes are damped
 
-DOUBT = 0.03
+LARGEST_CHANCE = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
 
 
 def look_at_changes(
     movie: FrameSource, config: Config, camera: Camera, span: tuple[int, int]
 ) -> Changes:
-    """Find what changes in the first frames of a movie."""
+    """Find changes in the first frames of a movie."""
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away
@@ -82,8 +82,8 @@ def _damping(light_e: FloatArray, camera: Camera) -> NDArray[np.float32]:
 
 
 def as_landing(changes: Changes, name: str) -> str:
-    """Say that a movie in mode ``track`` shows landings."""
-    if _chance(changes.number, changes.staying, MOST_STAYING) > DOUBT:
+    """Say that a movie in mode ``track`` shows landings; empty where it does not."""
+    if _chance(changes.number, changes.staying, MOST_STAYING) > LARGEST_CHANCE:
         return ""
     return (
         f"{name}: its particles land or leave rather than move: of {changes.number} clear changes "
@@ -93,8 +93,8 @@ def as_landing(changes: Changes, name: str) -> str:
 
 
 def as_moving(changes: Changes, name: str) -> str:
-    """Say that a movie with sliding windows shows particles that move."""
-    clear = _chance(changes.number, changes.moving, MOST_MOVING) <= DOUBT
+    """Say that a movie with sliding windows shows moving particles; empty where it does not."""
+    clear = _chance(changes.number, changes.moving, MOST_MOVING) <= LARGEST_CHANCE
     if not (clear and changes.moving >= LEAST_MOVING):
         return ""
     return (
@@ -110,5 +110,5 @@ def _chance(number: int, share: float, most: float) -> float:
 
 
 def changes_summary(changes: Changes) -> dict[str, Any]:
-    """Give what ``summary.json`` says of changes."""
+    """Summarise changes for ``summary.json``."""
     return {"number": changes.number, "staying": changes.staying, "moving": changes.moving}

@@ -70,13 +70,13 @@ class KeptFrames:
 def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     """Leave out frames that repeat the one before, unless they are dark, which is told apart."""
     before, after = frame_ranges(movie, config)
-    kept = [
-        span[0] + np.flatnonzero(~_repeats(movie, camera, span))
-        for span in (before, after)
-        if span is not None
-    ]
+    spans = [span for span in (before, after) if span is not None]
+    used = np.concatenate([np.arange(*span) for span in spans])
+    beyond = max(span[1] for span in spans) > movie.shape[0]
+    if beyond or np.unique(used).size < used.size:  # which is refused where they are summed
+        return KeptFrames(movie, config, config)
+    kept = [span[0] + np.flatnonzero(~_repeats(movie, camera, span)) for span in spans]
     numbers = np.concatenate(kept)
-    used = np.concatenate([np.arange(*span) for span in (before, after) if span is not None])
     missing = np.setdiff1d(used, numbers)
     if not missing.size or min(part.size for part in kept) < 2:  # nothing else is there
         return KeptFrames(movie, config, config)

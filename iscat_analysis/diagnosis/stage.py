@@ -1,4 +1,4 @@
-"""Whether the stage moves, before anything is searched: what the fixed pattern tells of it."""
+"""Motion of the stage, as the fixed pattern shows it before anything is searched."""
 
 from __future__ import annotations
 
@@ -7,17 +7,18 @@ from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.records import FrameSource
 from iscat_analysis.search.sliding import good_frames, measure_motion
 
-_MATTERS = 0.03  # of the variance of averages, that motion adds; of noise alone it is 1e-3
+# Share of the variance of averages that motion must add; noise alone adds 1e-3.
+_LEAST_VARIANCE_SHARE = 0.03
 
 
-def followed(config: Config, *, moves: bool) -> Config:
-    """Settle whether the motion of the fixed pattern is divided out."""
+def with_drift_correction(config: Config, *, moves: bool) -> Config:
+    """Set in the configuration whether the motion of the fixed pattern is divided out."""
     background = config.background.model_copy(update={"drift_correction": moves})
     return config.model_copy(update={"background": background})
 
 
-def motion_said(movie: FrameSource, opening: NoiseSurvey) -> str:
-    """Say that the fixed pattern of a landing movie moves."""
+def motion_message(movie: FrameSource, opening: NoiseSurvey) -> str:
+    """Say that the fixed pattern of a landing movie moves; empty where it does not."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"
     reader, length = opening.reader, opening.curve.frames[-1]
@@ -28,7 +29,7 @@ def motion_said(movie: FrameSource, opening: NoiseSurvey) -> str:
         for counts in (reader.opening(), last)
         if len(counts) >= 2
     )
-    if not share > _MATTERS:
+    if not share > _LEAST_VARIANCE_SHARE:
         return ""
     return (
         f"the fixed pattern moves: averages of {length} frames differ by {1 + share:.3g} times "

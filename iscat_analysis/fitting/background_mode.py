@@ -23,7 +23,7 @@ BackgroundMode = Literal["fixed", "sliding", "tracks"]
 
 
 def background_mode(config: Config) -> BackgroundMode:
-    """Tell in which way a movie is analysed."""
+    """Tell which frames are compared with which."""
     method = config.background.method
     if method == "sliding":
         if config.fit.likelihood == "poisson":
@@ -38,7 +38,7 @@ def background_mode(config: Config) -> BackgroundMode:
 
 
 def describe_background_mode(config: Config) -> str:
-    """Say which frames stand against which."""
+    """Describe in words which frames are compared with which."""
     background = config.background
     those = "all of them" if background.frames == ALL else "background.frames"
     if background.recorded:

@@ -20,7 +20,7 @@ from iscat_analysis.files import whole_file
 from iscat_analysis.reading import npz_of, read_bytes, read_json, read_parquet
 from iscat_analysis.records import Clip, EventView, FloatArray, Trace
 
-GOES_ON = "what was finished is kept, and the same command goes on from there"
+RESUMPTION_HINT = "what was finished is kept, and the same command goes on from there"
 """What an interrupt says where it is so."""
 
 _PART = re.compile(r"[0-9a-f]{32}-\d{5}\.(parquet|npz)(\.\d+-[0-9a-f]+\.partial)?")
@@ -55,7 +55,7 @@ class Checkpoint:
         self._key = digest.hexdigest()[:32]
 
     def read(self, number: int) -> tuple[pd.DataFrame, dict[str, Any]] | None:
-        """Give the table and the arrays of a finished part, or None."""
+        """Load the table and the arrays of a finished part; None where there are none."""
         if self._folder is None:
             return None
         table_path, path = self._paths(number)
@@ -68,7 +68,7 @@ class Checkpoint:
         return found
 
     def write(self, number: int, table: pd.DataFrame, arrays: Mapping[str, Any]) -> None:
-        """Keep a finished part; a full disk costs the resumption, not the run."""
+        """Save a finished part; on a full disk the run goes on, but cannot resume from it."""
         if self._folder is None:
             return
         table_path, path = self._paths(number)
@@ -88,7 +88,7 @@ class Checkpoint:
 
 
 def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
-    """Put images into arrays that a file holds."""
+    """Pack images into arrays for a file."""
     flat = [np.stack([v.contrast, v.model, v.residual]).reshape(3, -1) for v in views]
     traces = [v.trace for v in views]
     clips = [v.clip for v in views]
@@ -109,7 +109,7 @@ def packed_views(views: Sequence[EventView]) -> dict[str, FloatArray]:
 
 
 def unpacked_views(data: Mapping[str, Any]) -> tuple[EventView, ...]:
-    """Take images out of such arrays."""
+    """Unpack images from such arrays."""
     views, at = [], 0
     traces, clips = _traces(data), _clips(data)
     for i, (row, column) in enumerate(data["corners"]):
@@ -156,7 +156,7 @@ def _clips(data: Mapping[str, Any]) -> Iterator[Clip | None]:
 
 
 def partial_folder(folder: Path) -> Path:
-    """Name the folder of an output folder's finished chunks: hidden, beside it."""
+    """Name the hidden folder beside an output folder that holds its finished chunks."""
     return folder.with_name(f".{folder.name}.partial")
 
 
@@ -170,23 +170,23 @@ def remove_parts(folder: Path) -> None:
 
 
 def saying(stop: KeyboardInterrupt, what: str) -> KeyboardInterrupt:
-    """Add to what an interrupt says."""
+    """Append a text to the message of an interrupt."""
     return KeyboardInterrupt("; ".join(filter(None, [str(stop), what])))
 
 
 @contextmanager
 def parts_kept(folder: Path | None) -> Iterator[None]:
-    """Say in an interrupt that finished parts are kept, when all of them are."""
+    """Append to an interrupt that finished parts are kept, when all of them are."""
     try:
         yield
     except KeyboardInterrupt as stop:
         if folder is None or not any(folder.glob("*.npz")):
             raise
-        raise saying(stop, GOES_ON) from None
+        raise saying(stop, RESUMPTION_HINT) from None
 
 
 def is_resumable(folder: Path) -> bool:
-    """Whether a folder holds what an interrupted run left, and its chunks, if it finished any."""
+    """Whether a folder is what an interrupted run left, with finished chunks or without any."""
     try:
         summary = read_json(folder / "summary.json")
         goes_on = partial_folder(folder).is_dir() or not summary["events"]

@@ -1,4 +1,4 @@
-"""What a first run compiles is said as it happens."""
+"""The message that kernels are being compiled, in the first run."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ROOM = f"{_kernels.__name__}."
 
 
 class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
-    """Listens to Numba; `compiling` makes one."""
+    """Listens to Numba; `compiling` makes it."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify
@@ -41,14 +41,14 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
             self._notify("compiling the numerical kernels, once per installation…")
 
     def close(self) -> None:
-        """Say nothing any more."""
+        """Stop listening."""
         if self._timer is not None:
             self._timer.cancel()
 
 
 @contextmanager
 def compiling(notify: Callable[[str], None]) -> Iterator[None]:
-    """Say what is compiled until the block ends."""
+    """Say which functions are being compiled while the block runs."""
     if _kernels.TEMPORARY:
         notify(
             "compiled kernels cannot be kept, because neither the installation nor the home "

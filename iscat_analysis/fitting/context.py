@@ -1,4 +1,4 @@
-"""What a configuration makes of a movie: models, matched filter, threshold."""
+"""Models, matched filter and threshold that follow from the configuration of a movie."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _VARIANCE_OF_BACKGROUND = {
 
 @dataclass(frozen=True)
 class AnalysisContext:
-    """What a configuration fixes for every field of a movie: model, templates, scale."""
+    """Everything that is the same for all fields of a movie: models, templates, scale."""
 
     config: Config
     model: ForwardModel
@@ -56,7 +56,7 @@ class AnalysisContext:
         return self.config.particle.mean_height_nm(mass_kda)
 
     def with_prior(self, likelihood: Likelihood, mass_kda: float) -> Likelihood:
-        """Give a likelihood what is known of the particle's height, in mode mass."""
+        """Add the prior of the height to a likelihood, in mode mass."""
         prior = height_prior(self.config, mass_kda)
         return likelihood if prior is None else replace(likelihood, prior=prior)
 
@@ -71,7 +71,7 @@ class AnalysisContext:
         return self.config.fit.roi_px(self.pixel_nm)
 
     def left(self, signal: FloatArray) -> FloatArray:
-        """Give what the frames, as they are corrected, show of a signal over the field.
+        """Give what is left of a signal after frames are divided by their unsteady light.
 
         Shapes: `signal` (y, x), result (y, x).
         """
@@ -168,14 +168,14 @@ def square_model(config: Config, pixel_nm: float, roi_px: int) -> ForwardModel:
 
 
 def search_both(detection: Detection, *, searches: int = 1) -> Detection:
-    """Search both polarities, for one that is not wanted has side lobes that are."""
+    """Search both signs: particles of the unwanted sign have side lobes of the wanted one."""
     sides = 1 if detection.polarity == "both" else 2
     alarms = sides * detection.false_alarms_per_movie / searches
     return detection.model_copy(update={"polarity": "both", "false_alarms_per_movie": alarms})
 
 
 def reported_steps(context: AnalysisContext) -> int:
-    """Give which steps of a landing movie have the polarity that is reported."""
+    """Tell which steps of a landing movie have the sign that is reported."""
     return context.config.detection.sign * int(context.templates.signs[0])
 
 

@@ -1,8 +1,8 @@
-"""The records of an event, and the verdict on it, however its frames were told apart.
+"""Records of an event, the same for all background modes, and its flags.
 
-A candidate (`Candidate`, or the `Peak` and `Step` of a landing movie) is `Fitted` while its
-neighbours are still being found.  Once they are known it is judged, and is an `Event`: all that its
-row in ``fits.csv`` and its images are made of.
+A candidate (`Candidate`, or the `Peak` and `Step` of a landing movie) becomes `Fitted`, and an
+`Event` when its neighbours are known too.  An `Event` holds all that its row in ``fits.csv`` and
+its images need.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Fitted:
 
     @property
     def candidate(self) -> Candidate:
-        """The estimate, as the start of another fit."""
+        """The estimate, in the form from which another fit starts."""
         pixel = self.likelihood.grid.pixel_nm
         return Candidate(
             self.fit.x_nm / pixel, self.fit.y_nm / pixel, self.fit.z_nm, self.fit.mass_kda, self.snr
@@ -41,17 +41,17 @@ class Fitted:
 
     @property
     def place(self) -> PlaceAndMass:
-        """Where it is, and its mass."""
+        """Position [nm] and mass [kDa]."""
         return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
 
     @property
     def snr(self) -> float:
-        """√(2 Δℓ) against no particle."""
+        """Signal-to-noise ratio √(2 Δℓ), Δℓ against the model without the particle."""
         return self.fit.snr
 
     @property
     def described(self) -> Described:
-        """What the fit explains, and what it leaves over."""
+        """What the fit explains, and its misfit."""
         return Described.of(self.snr, self.fit.chi2_reduced, self.likelihood.n_pixels)
 
 
@@ -69,7 +69,7 @@ class Event(Fitted):
     rise: int = 0
 
 
-def remarks(
+def fit_flags(
     context: AnalysisContext,
     fitted: Fitted,
     windows: Windows,
@@ -78,21 +78,21 @@ def remarks(
     too_close: bool,
     changing: bool = False,
 ) -> tuple[Status, ...]:
-    """Add what the surroundings of a particle say of its fit."""
+    """Join the flags of a fit with those of its neighbourhood."""
     fit, region = fitted.fit, fitted.region
     corner = region.rows[0], region.columns[0]
     saturated = saturated_near(
         windows.saturated, fit.x_nm, fit.y_nm, context.pixel_nm, corner=corner
     )
-    said = (
+    possible = (
         (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
         (too_close, Status.TOO_CLOSE), (changing, Status.CHANGING),
     )  # fmt: skip
-    return verdict([*fit.flags, *(flag for true, flag in said if true)])[1]
+    return verdict([*fit.flags, *(flag for true, flag in possible if true)])[1]
 
 
 def standing_out(events: Sequence[Event]) -> Sequence[Event]:
-    """Keep the events on which nothing is to be remarked."""
+    """Select the events without a flag."""
     return [event for event in events if not event.flags] or events
 
 

@@ -1,10 +1,9 @@
-"""Detection and fitting over a whole field, in turns.
+"""Detection and fits over a whole field, in turns.
 
-What the fits explain is taken off the image before it is searched again, so a side lobe never
-counts as a particle and a faint neighbour is not lost.  What a poor fit leaves over conceals its
-neighbours; where it is they that it lacks, they are tried together.  Every fit sees its neighbours'
-signal as part of its background, and the laser power is estimated again with all particles
-accounted for.
+Fitted signals are subtracted from the image before it is searched again, so that side lobes do not
+count as particles and faint neighbours are not lost.  A poor fit hides its neighbours; where these
+are the cause of the misfit, candidates near it are fitted together.  Each fit includes the signal
+of its neighbours, and the laser power is estimated again over a background without particles.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import numpy as np
 
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
-from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, remarks
+from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
 from iscat_analysis.fitting.regions import (
     Region,
     noise_cumulants,
@@ -46,8 +45,9 @@ MAX_ROUNDS = 8
 
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
 _MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
-_TRIED = 0.1  # share of the χ² in excess that a particle explains which is tried among others
-_SETTLED = 0.1  # change of signal-to-noise ratios from one sweep to the next
+# Share of the χ² in excess that a particle explains which is tried among others
+_LEAST_EXPLAINED_SHARE = 0.1
+_LEAST_SNR_CHANGE = 0.1  # change of signal-to-noise ratios from one sweep to the next
 _AS_FOUND = 0.95  # of the threshold: a fit whose final SNR is below it is explained by the others
 _DUPLICATE_PX = 1.5  # two fits nearer than this describe one particle
 
@@ -100,7 +100,7 @@ def fit_field(
 def _settled(
     context: AnalysisContext, windows: Windows, events: list[Fitted], pool: ThreadPoolExecutor
 ) -> tuple[list[Fitted], Windows]:
-    """Fit everything with everything else in place, until fits near each other hardly change."""
+    """Fit all particles in turns, until fits near each other hardly change."""
     for sweep in range(_MOST_SWEEPS if events else 0):
         last = _without_doubles(events, context)
         events = _fit_all(context, windows, [e.candidate for e in last], last, pool)
@@ -117,17 +117,19 @@ def _with_concealed(
     excess_noise: ExcessNoise | None,
     pool: ThreadPoolExecutor,
 ) -> tuple[list[Fitted], Windows] | None:
-    """Add the particles that poor fits conceal, where it is their absence that makes these poor.
+    """Add particles near poor fits, where their absence is the cause of the misfit.
 
-    Of several particles that are missing around a known one, each explains but a part of what its
-    fit leaves over, and none is told from a misfit.  So candidates that explain some of it are
-    tried together.  Those stay that explain most of what is left with all the others in place.
+    If several particles are missing around a known one, each by itself explains only a part of the
+    misfit and cannot be told from it.  Candidates are therefore fitted together, and those are kept
+    that explain more than is then left.
     """
     trial, power = known, windows
     for _ in range(MAX_ROUNDS):
         if not any(Status.POOR_FIT in event.fit.flags for event in trial):
             break
-        fresh, _ = search_field(context, power, trial, excess_noise, explains=_TRIED)
+        fresh, _ = search_field(
+            context, power, trial, excess_noise, explains=_LEAST_EXPLAINED_SHARE
+        )
         if not fresh:
             break
         both = _fit_all(context, power, [*(e.candidate for e in trial), *fresh], trial, pool)
@@ -145,7 +147,7 @@ def _with_concealed(
 def _tenable(
     context: AnalysisContext, trial: Sequence[Fitted], known: Sequence[Fitted]
 ) -> list[Fitted]:
-    """Leave out the added ones that explain less than what is left, the worst of each place."""
+    """Drop added particles that explain less than the misfit, the worst of each place first."""
     places, earlier = (
         np.array([(e.candidate.x_px, e.candidate.y_px) for e in events])
         for events in (trial, known)
@@ -167,7 +169,7 @@ def _tenable(
 def total_signal(
     context: AnalysisContext, shape: tuple[int, int], events: Sequence[Fitted]
 ) -> FloatArray:
-    """Signal of all fitted particles over the field.
+    """Sum the signals of all fitted particles over the field.
 
     Shapes: result (y, x).
     """
@@ -208,7 +210,7 @@ def search_field(
     *,
     explains: float = EXPLAINS,
 ) -> tuple[list[Candidate], list[Candidate]]:
-    """Find new particles, and what may be but the side lobe of a known one."""
+    """Find new particles; candidates that may be side lobes of known ones are returned apart."""
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     explained = context.left(total_signal(context, shape, events))
     likelihood = search_likelihood(context, windows, explained)
@@ -241,7 +243,7 @@ def search_field(
 def _misfit(
     candidate: Candidate, event: Fitted, context: AnalysisContext, near_px: float, explains: float
 ) -> float:
-    """Signal-to-noise ratio that a candidate must exceed not to be what a fit left over."""
+    """Signal-to-noise ratio that a candidate must exceed not to be a residual of a fit."""
     here = event.candidate
     distance = math.hypot(candidate.x_px - here.x_px, candidate.y_px - here.y_px)
     if distance <= near_px:
@@ -250,18 +252,18 @@ def _misfit(
 
 
 def _reach_px(context: AnalysisContext) -> float:
-    """How far from a particle a poor fit leaves something over [pixels]."""
+    """Distance from a particle within which a poor fit leaves residuals [pixels]."""
     # In dark field a wrong background level leaves residuals beyond the fitted region.
     return (2 if context.additive else 0.75) * context.roi_px
 
 
 def _excess(event: Fitted) -> float:
-    """Give the χ² that a poor fit leaves over."""
+    """χ² of a fit beyond its expectation, where the fit is poor."""
     return _chi2_left(event) if Status.POOR_FIT in event.fit.flags else 0.0
 
 
 def _chi2_left(event: Fitted) -> float:
-    """Give the χ² of a fit above its expectation, which may be noise."""
+    """χ² of a fit beyond its expectation, some of which may be noise."""
     return max(0.0, event.fit.chi2_reduced - 1) * event.likelihood.n_pixels
 
 
@@ -274,9 +276,9 @@ def _fit_all(
     *,
     first: int = 0,
 ) -> list[Fitted]:
-    """Fit candidates with the current `events` but itself in its background.
+    """Fit each candidate with all other `events` in its background.
 
-    Candidate i is event ``first + i``, where there is one of that number.
+    Candidate i replaces event ``first + i``, if there is one of that number.
     """
     nominal = context.model.material.mass_kda
     free = FREE_PARAMETERS[context.mode]
@@ -338,23 +340,23 @@ def _refined(context: AnalysisContext, windows: Windows, events: Sequence[Fitted
 
 
 def _wanted(context: AnalysisContext, event: Fitted) -> bool:
-    """Whether the fitted contrast has the polarity that is reported."""
+    """Whether the fitted contrast has the sign that is reported."""
     sign = context.config.detection.sign
     return sign == 0 or context.additive or sign * event.fit.contrast > 0
 
 
 def _is_settled(before: Sequence[Fitted], after: Sequence[Fitted], near_px: float) -> bool:
-    """Whether another sweep would change little of fits that are near each other."""
+    """Whether another turn would hardly change fits that are near each other."""
     if len(before) != len(after) or not after:
         return not after
     places = np.array([(e.candidate.x_px, e.candidate.y_px) for e in after])
     apart = np.hypot(*(places[:, None] - places).T) + 2 * near_px * np.eye(len(places))
     moved = np.array([a.snr - b.snr for a, b in zip(before, after, strict=True)])
-    return bool(np.all((np.abs(moved) < _SETTLED) | (apart.min(axis=0) > near_px)))
+    return bool(np.all((np.abs(moved) < _LEAST_SNR_CHANGE) | (apart.min(axis=0) > near_px)))
 
 
 def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list[Fitted]:
-    """Keep the better of two fits that fell onto one particle."""
+    """Keep the better of two fits that converged to one particle."""
     kept: list[Fitted] = []
     for event in sorted(events, key=lambda e: -e.snr):
         here = event.candidate
@@ -370,7 +372,7 @@ def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list
 def _judged(
     context: AnalysisContext, windows: Windows, fitted: Sequence[Fitted], lobes: Sequence[Fitted]
 ) -> list[Event]:
-    """Add the verdicts that need the neighbourhood: saturation, crowding, side lobes."""
+    """Add the flags that depend on the neighbourhood: saturation, crowding, side lobes."""
     judged = []
     limit = context.config.detection.min_separation_nm
     for number, one in enumerate((*fitted, *lobes)):
@@ -387,7 +389,7 @@ def _judged(
         )
         lobe = number >= len(fitted) or one.described.is_dwarfed(near)
         own = windows.cut(one.region.slices)
-        flags = remarks(context, one, own, sidelobe=lobe, too_close=crowded)
+        flags = fit_flags(context, one, own, sidelobe=lobe, too_close=crowded)
         judged.append(
             Event(
                 one.region, one.fit, one.likelihood, own, flags,

@@ -16,7 +16,7 @@ changes a picture by a thousandth of its peak."""
 DRIFT_FRAMES = 1000.0
 """Frames in which the focus rises by ``optics.focus_drift_nm``."""
 
-_KEPT = 64  # models at hand, of some MB each
+_MOST_MODELS = 64  # models at hand, of some MB each
 
 
 class MovingFocus:
@@ -33,7 +33,7 @@ class MovingFocus:
             there = config.model_copy(update={"optics": optics, "calibration": None})
             return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
 
-        self._moved = memoize(_KEPT, moved)
+        self._moved = memoize(_MOST_MODELS, moved)
 
     def at(self, frame: int) -> ForwardModel:
         """Give the model of a frame."""

@@ -38,7 +38,7 @@ _REACH = SPAN * STRIDES
 
 
 def follow(chunk: Chunk, mapper: Mapper = map) -> Trajectory | None:
-    """Follow the fixed pattern of a chunk."""
+    """Estimate the motion of the fixed pattern through a chunk."""
     light = np.add.reduceat(chunk.power, chunk.edges[:-1])
     moment = np.add.reduceat(chunk.power * np.arange(len(chunk.power)), chunk.edges[:-1])
     frames = chunk.first + moment / np.where(light > 0, light, 1.0)
@@ -49,7 +49,7 @@ def follow(chunk: Chunk, mapper: Mapper = map) -> Trajectory | None:
 def corrected(
     chunk: Chunk, *, wanted: bool, mapper: Mapper = map
 ) -> tuple[Chunk, MovingPattern | None]:
-    """Follow the fixed pattern of a chunk where its motion is to be divided out."""
+    """Estimate the motion of the fixed pattern through a chunk, if it is to be divided out."""
     trajectory = follow(chunk, mapper) if wanted else None
     if trajectory is None:
         return chunk, None

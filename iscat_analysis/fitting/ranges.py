@@ -19,7 +19,7 @@ from iscat_analysis.units import count
 
 
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
-    """Which frames are background and which are fitted."""
+    """Give the ranges of frames that are background, and that are fitted."""
     before = config.background.recorded
     if config.background.method == "known":
         before = None
@@ -41,7 +41,7 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
 
 
 def _without_frames_before(config: Config) -> str:
-    """Name the backgrounds that need no frames before the particles, in the mode of a movie."""
+    """Name the backgrounds that need no frames before the particles."""
     if config.optics.scheme == "darkfield":
         return ""
     if config.fit.mode == "track":
@@ -56,7 +56,7 @@ def _without_frames_before(config: Config) -> str:
 def fitted_frames(
     movie: FrameSource, config: Config, before: tuple[int, int] | None = None
 ) -> tuple[int, int]:
-    """Which frames are looked at: ``fit.frames``, or all after the background."""
+    """Give the frames that are fitted: ``fit.frames``, or all after the background."""
     first, last = config.fit.frames or (before[1] if before else 0, movie.shape[0])
     if last > movie.shape[0]:
         raise DataError(
@@ -73,7 +73,7 @@ def tracked_frames(movie: Stack, config: Config) -> int:
 
 
 def checked(movie: FrameSource, camera: Camera) -> Check:
-    """Give what refuses the impossible counts of a movie."""
+    """Make the function that refuses impossible counts of a movie."""
     return partial(check_counts, name=movie.name, camera=camera)
 
 

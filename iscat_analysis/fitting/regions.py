@@ -1,4 +1,4 @@
-"""Pixels of a field: which ones, and the likelihood of their counts before and after."""
+"""Regions of a field, and the likelihood of their counts before and after."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Region:
 
 
 def region_around(side: int, shape: tuple[int, ...], start: Candidate) -> Region:
-    """Place the square that is fitted."""
+    """Place the fitted square around a position."""
     sides = []
     for centre, size in zip((start.y_px, start.x_px), shape, strict=True):
         first = round(centre - (side - 1) / 2)
@@ -50,7 +50,7 @@ def field_likelihood(context: AnalysisContext, windows: Windows) -> Likelihood:
 
 
 def contrast_image(context: AnalysisContext, windows: Windows) -> FloatArray:
-    """Give what the frames after show and those before do not.
+    """Contrast of the frames after over those before.
 
     Shapes: result (y, x).
     """

@@ -1,4 +1,4 @@
-"""What is found in a movie: from judged events to the table and the views."""
+"""Results of a movie: the table and the images that follow from the events."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from iscat_analysis.search.empty import EmptySpread
 
 @dataclass(frozen=True)
 class Compared:
-    """Which frames of a movie stand against which."""
+    """The frames that are compared, and their light."""
 
     frames_before: tuple[int, int]
     frames_after: tuple[int, int]
@@ -52,7 +52,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class Followed:
-    """What the tracks of a movie are described with, beside their rows."""
+    """What the description of tracks needs beside their rows."""
 
     windows: Windows
     parts: tuple[Windows, ...] = ()
@@ -61,7 +61,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class DetectionResult:
-    """What was found in a movie, whichever frames stand against which."""
+    """What was found in a movie; the same record for all background modes."""
 
     context: AnalysisContext
     fits: pd.DataFrame
@@ -93,7 +93,7 @@ def collected_photons(context: AnalysisContext, event: Event) -> float:
 def lines_of(
     context: AnalysisContext, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> list[dict[str, Any]]:
-    """Make the lines of ``fits.csv``."""
+    """Make the rows of ``fits.csv`` as plain records."""
     heights = {event.fit.estimate[2] for event in events}
     known = {}
     if len(heights) == 1 and not context.model.is_measured:  # of heights that are not fitted
@@ -105,14 +105,14 @@ def lines_of(
 def evidence_beside(
     context: AnalysisContext, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> FloatArray:
-    """Give what the light of each event says beside its fit, where masses are fitted.
+    """Test parameters that the fit of each event holds, where masses are fitted.
 
     Shapes: result (n, 11), in the order of `Evidence`.
     """
     if context.mode != "mass":
         return np.full((len(events), len(NOTHING)), np.nan)
-    told = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
-    return np.array(list(told)).reshape(-1, len(NOTHING))
+    rows = mapper(lambda event: evidence_of(event.likelihood, event.fit, event.rise), events)
+    return np.array(list(rows)).reshape(-1, len(NOTHING))
 
 
 def _line(

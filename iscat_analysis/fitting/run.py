@@ -1,4 +1,4 @@
-"""What a run of the main job tells and keeps beside its result: words, progress, times, parts."""
+"""One run of the main job: messages, progress, times and finished parts."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from iscat_analysis.records import FREE_PARAMETERS, Progress
 Notify = Callable[[str], None]
 
 
-def unheard(text: str) -> None:
-    """Tell nobody."""
+def notify_nobody(text: str) -> None:
+    """Drop a message."""
 
 
 class Clock:
-    """Seconds since the last lap, by name."""
+    """Measures the seconds of each stage."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
         self.seconds: dict[str, float] = {}
 
     def lap(self, name: str) -> None:
-        """Book the time since the last lap under a name."""
+        """Store the time since the last call under a name."""
         now = time.perf_counter()
         self.seconds[name] = now - self._last
         self._last = now
@@ -36,23 +36,23 @@ class Clock:
 
 @dataclass(frozen=True)
 class Run:
-    """One run."""
+    """The settings of one run, and the warnings that it collects."""
 
     notify: Notify
     progress: Progress
     partial: Path | None
-    place: Executor
+    executor: Executor
     inject: int
     clock: Clock = field(default_factory=Clock)
     warnings: list[str] = field(default_factory=list)
 
     def warn(self, text: str) -> None:
-        """Tell the user something that belongs to the result, and keep it."""
+        """Show a warning to the user, and keep it for the result."""
         self.warnings.append(text)
         self.notify(text)
 
     def warm_up(self, context: AnalysisContext) -> None:
-        """Load the compiled kernels of fits, or compile them."""
+        """Load or compile the kernels of fits."""
         config = context.config
         parts = parts_of(
             FREE_PARAMETERS[context.mode], heights=has_prior(config),

@@ -23,10 +23,10 @@ from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.records import BoolArray, FloatArray
 
-WORTH_NAMING = 0.3
+LEAST_EXPLAINED_SHARE = 0.3
 """Share of χ² in excess that a parameter must explain to be named."""
 
-MOST_OF_IT = 0.6
+LARGE_EXPLAINED_SHARE = 0.6
 """Share below which more may be wrong, and a correction of that parameter alone is no advice."""
 
 PIXEL = "camera.pixel_size_nm"
@@ -83,14 +83,14 @@ _UNITS = {
 _NAMES = (*_STEPS, PIXEL, _TURNED, *_OTHERS)
 _WHOLE = (_TURNED, *(name for name in _OTHERS if "mask" not in name))  # there or not
 _WHOLE_STEP = 0.5  # of one that is tried whole, which the residuals ask for at least
-_STRETCH = 30.0  # per cent, farther than which no pixel size is tried
+_MOST_SCALE_CHANGE = 30.0  # per cent, farther than which no pixel size is tried
 
 _Picture = Callable[[PixelGrid, float, float, float, float], FloatArray]
 
 
 @dataclass(frozen=True)
 class Cause:
-    """What the residuals of several fits look like."""
+    """The change of the microscope that the residuals of several fits resemble."""
 
     name: str
     share: float
@@ -103,7 +103,7 @@ class Cause:
 
     @property
     def likeness(self) -> str:
-        """What the residuals look most like."""
+        """What the residuals resemble, in words."""
         by = ""
         if self.step is not None:
             steps = [_rounded(step) for step in (self.step, *self.other_steps)]
@@ -123,7 +123,7 @@ class Cause:
         """One line for the user."""
         elsewhere = "" if self.learned else " with an interferometric movie of the same microscope"
         remedy = f"correct it, or calibrate the optics{elsewhere}"
-        if self.share < MOST_OF_IT:
+        if self.share < LARGE_EXPLAINED_SHARE:
             remedy = f"that explains only a part, so calibrate the optics{elsewhere}"
         return (
             f"the model does not describe the brightest particles ({self.events} looked at): what "
@@ -134,15 +134,15 @@ class Cause:
 def likely_cause(
     config: Config, fits: Sequence[tuple[Likelihood, FloatArray, BoolArray]]
 ) -> Cause | None:
-    """Name the part of the microscope whose change looks most like what fits left over."""
+    """Name the part of the microscope whose change resembles the residuals most."""
     if not fits or config.optics.convention != "exact":
         return None
     left = [_Left.of(*fit) for fit in fits]
     excess = sum(each.excess for each in left)
     if excess <= 0:
         return None
-    found = {name: _told(config, name, left, excess) for name in _NAMES}
-    named = {name: tried for name, tried in found.items() if tried[0][0] > WORTH_NAMING}
+    found = {name: _explained_by(config, name, left, excess) for name in _NAMES}
+    named = {name: tried for name, tried in found.items() if tried[0][0] > LEAST_EXPLAINED_SHARE}
     if not named:  # a share is above 1 where there is less noise than the camera's numbers say
         return None
     name = max(named, key=lambda name: named[name][0][0])
@@ -165,12 +165,13 @@ def likely_cause(
     )
 
 
-def _told(
+def _explained_by(
     config: Config, name: str, left: Sequence[_Left], excess: float
 ) -> list[tuple[float, float]]:
-    """Share of χ² in excess that a part of the microscope explains, and by what step.
+    """Share of the excess χ² that each step of a parameter explains, and that step.
 
-    The best first; others are as far away from it as pictures on the other side of focus are.
+    The best one comes first.  The others are local maxima, such as pictures on the other side of
+    focus.
     """
     reach = left[0].reach_nm
     changes = _neighbours(config, name, reach)
@@ -184,7 +185,7 @@ def _told(
         steps = _angle(steps)
     if (
         graded
-        and share > WORTH_NAMING
+        and share > LEAST_EXPLAINED_SHARE
         and (there := _neighbours(config, name, reach, float(steps[0])))
     ):
         share, asked = _explained(left, there, excess)
@@ -208,9 +209,9 @@ def _told(
 def _peaks(
     best: tuple[float, float], whole: list[tuple[float, float]]
 ) -> list[tuple[float, float]]:
-    """Give the steps that explain more than those tried beside them, the best first.
+    """Find the steps that explain more than the neighbouring ones, the best first.
 
-    A step of first order takes the place of the one that is tried next to it, if it is better.
+    A step from a first-order fit replaces the neighbouring grid step if it explains more.
     """
     tops = [
         each
@@ -225,7 +226,7 @@ def _peaks(
 
 @dataclass(frozen=True)
 class _Left:
-    """What one fit left over, in standard deviations, without the directions of the fit."""
+    """Residual of one fit, in standard deviations, with the directions of the fit projected out."""
 
     grid: PixelGrid
     place: tuple[float, float, float, float]
@@ -264,21 +265,21 @@ class _Left:
         )  # fmt: skip
 
     def change(self, step: float, picture: _Picture) -> FloatArray:
-        """Give the change of the picture per unit of a step."""
+        """Change of the picture per unit of a step."""
         change = (picture(self.grid, *self.place) - self.signal)[self.used] * self.root / step
         return np.asarray(change - self.fitted @ (self.fitted.T @ change))
 
 
 def _rounded(step: float) -> str:
-    """Two digits, with the sign."""
+    """Write a number with two digits and its sign."""
     return f"{float(f'{step:.2g}'):+g}"
 
 
 def _angle(step: FloatArray) -> FloatArray:
-    """Give the angle by which a phase is off, of what it seems to be to first order [degrees].
+    """Convert a phase error from its first-order value to an angle [degrees].
 
-    A turned picture is cos Δ of the picture and sin Δ of what a small turn adds to it.  The fitted
-    mass has taken up the cosine, and per mass tan Δ is left over.
+    A picture turned by Δ is cos Δ of the picture plus sin Δ of its derivative.  The fitted mass
+    takes up the cosine, so that the residual per mass is tan Δ.
     """
     return np.degrees(np.arctan(np.radians(step)))
 
@@ -290,9 +291,9 @@ def _explained(
     *,
     whole: bool = False,
 ) -> tuple[float, FloatArray]:
-    """Share of χ² in excess that changes of the microscope explain, and how much of each.
+    """Share of the excess χ² that changes of the microscope explain, and their sizes.
 
-    `whole` changes are there or not: just one of them is taken.
+    Of changes that are `whole`, present or not, only one is taken.
     """
     slope, curvature = np.zeros(len(changes)), np.zeros((len(changes), len(changes)))
     for each in left:
@@ -308,14 +309,14 @@ def _explained(
 def _neighbours(
     config: Config, name: str, reach_nm: float, far: float | None = None
 ) -> list[tuple[float, _Picture]]:
-    """Give the microscopes that differ in one respect, and by how much; none where there are none.
+    """Give configurations that differ in one parameter of the microscope.
 
-    They are `far` away where that is given, else as in `_STEPS`.  There are none beyond what optics
-    can be, nor where particles that the configuration's line has dark would be bright.
+    They differ by `far` where it is given, else by `_STEPS`.  There are none where no optics have
+    such a value, or where particles would change their sign against the calibration line.
     """
     optics = config.optics
     if name == PIXEL:
-        percent = 1.0 if far is None else max(min(far, _STRETCH), -_STRETCH)
+        percent = 1.0 if far is None else max(min(far, _MOST_SCALE_CHANGE), -_MOST_SCALE_CHANGE)
         larger = 1 + percent / 100
         model = forward_model(config, reach_nm * max(1.01 * larger, 1.0))
 

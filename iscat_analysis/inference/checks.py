@@ -1,6 +1,6 @@
-"""What every argument must be: real numbers, of the right shape, finite, of a possible size.
+"""Checks of arguments: real, finite numbers of the right shape and a possible size.
 
-Kernels read memory without asking.  Each array is therefore looked at once, where it enters.
+Compiled kernels do not check indices, so that every array is checked where it enters.
 """
 
 from __future__ import annotations
@@ -133,14 +133,14 @@ def number_in(
 
 
 def truth_in(name: str, value: Any) -> bool:
-    """Check an answer to yes or no."""
+    """Check a boolean."""
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"{name} = {shown(value)}: give True or False")
     return bool(value)
 
 
 def choice_in(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Check that a word is one of those that have a meaning."""
+    """Check that a word is one of the allowed ones."""
     if not isinstance(value, str) or value not in choices:
         raise ConfigError(f"{name} = {shown(value)}: choose one of {', '.join(choices)}")
 
@@ -153,7 +153,7 @@ def path_in(name: str, value: Any) -> Path:
 
 
 def shown(value: Any) -> str:
-    """Write a value of any type into a message, in one line and not at length."""
+    """Shorten a value of any type to one line of a message."""
     if isinstance(value, float):
         return f"{value:g}"
     return " ".join(reprlib.repr(value).split())

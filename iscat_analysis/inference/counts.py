@@ -1,4 +1,4 @@
-"""From counts before and after to a likelihood: which noise model suits what is known of them."""
+"""The likelihood of a region, and the choice of its noise model."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2
 
 
 def choose_noise(wanted: str, *, interferes: bool, counted: bool) -> NoiseModel:
-    """Choose the noise model that is named, or with ``"auto"`` the one that suits what is known.
+    """Choose a noise model by its name, or with ``"auto"`` by the kind of background.
 
-    The conditional one is for light that interferes with a background whose frames were counted.
+    The conditional model is for light that interferes with a background whose frames were counted.
     """
     if wanted != "auto":
         return NOISE_MODELS[wanted]

@@ -27,8 +27,9 @@ SIGNIFICANT = 3.0
 LEAST_EXCESS = 0.02
 """Relative excess below which nothing is said."""
 
-_DRIFTS = 4.0  # growth of the excess from half a window to a whole one, above which it is a drift
-_WIDEST = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
+# Growth of the excess from half a window to a whole one, above which it is a drift
+_LEAST_DRIFT_GROWTH = 4.0
+_MOST_HALF_WIDTH = 5.0  # half-width of an interval of ln ratio, beyond which nothing is known
 _FEWEST_TILES = 6
 _FEWEST_COUNTS = 200
 
@@ -50,37 +51,38 @@ class EmpiricalSpread:
 
     @property
     def fast2(self) -> float:
-        """Squared spread from one frame to the next."""
+        """Squared spread of noise from frame to frame."""
         if self.single:
             return self.empty[0] ** 2
         return self.by_frames[0] ** 2 if self.by_frames else 1.0
 
     @property
     def slow2(self) -> float:
-        """What the squared spread has beyond that of parts, where there are no particles."""
+        """Squared spread of slow noise: of whole windows beyond that of their parts."""
         return self.empty[-1] ** 2 - self.empty[0] ** 2 if self.empty else 0.0
 
     @property
     def drifts(self) -> bool:
-        """Whether slow noise grows as a drift at constant speed makes it, rather than flicker.
+        """Whether slow noise grows with time like a drift, rather than like flicker.
 
-        Flicker doubles from half a window to a whole one, a drift grows eightfold; single frames
-        see a drift as the square of their distance from the background, flicker as its logarithm.
+        From half a window to a whole one flicker doubles, and a drift grows eightfold.  In single
+        frames a drift grows with the squared distance from the background, flicker with its
+        logarithm.
         """
         if self.single:
             near, far = (max(self.by_frames[k] ** 2 - self.fast2, 1e-3) for k in (0, -1))
             return far / near > self.frames[-1] / self.frames[0] > 1
         halves, whole = (self.empty[k] ** 2 for k in (-2, -1))
-        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _DRIFTS
+        return (whole - self.fast2) / max(halves - self.fast2, 1e-3) > _LEAST_DRIFT_GROWTH
 
     @property
     def exceeds(self) -> bool:
-        """Whether the bound, and so σ, understates the error."""
+        """Whether the bound, and so σ, is too small."""
         return self.over_crb > 1 + LEAST_EXCESS and self.significance > SIGNIFICANT
 
     @property
     def falls_short(self) -> bool:
-        """Whether the noise is less than the model expects."""
+        """Whether the noise is smaller than the model expects."""
         return self.over_crb < 1 - LEAST_EXCESS and self.significance < -SIGNIFICANT
 
 
@@ -115,7 +117,7 @@ def pooled(
     ratio2 = max(found.ratio2, 1e-6)
     error = math.sqrt(found.variance) / (2 * ratio2)  # of ln ratio
     ratio, degrees = math.sqrt(ratio2), max(found.degrees, 2)
-    reach = min(float(stdtrit(degrees, 0.975)) * error, _WIDEST)
+    reach = min(float(stdtrit(degrees, 0.975)) * error, _MOST_HALF_WIDTH)
     # what Student's law makes of the error, in normal standard errors
     chance = float(stdtr(degrees, -abs(math.log(ratio)) / error))
     significance = math.copysign(-float(ndtri(max(chance, 1e-300))), math.log(ratio))
@@ -149,7 +151,7 @@ class _Found:
 
 @dataclass(frozen=True)
 class _Tiles:
-    """What each tile of the field says, shape (contrasts, tiles)."""
+    """Contributions of each tile of the field, shape (contrasts, tiles)."""
 
     squares: FloatArray
     counts: FloatArray
@@ -159,7 +161,7 @@ class _Tiles:
     def of(
         cls, squares: FloatArray | None, counts: FloatArray | None, shared: float
     ) -> _Tiles | None:
-        """Keep the tiles with empty places; None where they are too few."""
+        """Select tiles with places without particles; None where they are too few."""
         if squares is None or counts is None:
             return None
         held = counts[0] > 0
@@ -178,17 +180,17 @@ class _Tiles:
         return np.asarray(self.squares.sum(axis=1) / np.maximum(self.counts.sum(axis=1), 1e-300))
 
     def influence(self, k: int) -> FloatArray:
-        """Give what each tile contributes to the error of a mean square."""
+        """Contribution of each tile to the error of a mean square."""
         n, s = self.counts[k], self.squares[k]
         return np.asarray((s - self.mean[k] * n) / n.sum())
 
     def variance(self, influence: FloatArray) -> float:
-        """Give the variance of what tiles add up to."""
+        """Variance of the sum over tiles."""
         return self.shared * float(np.sum(influence**2)) * self.number / (self.number - 1)
 
 
 def _of_windows(own: FloatArray, tiles: _Tiles | None) -> _Found:
-    """Gather what parts of windows say, at the events and where there are none."""
+    """Ratios from parts of windows, at events and at places without a particle."""
     squares, counts = own[:, :, 0], own[:, :, 1]
     ratio2, variance = _mean_square(squares[:, 0], counts[:, 0], 2.0)
     degrees = max(len(own), counts[:, 0].sum() / 4)
@@ -207,7 +209,7 @@ def _of_windows(own: FloatArray, tiles: _Tiles | None) -> _Found:
 
 
 def _of_frames(tiles: _Tiles, distances: tuple[float, ...]) -> _Found:
-    """Gather what single frames say where there are no particles."""
+    """Ratios from single frames at places without a particle."""
     whole, successive, *at = tiles.mean
     curve = tuple((m, tiles.variance(tiles.influence(2 + k))) for k, m in enumerate(at))
     return _Found(

@@ -113,13 +113,13 @@ def _box_around(
 
 
 def _searched(prior: HeightPrior, known_nm: tuple[float, float]) -> tuple[float, float]:
-    """Give the heights at which a prior and a model let a particle be searched."""
+    """Range of heights in which a prior and a model let a particle be searched."""
     low, high = prior.range_nm
     return max(low, known_nm[0]), min(high, known_nm[1])
 
 
 def _where(free: list[bool], ends: Sequence[float], fixed: Sequence[float]) -> FloatArray:
-    """Take one end of each parameter that is free, and the value of each that is not."""
+    """Select one end of the range of each free parameter, and the value of each fixed one."""
     return np.array(
         [end if moves else value for moves, end, value in zip(free, ends, fixed, strict=True)]
     )
@@ -209,7 +209,7 @@ def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
 
 
 def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:
-    """Give a candidate's θ.
+    """Convert a candidate to θ.
 
     Shapes: result (5,).
     """
@@ -245,22 +245,22 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
 
 
 def _inside(theta: FloatArray, box: Box) -> FloatArray:
-    """Move θ into a box; what is not free has no room there."""
+    """Clip θ to a box; fixed parameters have a range of zero."""
     return np.minimum(np.maximum(theta, box.lower), box.upper)
 
 
 def _follow(likelihood: Likelihood, theta: FloatArray, box: Box, best: float) -> Optimum:
-    """Follow a start, no farther than shows that it cannot end within `FOLLOWED` of the best."""
+    """Fit from a start, and give up when it cannot end within `FOLLOWED` of the best."""
     return likelihood.maximize(theta, box.free, box.lower, box.upper, least=best - FOLLOWED)
 
 
 def _ranked(optima: list[Optimum]) -> list[Optimum]:
-    """Put optima in order, the best first and those that were not followed to their ends last."""
+    """Sort optima: the best first, those that were given up last."""
     return sorted(optima, key=lambda o: (not o.converged, -o.log_likelihood))
 
 
 class _Found(NamedTuple):
-    """An optimum, how it describes the data, and what its curvature says of its errors."""
+    """An optimum, its goodness of fit and its errors."""
 
     best: Optimum
     chi2_reduced: float
@@ -274,7 +274,7 @@ class _Found(NamedTuple):
 
 
 def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
-    """Judge an optimum."""
+    """Compute goodness of fit and errors of an optimum."""
     derivatives = likelihood.derivatives(best.theta, box.free)
     chi2_reduced, p_value = goodness_of_fit(likelihood, best.theta, box.free, derivatives)
     walls = _walls(best.theta, box)
@@ -289,14 +289,14 @@ def _judged(likelihood: Likelihood, best: Optimum, box: Box) -> _Found:
 def _also_from(
     likelihood: Likelihood, theta: FloatArray, box: Box, optima: list[Optimum], found: _Found
 ) -> tuple[list[Optimum], _Found]:
-    """Follow one more start, and judge where it leads if that is the best."""
+    """Fit from one more start, and keep the result if it is the best."""
     last = _follow(likelihood, theta, box, found.best.log_likelihood)
     ranked = _ranked([*optima, last])
     return ranked, found if ranked[0] is found.best else _judged(likelihood, ranked[0], box)
 
 
 def _far(likelihood: Likelihood, box: Box, found: _Found) -> tuple[_Found, FloatArray | None]:
-    """Widen errors to what the likelihood says far from an optimum; see `reach`."""
+    """Widen errors where the likelihood is no parabola; see `reach`."""
     free = np.flatnonzero(box.free[:4])
     places = free[free < AMPLITUDE]
     steps = np.zeros((places.size, 5))
@@ -310,7 +310,7 @@ def _far(likelihood: Likelihood, box: Box, found: _Found) -> tuple[_Found, Float
 
 
 def _is_plain(found: Optimum) -> bool:
-    """Whether a particle is told from none, and not only a level of the light from another."""
+    """Whether a particle is significant against a mere change of the level."""
     alone = 0.5 * found.theta[AMPLITUDE] ** 2 * found.fisher[AMPLITUDE, AMPLITUDE]
     return bool(min(found.log_likelihood, alone) > PLAIN)
 
@@ -349,7 +349,7 @@ def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative,
 
 
 def _walls(theta: FloatArray, box: Box) -> list[bool]:
-    """Which free parameters lie on an end of the box."""
+    """Tell which free parameters ended at a limit of the box."""
     places = zip(
         box.free.tolist(), theta.tolist(), box.lower.tolist(), box.upper.tolist(), strict=True
     )

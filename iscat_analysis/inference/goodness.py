@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincc
 
-from iscat_analysis._kernels.goodness import look
+from iscat_analysis._kernels.goodness import count_and_test
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise_models import MANY_COUNTS
 
@@ -37,7 +37,7 @@ WAIST = 0.5
 POOLED_COUNTS = 5.0
 """Cells that expect fewer counts are joined until they expect as many."""
 
-_NARROWEST = 0.1  # variance of a sum of squares over that of normal residuals, at least
+_LEAST_VARIANCE_RATIO = 0.1  # variance of a sum of squares over that of normal residuals, at least
 _SUSPECTS = 8  # largest residuals whose exact tail is looked up
 _DEPENDENT = 1e-8  # share of a mode outside the fitted directions that counts as none
 _NORMAL = 1e-4  # excess kurtosis that changes no p-value
@@ -84,7 +84,7 @@ def three_tests(
     free = np.asarray(free, dtype=np.bool_)
     optics, grid = likelihood.model.optics, likelihood.grid
     rate, tails = np.empty(grid.shape), np.empty((3, _SUSPECTS))
-    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = look(
+    chi2, pixels, excess, least_rate, mode_chi2, modes, mode_excess, least, count = count_and_test(
         likelihood.noise.code, likelihood.data, math.exp(theta[LEVEL]), rows, grid.x_nm, grid.y_nm,
         theta, WAIST * optics.wavelength_nm / optics.na, ORDER, free, _DEPENDENT, _NORMAL,
         MANY_COUNTS, rate, tails,
@@ -106,7 +106,7 @@ def three_tests(
 
 def _gamma_above(chi2: float, freedom: float, excess: float) -> float:
     """Upper tail of a sum of squares of variance (2 + excess)·freedom."""
-    spread = max(1 + excess / 2, _NARROWEST)
+    spread = max(1 + excess / 2, _LEAST_VARIANCE_RATIO)
     return float(gammaincc(freedom / spread / 2, chi2 / spread / 2))
 
 

@@ -23,7 +23,7 @@ SIGNIFICANT = 20.0
 """Twice the gain in log-likelihood by which a spread is told from none; by chance in 1e-5."""
 
 _FINEST_NM, _WIDEST_NM, _WIDTHS = 0.05, 300.0, 240  # spreads that are tried
-_OUTLYING = 4.0  # of the robust spread, beyond which an event is one of another optimum
+_OUTLIER_SIGMAS = 4.0  # of the robust spread, beyond which an event is one of another optimum
 _IN_95 = 3.84  # twice the fall of the log-likelihood at the ends of a 95 % interval
 
 
@@ -70,7 +70,7 @@ def spread_of_heights(z_nm: FloatArray, sigma_nm: FloatArray) -> HeightSpread | 
     z, v = z_nm[known], sigma_nm[known] ** 2
     if z.size >= FEWEST:
         away = np.abs(z - np.median(z))
-        kept = away <= _OUTLYING * np.sqrt((1.48 * np.median(away)) ** 2 + v)
+        kept = away <= _OUTLIER_SIGMAS * np.sqrt((1.48 * np.median(away)) ** 2 + v)
         z, v = z[kept], v[kept]
     if z.size < FEWEST:
         return None

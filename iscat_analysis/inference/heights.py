@@ -32,7 +32,7 @@ class HeightPrior:
 
     @property
     def information(self) -> float:
-        """What it knows of the height [1/nm²]."""
+        """Information of the prior [1/nm²]."""
         return self.sd_nm**-2
 
     @property
@@ -48,7 +48,7 @@ class HeightPrior:
 
 
 def height_prior(config: Config, mass_kda: float) -> HeightPrior | None:
-    """Give what a configuration knows of a particle's height; None where it is held, or free."""
+    """Give the prior of the height; None where the height is fixed or free."""
     particle = config.particle
     if not has_prior(config):
         return None

@@ -26,7 +26,7 @@ from iscat_analysis.records import BoolArray, FloatArray
 MANY_COUNTS = 1e6
 """Counts above which tails are normal: 5 σ out to a few per cent."""
 
-_FINEST = 1e-11  # tail below which whole counts are not told from continuous ones
+_LEAST_TAIL = 1e-11  # tail below which whole counts are not told from continuous ones
 _CERTAIN = 1 - 1e-16
 
 
@@ -305,7 +305,7 @@ NOISE_MODELS: Mapping[str, NoiseModel] = {
 def _attainable(rate: FloatArray, tail: float) -> FloatArray:
     """Probability that a Poisson count has a two-sided tail of at most `tail`, for each rate."""
     half = tail / 2
-    if half < _FINEST or half >= 0.5:
+    if half < _LEAST_TAIL or half >= 0.5:
         return np.full(rate.size, min(tail, 1.0))
     out = np.full(rate.size, tail)
     few = rate < MANY_COUNTS

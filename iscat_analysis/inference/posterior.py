@@ -34,8 +34,8 @@ MIN_TAUS = 50.0
 EXTENSIONS = 4
 """A chain may grow to this many times its configured length before it is refused."""
 
-_DEGREES = 5  # of the Student t proposal: heavier tails than any regular posterior
-_WIDEN = 1.2  # its scale over the posterior's
+_STUDENT_DOF = 5  # of the Student t proposal: heavier tails than any regular posterior
+_PROPOSAL_SCALE = 1.2  # its scale over the posterior's
 
 
 def sample_posterior(
@@ -52,12 +52,14 @@ def sample_posterior(
     import emcee  # takes a third of a second, and only chains need it
 
     index = np.flatnonzero(fit.box.free)
-    told = index < len(PARAMETERS)
+    physical = index < len(PARAMETERS)
     normal = (
         {}
         if prior is None
         else {
-            name: prior.normal[name] for i in index[told] if (name := PARAMETERS[i]) in prior.normal
+            name: prior.normal[name]
+            for i in index[physical]
+            if (name := PARAMETERS[i]) in prior.normal
         }
     )  # of what is not free nothing can be learned
     prior = Prior(normal)
@@ -104,17 +106,19 @@ def sample_posterior(
         samples[..., column] = likelihood.model.scale.mass(samples[..., column])
     # the level of the light, where it is free, says nothing of the particle: it is integrated over
     return PosteriorResult(
-        names=tuple(PARAMETERS[i] for i in index[told]),
-        samples=samples[..., told],
+        names=tuple(PARAMETERS[i] for i in index[physical]),
+        samples=samples[..., physical],
         log_likelihood=values,
-        tau=verdict.tau[told],
-        r_hat=verdict.r_hat[told],
-        ess_bulk=verdict.ess_bulk[told],
-        ess_tail=verdict.ess_tail[told],
+        tau=verdict.tau[physical],
+        r_hat=verdict.r_hat[physical],
+        ess_bulk=verdict.ess_bulk[physical],
+        ess_tail=verdict.ess_tail[physical],
         acceptance=float(np.mean(sampler.acceptance_fraction)),
         converged=verdict.converged,
         message=verdict.message,
-        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[told] if normal else None,
+        van_trees=posterior_bound(likelihood, fit.theta, index, prior)[physical]
+        if normal
+        else None,
     )
 
 
@@ -140,7 +144,7 @@ class _Proposal:
         scale = 1 / np.sqrt(np.maximum(np.diag(fisher), 1e-300))
         values, vectors = np.linalg.eigh(fisher * np.outer(scale, scale))
         widths = 1 / np.sqrt(np.maximum(values, 1e-4))
-        factor = _WIDEN * scale[:, None] * vectors * widths
+        factor = _PROPOSAL_SCALE * scale[:, None] * vectors * widths
         centres, gaps = [fit.theta[index]], [0.0]
         for other in fit.alternatives:
             if other.log_likelihood_gap < 15:
@@ -149,7 +153,9 @@ class _Proposal:
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)
         weights = -np.minimum(gaps, 3.0)
-        narrow = factor @ factor.T / _WIDEN**2  # the covariance, and the way towards the prior
+        narrow = (
+            factor @ factor.T / _PROPOSAL_SCALE**2
+        )  # the covariance, and the way towards the prior
         return cls(
             np.array([centre + narrow @ known @ (wanted - centre) for centre in centres]),
             weights - np.logaddexp.reduce(weights),
@@ -161,7 +167,7 @@ class _Proposal:
         """Draw points, shape (count, d)."""
         modes = random.choice(len(self.centres), size=count, p=np.exp(self.log_weights))
         normal = random.standard_normal((count, self.factor.shape[0]))
-        stretch = np.sqrt(_DEGREES / random.chisquare(_DEGREES, count))
+        stretch = np.sqrt(_STUDENT_DOF / random.chisquare(_STUDENT_DOF, count))
         return self.centres[modes] + stretch[:, None] * (normal @ self.factor.T)
 
     def log_density(self, points: FloatArray) -> FloatArray:
@@ -169,8 +175,8 @@ class _Proposal:
         d = self.factor.shape[0]
         apart = (points[None] - self.centres[:, None]).reshape(-1, d)
         squares = np.sum((apart @ self.whiten.T) ** 2, axis=1).reshape(len(self.centres), -1)
-        norm = gammaln((_DEGREES + d) / 2) - gammaln(_DEGREES / 2)
-        log_t = norm - 0.5 * (_DEGREES + d) * np.log1p(squares / _DEGREES)
+        norm = gammaln((_STUDENT_DOF + d) / 2) - gammaln(_STUDENT_DOF / 2)
+        log_t = norm - 0.5 * (_STUDENT_DOF + d) * np.log1p(squares / _STUDENT_DOF)
         density: FloatArray = np.logaddexp.reduce(log_t + self.log_weights[:, None], axis=0)
         return density
 

@@ -22,8 +22,8 @@ from scipy.special import ndtr
 
 from iscat_analysis.records import FloatArray
 
-_HIGHEST = 40.0  # no threshold is larger
-_FINEST = 1e-10  # to which a level is found
+_HIGHEST_LEVEL = 40.0  # no threshold is larger
+_LEVEL_TOLERANCE = 1e-10  # to which a level is found
 
 LOWEST = 2.0
 """Level from which on both terms of N fall as it rises."""
@@ -61,11 +61,10 @@ def expected_maxima(
 
 
 def companions(u: float, ring: FloatArray, cell: float) -> float:
-    """Count the maxima of the other sign that a maximum brings with it.
+    """Give the expected number of maxima of the other sign that accompany a maximum.
 
     Where the field is correlated by r < 0 with that at a maximum of height v = u + 1/u, its mean is
-    −|r| v, and it passes −u more often there.  Once the maximum is fitted and taken off, it does
-    no more.
+    −|r| v, and it passes −u more often there.  That ends when the maximum is fitted and subtracted.
     """
     near = ring[ring < 0]
     spread = np.sqrt(1 - near**2)
@@ -105,12 +104,12 @@ class Excursions:
         if not self.area > 0 or excess(low) <= 0:
             return lowest
         high = low
-        while excess(high) > 0 and high < _HIGHEST:
-            high = min(high + 1.0, _HIGHEST)
+        while excess(high) > 0 and high < _HIGHEST_LEVEL:
+            high = min(high + 1.0, _HIGHEST_LEVEL)
         # by halves: loading SciPy's search of roots takes longer than a small search for particles
-        steps = range(math.ceil((high - low) / _FINEST))
-        few = bisect_left(steps, True, key=lambda k: excess(low + k * _FINEST) <= 0)
-        return low + few * _FINEST
+        steps = range(math.ceil((high - low) / _LEVEL_TOLERANCE))
+        few = bisect_left(steps, True, key=lambda k: excess(low + k * _LEVEL_TOLERANCE) <= 0)
+        return low + few * _LEVEL_TOLERANCE
 
 
 def height_reached(

@@ -20,7 +20,7 @@ AWAY = 3.0
 
 
 def reaches_far(likelihood: Likelihood, sigma: FloatArray) -> bool:
-    """Whether places are so uncertain that the curvature may not tell their errors.
+    """Whether errors are so large that the curvature at the maximum may underestimate them.
 
     Shapes: `sigma` (4,).
     """

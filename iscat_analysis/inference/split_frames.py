@@ -33,7 +33,7 @@ LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 7
 
 @dataclass(frozen=True)
 class Response:
-    """What one photoelectron more in a pixel does to the estimates."""
+    """Change of the estimates per additional photoelectron in a pixel."""
 
     before: FloatArray
     after: FloatArray
@@ -42,7 +42,7 @@ class Response:
 
 @dataclass(frozen=True)
 class Series:
-    """Errors that single frames of one window contribute to the estimates."""
+    """Contributions of single frames of one window to the error of the estimates."""
 
     values: FloatArray
     power: FloatArray
@@ -57,7 +57,7 @@ def response_of(
     before_e: FloatArray,
     power_ratio: float,
 ) -> Response | None:
-    """Linearise an estimate in the counts it was made of.
+    """Linearise an estimate in its counts.
 
     Notes
     -----
@@ -101,7 +101,7 @@ def series_of(
     mean_e: FloatArray,
     read_variance_e2: FloatArray,
 ) -> Series:
-    """Weigh the counts of every frame with a response.
+    """Multiply the counts of every frame with a response.
 
     Shapes: `counts` (t, ny, nx), `weights` (n, ny, nx), `power` (t,), `gain, offset` (ny, nx),
     `mean_e` (ny, nx), `read_variance_e2` (ny, nx).
@@ -120,7 +120,7 @@ def series_of(
 
 
 def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
-    """Gather what the windows of one event say of the spread of its estimates.
+    """Compare the estimates from the parts of all windows of one event.
 
     Shapes: result (1 + len(LENGTHS).
     """

@@ -19,7 +19,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
-from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.instrument.crowded import seen_in_field
 from iscat_analysis.instrument.learner import (
     FREE,
@@ -111,7 +111,7 @@ def learn_sign(
     camera: Camera,
     *,
     warn: Callable[[str], None],
-    notify: Callable[[str], None] = unheard,
+    notify: Callable[[str], None] = notify_nobody,
     opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Learn the optics of a movie whose configured focus has the wrong sign, or its focus alone."""

@@ -20,7 +20,7 @@ from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_c
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
-from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.crowded import learn_in_field, seen_in_field
 from iscat_analysis.instrument.focus_drift import (
@@ -73,7 +73,7 @@ def learn_optics(
     camera: Camera,
     *,
     warn: Callable[[str], None],
-    notify: Callable[[str], None] = unheard,
+    notify: Callable[[str], None] = notify_nobody,
     opening: NoiseSurvey | None = None,
 ) -> tuple[Config, dict[str, Any]]:
     """Test the configured optics on the brightest particles, and learn them where they fail."""

@@ -6,7 +6,7 @@ import numpy as np
 
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
-from iscat_analysis.landing.merging import Done
+from iscat_analysis.landing.merging import FinishedChunk
 from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.empty import EmptySpread
@@ -15,7 +15,7 @@ from iscat_analysis.search.empty import EmptySpread
 class Store(Checkpoint):
     """Finished chunks of a landing movie on disk."""
 
-    def load(self, number: int) -> Done | None:
+    def load(self, number: int) -> FinishedChunk | None:
         """Give a finished chunk, or None."""
         found = self.read(number)
         if found is None:
@@ -23,7 +23,7 @@ class Store(Checkpoint):
         lines, data = found
         try:
             low, high = (int(n) for n in data["core"])
-            return Done(
+            return FinishedChunk(
                 core=(low, high),
                 lines=lines,
                 repeats=data["repeats"],
@@ -43,7 +43,7 @@ class Store(Checkpoint):
         except (ValueError, KeyError):
             return None
 
-    def save(self, number: int, done: Done) -> None:
+    def save(self, number: int, done: FinishedChunk) -> None:
         """Keep a finished chunk."""
         searched = done.searched or Searched.joined(())
         arrays = {
@@ -68,10 +68,10 @@ class Store(Checkpoint):
         self.write(number, done.lines, arrays)
 
 
-def _columns(way: Trajectory | None) -> FloatArray:
-    if way is None:
+def _columns(motion: Trajectory | None) -> FloatArray:
+    if motion is None:
         return np.empty((0, 5))
-    return np.column_stack([way.frames, way.shift_px, way.error_px])
+    return np.column_stack([motion.frames, motion.shift_px, motion.error_px])
 
 
 def _empty(squares: FloatArray, counts: FloatArray, shared: FloatArray) -> EmptySpread | None:

@@ -1,4 +1,4 @@
-"""One chunk of a landing movie: its models, its steps and their fits, in whatever process."""
+"""One chunk of a landing movie: its models, its steps and their fits, in any process."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
-from iscat_analysis.landing.merging import CLIPS, VIEWS, Done
+from iscat_analysis.landing.merging import CLIPS, VIEWS, FinishedChunk
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.records import (
     CountSource,
@@ -35,7 +35,7 @@ from iscat_analysis.threads import threads
 
 @dataclass(frozen=True)
 class ChunkSetting:
-    """What the chunks of a movie have in common, for a process that can read its file."""
+    """What all chunks of a movie share, so that any process can read and analyse one."""
 
     frames: CountSource
     camera: Camera
@@ -69,8 +69,8 @@ def chunk_job(
     earlier: int,
     *,
     progress: Progress = silent,
-) -> Done:
-    """Analyse one chunk from the movie's file."""
+) -> FinishedChunk:
+    """Open the movie and analyse one chunk."""
     with threads(setting.config.compute.workers) as pool:
         chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
         progress("landing", 0, 1)
@@ -89,7 +89,7 @@ def analyse_chunk(
     posteriors: int,
     excess_noise: ExcessNoise | None,
     earlier: int,
-) -> Done:
+) -> FinishedChunk:
     """Find and fit every step of a chunk."""
     wanted = context.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
@@ -112,7 +112,7 @@ def analyse_chunk(
     shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
     light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
-    return Done(
+    return FinishedChunk(
         core=core,
         lines=make_rows(lines_of(context, events, mapper=pool.map)),
         repeats=np.array([step.repeats for step in steps]),

@@ -28,19 +28,19 @@ from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
-from iscat_analysis.fitting.run import Notify, Run, unheard
+from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.landing.chunk_store import Store
 from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
-from iscat_analysis.landing.merging import Done, Merged
+from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
-from iscat_analysis.threads import beside, one_thread_algebra, threads
+from iscat_analysis.threads import one_thread_algebra, start_in_thread, threads
 
-TOLD_FRAMES = 2000
+HEIGHT_FRAMES = 2000
 """Frames from which heights are learned, at most."""
 
 LEAST_SD_NM = 0.1
@@ -52,8 +52,8 @@ POSTERIORS = 20
 
 def find_landings(ready: Prepared, run: Run) -> DetectionResult:
     """Find what lands or leaves between windows that slide over a movie."""
-    for remark in run.place.remarks(ready.config.compute.memory_limit_mb):
-        run.notify(remark)
+    for warning in run.executor.warnings(ready.config.compute.memory_limit_mb):
+        run.notify(warning)
     try:
         config = with_learned_heights(ready, run)
         found = analyse_landings(
@@ -66,7 +66,7 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
             partial=run.partial,
             identity=ready.movie.identity if run.partial else "",
             lines=ready.lines,
-            place=run.place,
+            executor=run.executor,
             opening=ready.opening,
             stretches=ready.stretches.kept,
         )
@@ -77,46 +77,46 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
 
 
 def with_learned_heights(ready: Prepared, run: Run) -> Config:
-    """Learn mean and spread of the heights, where that is left open, from the first frames.
+    """Learn mean and spread of the heights from the first frames, where these are left open.
 
-    There they are searched with a prior so wide that the light decides; what it does not tell
-    stays with that prior.
+    These frames are analysed with a prior so wide that the light determines the heights.  A number
+    that the light does not determine keeps its prior.
     """
     config = ready.config
     particle = config.particle
     if not particle.height_is_open or config.fit.mode != "mass":
         return config
     first, last = ready.stretches.main
-    some = config.fit.model_copy(update={"frames": (first, min(last, first + TOLD_FRAMES))})
+    some = config.fit.model_copy(update={"frames": (first, min(last, first + HEIGHT_FRAMES))})
     trial = config.model_copy(update={"fit": some})
     found = analyse_landings(
-        ready.movie, trial, ready.camera, warn=unheard, progress=silent, prepare=run.warm_up,
+        ready.movie, trial, ready.camera, warn=notify_nobody, progress=silent, prepare=run.warm_up,
         lines=ready.lines,
     )  # fmt: skip
     run.clock.lap("heights")
     good = (found.fits["status"] == Status.OK).to_numpy()
-    told = None if found.evidence is None else spread_of_heights(*found.evidence[good, :2].T)
-    if told is None or told.mean_se_nm > particle.height_prior_sd_nm / 2:
+    spread = None if found.evidence is None else spread_of_heights(*found.evidence[good, :2].T)
+    if spread is None or spread.mean_se_nm > particle.height_prior_sd_nm / 2:
         run.warn(
             "the heights cannot be learned from so few or so faint particles: they are taken as "
             f"{particle.nominal_height_nm:g} ± {particle.height_prior_sd_nm:g} nm"
         )
         return config
-    run.notify(f"{ready.movie.name}: {told}, learned from {told.events} particles")
+    run.notify(f"{ready.movie.name}: {spread}, learned from {spread.events} particles")
     if ready.summary.get("optics", {}).get("calibrated"):
         run.warn(
             "a common height and the focus are one number, and the focus was learned from the same "
-            f"particles: only their spread, {told.sd_nm:.1f} nm, is known, and the mean of "
-            f"{told.mean_nm:.1f} nm is where the learned optics put it"
+            f"particles: only their spread, {spread.sd_nm:.1f} nm, is known, and the mean of "
+            f"{spread.mean_nm:.1f} nm is where the learned optics put it"
         )
     learned = {
-        "learned_height_nm": max(round(told.mean_nm, 2), 0.0),
-        "height_sd_nm": min(max(round(told.sd_nm, 2), LEAST_SD_NM), LARGEST_SD_NM),
+        "learned_height_nm": max(round(spread.mean_nm, 2), 0.0),
+        "height_sd_nm": min(max(round(spread.sd_nm, 2), LEAST_SD_NM), LARGEST_SD_NM),
     }
     return config.model_copy(update={"particle": particle.model_copy(update=learned)})
 
 
-def _nothing(context: AnalysisContext) -> None:
+def _do_nothing(context: AnalysisContext) -> None:
     """Do nothing."""
 
 
@@ -127,16 +127,16 @@ def analyse_landings(
     *,
     warn: Notify,
     progress: Progress,
-    prepare: Callable[[AnalysisContext], None] = _nothing,
+    prepare: Callable[[AnalysisContext], None] = _do_nothing,
     partial: Path | None = None,
     identity: str = "",
     lines: Lines | None = None,
-    place: Executor | None = None,
+    executor: Executor | None = None,
     opening: NoiseSurvey | None = None,
     stretches: Sequence[tuple[int, int]] = (),
 ) -> DetectionResult:
     """Find and fit every particle that lands or leaves, in each stretch of a movie by itself."""
-    place = place or LocalExecutor()
+    executor = executor or LocalExecutor()
     first, last = fitted_frames(movie, config)
     stretches = stretches or ((first, last),)
     total = sum(stop - start for start, stop in stretches)
@@ -147,7 +147,7 @@ def analyse_landings(
     reader, noise, window = opening.reader, opening.noise, opening.window
     if (reader.first, reader.last) != (first, last):  # it was surveyed in one stretch
         reader = reader_of(frames, config, camera, (first, last))
-    for text in noise.said(movie.name):
+    for text in noise.messages_of(movie.name):
         warn(text)
     stride = stride_of(window)
     count = sum(boundaries(stop - start, window) for start, stop in stretches)
@@ -169,32 +169,32 @@ def analyse_landings(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
-    merged = Merged(reader.shape, [stop for _, stop in stretches])
+    merged = MergedChunks(reader.shape, [stop for _, stop in stretches])
     interrupted = False
-    with threads(place.threads(config.compute.workers, len(plan))) as pool:
+    with threads(executor.threads(config.compute.workers, len(plan))) as pool:
 
-        def finish(number: int) -> Done:
+        def finish(number: int) -> FinishedChunk:
             done = None if posterior else store.load(number)
             if done is None:
                 core, span = plan[number]
                 budget = POSTERIORS - merged.sampled if posterior else 0
                 earlier = merged.earlier(number, core[0] - window)  # before all of this chunk
-                if place.distant:
+                if executor.distant:
                     reader.forget()  # whoever does it has a reader of its own
 
-                def here() -> Done:
+                def here() -> FinishedChunk:
                     chunk = reader.chunk(span, stride, pool)
                     return analyse_chunk(
                         context, chunk, core, window, pool, budget, noise.excess, earlier
                     )
 
-                done = place.call(chunk_job, movie_job, core, span, budget, earlier, here=here)
+                done = executor.call(chunk_job, movie_job, core, span, budget, earlier, here=here)
                 store.save(number, done)
             merged.note(number, done)
             return done
 
         try:
-            with closing(_finished(finish, len(plan), place, merged, posterior)) as finished:
+            with closing(_finished(finish, len(plan), executor, merged, posterior)) as finished:
                 for frames_done, stopped in finished:
                     if frames_done < total:
                         progress("landing", frames_done, total)
@@ -204,7 +204,7 @@ def analyse_landings(
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
             interrupted = True
-    forgetting = beside(reader.forget)
+    forgetting = start_in_thread(reader.forget)
     fits, views, repeats = merged.result()
     light, drift, begin = merged.light(), merged.drift(), stretches[0][0]
     forgetting.result()
@@ -235,7 +235,7 @@ def analyse_landings(
         **searched,
         "frames_left_out": merged.left_out(),
         "drift_px": drift,
-        **_way(merged.trajectory()),
+        **_trajectory_summary(merged.trajectory()),
         "chunks": len(plan),
     }
     return DetectionResult(
@@ -261,23 +261,30 @@ def analyse_landings(
 
 
 def _finished(
-    finish: Callable[[int], Done], count: int, place: Executor, merged: Merged, posterior: bool
+    finish: Callable[[int], FinishedChunk],
+    count: int,
+    executor: Executor,
+    merged: MergedChunks,
+    posterior: bool,
 ) -> Generator[tuple[int, bool]]:
-    """Finish chunks and merge them in their order, whichever comes first.
+    """Finish chunks and merge them in order, in whatever order they come.
+
+    Yields the number of finished frames, and whether a chunk was interrupted.  With posteriors,
+    chunks run one after another, because each may sample as many as those before it left over.
 
     Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
     has the posteriors that those before it left to sample: with posteriors, one follows another.
     """
 
-    def results() -> Iterator[tuple[int, Done]]:
+    def results() -> Iterator[tuple[int, FinishedChunk]]:
         alone = 0
         while posterior and alone < count and merged.sampled < POSTERIORS:
             yield alone, finish(alone)
             alone += 1
-        for number, done in place.each(finish, range(alone, count)):
+        for number, done in executor.each(finish, range(alone, count)):
             yield alone + number, done
 
-    waiting: dict[int, Done] = {}
+    waiting: dict[int, FinishedChunk] = {}
     ready = frames = 0
     for number, done in results():
         waiting[number] = done
@@ -290,7 +297,7 @@ def _finished(
 
 
 def _median_snr(table: pd.DataFrame) -> float:
-    """Give the signal-to-noise ratio of the particle in the middle; 0 where there is none."""
+    """Median signal-to-noise ratio of the particles; 0 where there is none."""
     good = table["snr"][table["status"] == Status.OK] if len(table) else []
     return float(np.median(good)) if len(good) else 0.0
 
@@ -301,8 +308,8 @@ def _counted(table: pd.DataFrame) -> dict[str, int]:
     return {"landings": int((~left).sum()), "leavings": int(left.sum())}
 
 
-def _way(trajectory: Trajectory | None) -> dict[str, Any]:
-    """Give what the summary says of a trajectory."""
+def _trajectory_summary(trajectory: Trajectory | None) -> dict[str, Any]:
+    """Summarise a trajectory of the fixed pattern."""
     if trajectory is None:
         return {
             "drift_corrected": False,

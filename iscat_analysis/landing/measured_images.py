@@ -30,12 +30,13 @@ from iscat_analysis.search.residue import RINGS, chi2_excess
 from iscat_analysis.search.sliding import STRIDES, Chunk
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
-_OUTLIER = 3.0  # standard deviations from which a pixel counts less
+_OUTLIER_SIGMAS = 3.0  # standard deviations from which a pixel counts less
 _FITS = 4  # of the rings, with the outliers of the one before
 _PASSES = 2  # over steps whose pictures overlap
 _LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
-_LEFT = 0.1  # share of a misfit that alone passes the threshold where it hides others
-_WANDER = 0.35  # of a region, that the centre may lie from where the model's fit found it
+_LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold where it hides others
+# Farthest that the centre may lie from the fit of the model, in sides of the region.
+_LARGEST_SHIFT_SHARE = 0.35
 
 
 def with_measured_images(
@@ -65,28 +66,29 @@ def with_measured_images(
             chosen.append(i)
         elif not middle.is_measured:
             lobes.add(i)
-    told = list(steps)
+    measured = list(steps)
     for _ in range(_PASSES):
         for i in chosen:
-            others = [told[k] for k in near[i] if k not in lobes]
-            told[i] = _measured(told[i], others, chunk, neighbours, window, roi_px)
-    return [step for i, step in enumerate(told) if i not in lobes]
+            others = [measured[k] for k in near[i] if k not in lobes]
+            measured[i] = _measured(measured[i], others, chunk, neighbours, window, roi_px)
+    return [step for i, step in enumerate(measured) if i not in lobes]
 
 
 def _hides_others(step: Step, threshold: float) -> bool:
-    """Whether what is left over hides others: a little of much, or nearly all of a picture.
+    """Whether the misfit of a step could hide others.
 
-    What is between these may be two particles that land at once.
+    It does if the model misses a little of a very bright picture, or nearly all of a picture.  In
+    between it may be two particles that land at once.
     """
     described = step.excess < _LITTLE * step.snr**2
     if described and RINGS * step.start.snr > threshold:
         return True
-    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEFT) ** 2)
+    return step.excess > max(_MUCH * step.snr**2, (threshold / _LEAST_MISFIT_SHARE) ** 2)
 
 
 def _is_lobe(step: Step, brighter: Step, window: int, roi_px: int) -> bool:
-    """Whether a step lies in the middle of the picture of a brighter one, and at its time."""
-    near = distance_px(step, brighter) < 2 * _WANDER * roi_px
+    """Whether a step is in the middle of the picture of a brighter step, at the same time."""
+    near = distance_px(step, brighter) < 2 * _LARGEST_SHIFT_SHARE * roi_px
     return near and abs(step.at.frame - brighter.at.frame) <= window // STRIDES
 
 
@@ -98,7 +100,7 @@ def _measured(
     window: int,
     roi_px: int,
 ) -> Step:
-    """Replace a step's picture by the measured one; it stays where there are no frames for it."""
+    """Replace the picture of a step by the measured one, if there are frames for that."""
     rows, columns = ((part.start, part.stop) for part in neighbours.box(step))
     frame, gap = step.at.frame, min(step.at.gap, window // 5)
     begin, end = max(frame - window, chunk.first), min(frame + window, chunk.stop)
@@ -121,7 +123,7 @@ def _measured(
     sigma = np.sqrt((1 / before + 1 / after) * (1 + contrast) ** 2)
     weight = np.where(used, 1 / sigma, 0.0)
     place = step.start.y_px - rows[0], step.start.x_px - columns[0]
-    centre = _centre(contrast * weight, place, _WANDER * roi_px)
+    centre = _centre(contrast * weight, place, _LARGEST_SHIFT_SHARE * roi_px)
     image = ring_average(contrast, weight, centre)
     half = roi_px // 2
     y, x = (max(round(c) - half, 0) for c in place)
@@ -188,5 +190,5 @@ def ring_average(
         image = design @ spsolve(normal.tocsc(), design.T @ (kept * value))
         off = np.abs(value - image) * accuracy
         scale = max(1.0, float(np.median(off[accuracy > 0])) / 0.6745)
-        kept = accuracy**2 * np.minimum(1.0, _OUTLIER * scale / np.maximum(off, 1e-9)) ** 2
+        kept = accuracy**2 * np.minimum(1.0, _OUTLIER_SIGMAS * scale / np.maximum(off, 1e-9)) ** 2
     return np.asarray(image.reshape(contrast.shape))

@@ -1,4 +1,4 @@
-"""Finished chunks of a landing movie, joined again: each event once, in order of frame."""
+"""Finished chunks of a landing movie, merged: each event once, in order of frame."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
 
 
 @dataclass(frozen=True)
-class Done:
-    """What is kept of a finished chunk."""
+class FinishedChunk:
+    """The results of a chunk that are kept."""
 
     core: tuple[int, int]
     lines: pd.DataFrame  # of fits.csv, which have no numbers yet
@@ -51,11 +51,11 @@ class Done:
     searched: Searched | None = None  # share of the field at each boundary
 
 
-class Merged:
+class MergedChunks:
     """Finished chunks, in order."""
 
     def __init__(self, shape: tuple[int, int], ends: Sequence[int] = ()) -> None:
-        self._done: list[Done] = []
+        self._done: list[FinishedChunk] = []
         self._ends = set(ends)  # of the stretches of the movie
         self._dated: dict[int, NDArray[np.int64]] = {}
         self._strongest = np.zeros((2, *shape))
@@ -64,18 +64,18 @@ class Merged:
         self.empty: EmptySpread | None = None
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
 
-    def note(self, number: int, done: Done) -> None:
-        """Note when the events of a finished chunk happen, whose turn may not have come yet."""
+    def note(self, number: int, done: FinishedChunk) -> None:
+        """Register the events of a finished chunk, which may not be the next one in order."""
         frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
         self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
 
     def earlier(self, number: int, frame: int) -> int:
-        """Count the events before a frame, of the finished chunks before one."""
+        """Count the events before a frame in finished chunks before a given one."""
         known = list(self._dated.items())  # other threads note theirs
         return sum(int((dated < frame).sum()) for n, dated in known if n < number)
 
-    def add(self, done: Done) -> None:
-        """Take one more."""
+    def add(self, done: FinishedChunk) -> None:
+        """Append the next chunk."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
         self.sampled += done.sampled
@@ -112,7 +112,7 @@ class Merged:
             finished |= (frame >= done.core[0]) & (frame < done.core[1])
         kept = np.flatnonzero(own)
         for stranger in np.flatnonzero(~own & finished):
-            if not _same(table, int(stranger), kept):
+            if not _is_same_step(table, int(stranger), kept):
                 kept = np.append(kept, stranger)
         order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
         views, repeats = [], []
@@ -122,8 +122,8 @@ class Merged:
             if number < VIEWS and row < len(done.views):
                 view = replace(done.views[row], event=number)
                 views.append(view if number < CLIPS else replace(view, clip=None))
-        told = [homes[i][0].evidence[homes[i][1]] for i in order]
-        self.evidence = np.array(told).reshape(-1, len(NOTHING))
+        evidence = [homes[i][0].evidence[homes[i][1]] for i in order]
+        self.evidence = np.array(evidence).reshape(-1, len(NOTHING))
         rows = make_rows(table.iloc[order], {"event": range(len(order))})
         return rows, tuple(views), tuple(repeats)
 
@@ -135,7 +135,7 @@ class Merged:
         """Whether a stretch begins with this chunk."""
         return number == 0 or self._closes(self._done[number - 1])
 
-    def _closes(self, done: Done) -> bool:
+    def _closes(self, done: FinishedChunk) -> bool:
         """Whether a stretch ends with this chunk."""
         return done.core[1] in self._ends
 
@@ -153,7 +153,7 @@ class Merged:
         return out
 
     def light(self) -> FloatArray:
-        """Light of the frames that are done; NaN where one was left out."""
+        """Light of the finished frames; NaN where one was left out."""
         return self._in_place([done.light for done in self._done], np.nan)
 
     def left_out(self) -> int:
@@ -166,7 +166,7 @@ class Merged:
         return np.flatnonzero(~good.astype(np.bool_))
 
     def trajectory(self) -> Trajectory | None:
-        """Way of the fixed pattern through all chunks that followed it; None where none did."""
+        """Trajectory of the fixed pattern through all chunks; None where none was followed."""
         parts: list[Trajectory] = []
         way: Trajectory | None = None  # the chunk before, halo included
         for done in self._done:
@@ -190,7 +190,7 @@ class Merged:
         )
 
     def unfollowed(self) -> list[tuple[int, int]]:
-        """Frames of chunks in which no motion was looked for, or there was no pattern to follow."""
+        """Frames of chunks in which the motion was not followed, or that had no pattern."""
         return [done.core for done in self._done if done.trajectory is None]
 
     def drift(self) -> list[float] | None:
@@ -223,7 +223,7 @@ class Merged:
         return int(np.sum(masked & ~saturated)), int(saturated.sum())
 
 
-def _same(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
+def _is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
     """Whether some other row describes the same step."""
     frame, error, x, y, mass = (
         table[name].to_numpy(dtype=float)

@@ -32,7 +32,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 WHOLE = (slice(None), slice(None))
 """All of an image."""
 
-_WEAK = 0.05  # contrast up to which several add up
+_WEAK_CONTRAST = 0.05  # contrast up to which several add up
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Step:
 
 
 class Neighbours:
-    """Which steps see each other, and how."""
+    """Which steps overlap, and the light of a step in the frames of another."""
 
     def __init__(
         self,
@@ -183,7 +183,7 @@ class Neighbours:
 
         A weak one has the same image, its own, at all times.
         """
-        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK
+        strong = abs(step.start.mass_kda * self._contrast_per_kda) > _WEAK_CONTRAST
         if strong or step.is_measured or self._pattern is not None:
             return self.factor(step, before, after) - 1, 1.0
         return step.image, self.presence(step, after) - self.presence(step, before)
@@ -194,7 +194,7 @@ class Neighbours:
         add_image(total, step.corner, image, share)
 
     def _present(self, step: Step, frames: slice) -> slice:
-        """Give those of the frames in which the particle is there; all if it is there in none."""
+        """Select the frames in which the particle is there; all frames if it is in none."""
         turn = min(max(step.at.frame - self._chunk.first, frames.start), frames.stop)
         part = slice(turn, frames.stop) if step.sign > 0 else slice(frames.start, turn)
         return part if part.start < part.stop else frames
@@ -215,7 +215,7 @@ class Neighbours:
         return seen
 
     def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
-        """For each step, others that its fit should know of, and those that it depends on."""
+        """List for each step the others that its fit must include, and those that it depends on."""
         x, y, frame = (
             np.array(values, dtype=float)
             for values in zip(

@@ -1,4 +1,4 @@
-"""What is odd about the frames of a landing movie, in words."""
+"""Warnings about dark, repeated and shifted frames of a landing movie."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.diagnosis.causes import pixel_warnings
 from iscat_analysis.diagnosis.fixed_pattern import DRIFT_PX
-from iscat_analysis.landing.merging import Merged
+from iscat_analysis.landing.merging import MergedChunks
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import listed
 
@@ -23,7 +23,7 @@ LOST = 0.05
 
 def frame_warnings(
     name: str,
-    merged: Merged,
+    merged: MergedChunks,
     drift: list[float] | None,
     light: FloatArray,
     first: int,
@@ -31,7 +31,7 @@ def frame_warnings(
     *,
     corrected: bool = False,
 ) -> Iterator[str]:
-    """Say what is odd about the frames.
+    """Warn of frames that were left out and of motion of the pattern.
 
     Shapes: `light` (t,).
     """
@@ -61,9 +61,9 @@ def frame_warnings(
 
 
 def _drift_warnings(
-    name: str, merged: Merged, drift: list[float] | None, windows: float, corrected: bool
+    name: str, merged: MergedChunks, drift: list[float] | None, windows: float, corrected: bool
 ) -> Iterator[str]:
-    """Say how the fixed pattern moved, and what was done about it."""
+    """Say how the fixed pattern moved, and whether its motion was divided out."""
     way = merged.trajectory()
     if way is not None and drift is not None:
         yield (

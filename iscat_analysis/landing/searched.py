@@ -1,8 +1,8 @@
-"""Which part of field and time was searched, and for particles of what signal-to-noise ratio.
+"""The part of field and time that was searched, for each signal-to-noise ratio.
 
-Beside a bright step a particle must be higher than what the fits left over there, and it waits as
-long as something much higher in the same frames was neither fitted nor subtracted.  What is asked
-of a peak at each place and boundary is the largest of these and the threshold of the search.
+A particle near a bright step must exceed the residual of the fit there.  It also waits as long as a
+much higher peak of the same frames is neither fitted nor subtracted.  The level that a peak needs
+at a place and boundary is the larger of these and the threshold of the search.
 """
 
 from __future__ import annotations
@@ -100,18 +100,18 @@ def searched_shares(
             continue
         asked = np.full(chunk.shape, threshold)
         for peak in waits:
-            _raise_beside(asked, peak, roi_px)
+            _raise_near_unsubtracted(asked, peak, roi_px)
         for step in near:
             part = max(1 - abs(step.at.frame - now) / window, 0.0)
             inside = part * math.sqrt(EXPLAINS * step.excess)
-            _raise_around(asked, step, snr[j], inside, roi_px)
+            _raise_near_fitted(asked, step, snr[j], inside, roi_px)
         sizes = np.sort(asked[chunk.usable]) / threshold
         shares[row] = np.searchsorted(sizes, LEVELS * (1 + 1e-9)) / sizes.size
     return Searched(frames[own].astype(np.int64), shares)
 
 
-def _raise_beside(asked: FloatArray, peak: Peak, roi_px: int) -> None:
-    """Ask of others what they must exceed not to wait for a peak that was not subtracted."""
+def _raise_near_unsubtracted(asked: FloatArray, peak: Peak, roi_px: int) -> None:
+    """Raise the needed level around a peak that was not subtracted."""
     for half, share in ((LARGEST_IMAGE * roi_px, FAR_LOBE), (roi_px, SIDELOBE)):
         box = tuple(
             slice(max(math.ceil(c - half), 0), max(math.floor(c + half) + 1, 0))
@@ -120,10 +120,10 @@ def _raise_beside(asked: FloatArray, peak: Peak, roi_px: int) -> None:
         np.maximum(asked[box], share * abs(peak.snr), out=asked[box])
 
 
-def _raise_around(
+def _raise_near_fitted(
     asked: FloatArray, step: Step, snr: NDArray[Any], inside: float, roi_px: int
 ) -> None:
-    """Ask what the fit of a bright step left over, along rings around it and in its region."""
+    """Raise the needed level around a bright step, by the residual of its fit."""
     centre = step.start.x_px, step.start.y_px
     y, x = (np.arange(n) - c for n, c in zip(asked.shape, centre[::-1], strict=True))
     away = np.hypot(y[:, None], x[None, :])
@@ -134,16 +134,16 @@ def _raise_around(
     np.maximum(asked, left, out=asked)
 
 
-def searched_warning(name: str, told: dict[str, Any]) -> str:
+def searched_warning(name: str, summary: dict[str, Any]) -> str:
     """Say that a part of the movie was not searched; empty where nearly all was."""
-    share = told["searched_share"]
+    share = summary["searched_share"]
     if share is None or share >= LEAST_SHARE:
         return ""
-    spans = sorted(told["partly_searched"], key=lambda span: span[2])[:3]
+    spans = sorted(summary["partly_searched"], key=lambda span: span[2])[:3]
     worst = ", ".join(f"{start}:{stop} ({part:.0%})" for start, stop, part in sorted(spans))
     return (
         f"{name}: {share:.0%} of field and time were searched for particles with a signal-to-noise "
-        f"ratio of {told['searched_snr']:.0f}; what bright or ill-described particles left over "
+        f"ratio of {summary['searched_snr']:.0f}; what bright or ill-described particles left over "
         f"hides the rest, most in frames {worst}; numbers of particles and rates are corrected "
         "for it, but look at these frames"
     )

@@ -1,7 +1,7 @@
-"""Which peaks of a landing movie are steps, and which the side lobes of others.
+"""Side lobes among the peaks of a landing movie.
 
-A peak beside a higher one waits until that one is fitted and taken off.  What is left then must
-exceed what the fits leave over, which `iscat_analysis.search.residue` measures on them.
+A peak near a higher one waits until that one is fitted and subtracted.  If it is still there, it
+must exceed the residual of the fits, which `iscat_analysis.search.residue` measures.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, RINGS, is_hidden, s
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
 
-_RESIDUE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
+_RESIDUE_SHARE = 0.15  # of a fitted step, below which a peak on top of it is what its fit left over
 
 
 @dataclass(frozen=True)
 class SidelobeFilter:
-    """Tells steps from side lobes."""
+    """Separates steps from side lobes of other steps."""
 
     first: int
     stride: int
@@ -33,7 +33,7 @@ class SidelobeFilter:
     def sift(
         self, peaks: Sequence[Peak], steps: Sequence[Step], snr: MapArray
     ) -> tuple[list[Peak], list[Peak]]:
-        """Sort peaks.
+        """Sort peaks into steps, peaks that wait, and side lobes.
 
         Shapes: `snr` (n, y, x).
         """
@@ -55,9 +55,9 @@ class SidelobeFilter:
         return fresh, doubtful
 
     def _waiting(self, peaks: Sequence[Peak]) -> list[bool]:
-        """Tell which peaks may be nothing but the side lobe of a higher one.
+        """Tell which peaks may be side lobes of a higher one.
 
-        A peak that waits makes others wait too, or its own rings would be taken for particles.
+        A peak that waits makes others wait as well, or its own rings would be taken for particles.
         """
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
         reach, side = STRIDES * self.stride, self.roi_px
@@ -68,19 +68,20 @@ class SidelobeFilter:
         return hidden
 
     def _is_residue(self, step: Step, peak: Peak) -> bool:
-        """Whether a peak may be a residual of a fitted step, whose model is never quite right."""
+        """Whether a peak may be the residual of a fitted step."""
         start = step.start
         distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
-        share = _RESIDUE if on_top else 0.0 if step.is_measured else RINGS
+        share = _RESIDUE_SHARE if on_top else 0.0 if step.is_measured else RINGS
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
 
     def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
-        """Signal-to-noise ratio that a peak must exceed not to be what the fits left over.
+        """Signal-to-noise ratio that a peak must have not to be a residual of the fits.
 
-        The nearest steps come first, and the search ends with one that hides the peak.
+        The nearest steps are tried first; the search ends with one whose residual is higher than
+        the peak.
         """
         away = [math.hypot(peak.x_px - s.start.x_px, peak.y_px - s.start.y_px) for s in steps]
         size = max(
@@ -102,9 +103,9 @@ class SidelobeFilter:
         return size
 
     def _inside(self, step: Step, peak: Peak) -> float:
-        """Give what a peak in a step's fitted region must exceed.
+        """Residual inside the fitted region of a step, which a peak must exceed.
 
-        A window that holds only some frames of the step shows only that part of the misfit.
+        A window with only some of the frames of the step shows only a part of the misfit.
         """
         part = max(1 - abs(step.at.frame - peak.frame) / self.window, 0.0)
         return part * math.sqrt(EXPLAINS * step.excess)

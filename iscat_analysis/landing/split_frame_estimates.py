@@ -1,4 +1,4 @@
-"""Repeats: every estimate on parts of its own frames, and the same frames where nothing landed."""
+"""Estimates from parts of the frames of each event, and from frames in which nothing lands."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _BLOCK_BYTES = 16 * 2**20
 
 
 def nothing_repeated(mode: str) -> FloatArray:
-    """Give what is known of an event whose frames could not be compared."""
+    """Give the record of an event whose frames could not be divided."""
     empty = Series(np.zeros((len(FREE_PARAMETERS[mode]), 0)), *(np.zeros(0) for _ in range(3)))
     return repeats_of((empty,))
 
@@ -61,7 +61,7 @@ def step_repeats(
     pattern: MovingPattern | None,
     mode: str,
 ) -> FloatArray:
-    """Compare parts of the frames of one landing or leaving."""
+    """Compare the estimates from parts of the frames of one landing or leaving."""
     region, windows = event.region, event.windows
     response = _response(event)
     if response is None:
@@ -133,7 +133,7 @@ def step_controls(
     steps: Sequence[Step],
     neighbours: Neighbours,
 ) -> EmptySpread | None:
-    """Look at the windows of some events where nothing lands or leaves."""
+    """Make the same estimates in windows in which nothing lands or leaves."""
     times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
@@ -177,13 +177,13 @@ def step_controls(
 
 
 def _most_windows(places: int, share: float) -> int:
-    """Windows to look at in a chunk with so many places, which is a share of its movie."""
+    """Give the number of such windows in a chunk, in proportion to its share of the movie."""
     enough = min(PLACES, MOVIE_PLACES * share) / max(places, 1)
     return int(np.clip(enough, FEWEST_WINDOWS, MOST_WINDOWS))
 
 
 def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
-    """Contiguous parts of the good frames of a window, relative to the chunk."""
+    """Divide the good frames of a window into contiguous parts."""
     good = np.flatnonzero(chunk.power[chunk.cut(start, stop)] > 0) + (start - chunk.first)
     parts = min(PARTS, good.size)
     edges = np.linspace(0, good.size, parts + 1).round().astype(int)

@@ -1,9 +1,9 @@
-"""Sliding contrast of a chunk, filtered, with the steps that are known taken off.
+"""Filtered sliding contrast of a chunk, without the steps that are known.
 
-What a step makes of the contrast reaches no farther than its image and the filter's template, and
-the filter is linear: steps that are found, or fitted anew, change the maps around them alone.
-Where the light in common, the motion of the pattern or correlated noise is taken out as well, a
-step changes the whole field, and maps are made anew.
+The filter is linear and a step reaches no farther than its image and the template.  Steps that are
+new or fitted again therefore change the maps only near them.  Where common light, motion of the
+pattern or correlated noise is removed as well, a step changes the whole field, and the maps are
+computed again.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from iscat_analysis.search.sliding import STRIDES, Chunk, Filter, MapArray, slid
 
 
 class StepMaps:
-    """The maps of one chunk, from one search to the next."""
+    """The maps of one chunk, updated from search to search."""
 
     def __init__(
         self,
@@ -40,7 +40,7 @@ class StepMaps:
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
 
     def without(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
-        """Take known steps off."""
+        """Subtract known steps."""
         if self._is_local:
             maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
             for step in _missing(self._known, steps):
@@ -60,7 +60,7 @@ class StepMaps:
         return slice(int(edges[low]), middle), slice(middle, int(edges[high]))
 
     def _add(self, maps: tuple[MapArray, FloatArray], step: Step, share: float) -> None:
-        """Add a multiple of what a step makes of the contrast to the maps around it."""
+        """Add a multiple of the contrast of a step to the maps around it."""
         snr, effective = maps
         here = int(np.searchsorted(self._chunk.edges, step.at.frame - self._chunk.first))
         filtered = None
@@ -77,7 +77,7 @@ class StepMaps:
             add_image(snr[boundary], corner, response, np.float32(scale))
 
     def _anew(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
-        """Make the maps again in which what is known has changed."""
+        """Compute the maps again where the known steps have changed."""
         moving, chunk = self._pattern, self._chunk
         near = []
         for boundary in range(chunk.edges.size - 2):
@@ -108,11 +108,11 @@ class StepMaps:
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:
-    """Tell apart the very same steps from those that were fitted anew."""
+    """Give the identities of steps; one that was fitted again is another object."""
     return {id(step) for step in steps}
 
 
 def _missing(some: Sequence[Step], others: Sequence[Step]) -> list[Step]:
-    """Give those that are not among others."""
+    """Give the steps of one list that are not in another."""
     there = _ids(others)
     return [step for step in some if id(step) not in there]

@@ -18,7 +18,7 @@ import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
-from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
@@ -52,14 +52,15 @@ ROUNDS = 10
 """Searches at most; each takes what was found so far off the contrast."""
 
 _SWEEPS = 10  # fits of what has neighbours that still move, with everything else in place
-_EXPLAINED = 0.7  # of the threshold; a fit that reaches less is what other steps explain
+# Of the threshold; a fit that reaches less is what other steps explain
+_LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
-_MUCH = 5.0  # times the mass of a step that another has, of whose light it may be
+_LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
 @dataclass(frozen=True)
 class StepEvent:
-    """A step that was fitted for good, and what its frames say beside it."""
+    """A step after its last fit, with the estimates from parts of its frames."""
 
     event: Event
     step: Step
@@ -228,7 +229,7 @@ class ChunkFitter:
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
-        """Fit the chosen steps at the heights that they have, each with the others as they were."""
+        """Fit the chosen steps at their present heights, with the others fixed."""
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
@@ -248,7 +249,7 @@ class ChunkFitter:
     def _lifted(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
-        """Fit the chosen steps at all heights, so that their rings are those of their own."""
+        """Fit the chosen steps at all heights, so that the rings fit too."""
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
@@ -277,13 +278,13 @@ class ChunkFitter:
         return refitted
 
     def _seated(self, step: Step) -> Candidate:
-        """Put a step where a particle of its mass is expected, unless its height is free."""
+        """Set the height of a step to the expected one, unless its height is free."""
         if "z_nm" in FREE_PARAMETERS[self._context.mode]:
             return step.start
         return replace(step.start, z_nm=self._context.height_nm(step.start.mass_kda))
 
     def _moved(self, step: Step, task: Task, theta: FloatArray, snr: float) -> Step:
-        """Put a step where a fit found it."""
+        """Set a step to its fitted position."""
         likelihood, (y_px, x_px) = task.likelihood, task.offset_px
         pixel = self._context.pixel_nm
         start = replace(
@@ -303,7 +304,7 @@ class ChunkFitter:
 
     @property
     def _quick_mode(self) -> str:
-        """Where z is free it is found after place and mass, from all heights at once."""
+        """Mode of the first fits: a free z is held, and found later from all heights at once."""
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
 
     def _finish(
@@ -330,7 +331,7 @@ class ChunkFitter:
             task.at.frame, task.n_before, task.n_after, step.sign, task.at.half_width,
             task.at.rise,
         )  # fmt: skip
-        if event.snr < _EXPLAINED * context.templates.threshold:
+        if event.snr < _LEAST_THRESHOLD_SHARE * context.templates.threshold:
             return None
         step = replace(step, at=task.at)
         seen = (
@@ -344,7 +345,7 @@ class ChunkFitter:
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
-        """Judge all steps, those that may be side lobes, or explain less than they leave, too."""
+        """Judge all steps, including side lobes and steps that explain less than they leave."""
         steps = [own.fitted.step for own in finished]
         described = [own.fitted.event.described for own in finished]
         frame = np.array([step.at.frame for step in steps])
@@ -355,7 +356,7 @@ class ChunkFitter:
             at_once = np.abs(frame - frame[number]) < self._window
             near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
             event = own.fitted.event
-            flags = remarks(
+            flags = fit_flags(
                 self._context, event, event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
@@ -368,13 +369,16 @@ class ChunkFitter:
         return judged
 
     def _credible(self, steps: Sequence[Step]) -> list[Step]:
-        """Leave out what the others explain, and the weaker of two steps that describe one."""
+        """Drop steps that others explain, and the weaker of two that describe one particle."""
         steps = sorted(steps, key=lambda s: -s.start.snr)
         sign = np.array([s.sign for s in steps])
         frame = np.array([s.at.frame for s in steps])
         width = np.array([s.at.half_width for s in steps])
         x_px, y_px = _places(steps)
-        kept = np.array([s.snr for s in steps]) > _EXPLAINED * self._context.templates.threshold
+        kept = (
+            np.array([s.snr for s in steps])
+            > _LEAST_THRESHOLD_SHARE * self._context.templates.threshold
+        )
         for number in np.flatnonzero(kept).tolist():
             same = kept[:number] & (sign[:number] == sign[number])
             same &= np.abs(frame[:number] - frame[number]) <= np.maximum(
@@ -395,7 +399,7 @@ def _has_moved(old: Step, new: Step) -> bool:
 
 def _outshines(other: Step, step: Step) -> bool:
     """Whether a step may be what is left of another, much stronger one whose light rises slowly."""
-    return other.at.rise > 0 and other.start.mass_kda > _MUCH * step.start.mass_kda
+    return other.at.rise > 0 and other.start.mass_kda > _LEAST_MASS_RATIO * step.start.mass_kda
 
 
 def _places(steps: Sequence[Step]) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.hashing import refuse_changed, states_of
-from iscat_analysis.movie.addresses import MARK, beside, split_address
+from iscat_analysis.movie.addresses import MARK, path_beside, split_address
 from iscat_analysis.movie.file_set import FileSet
 from iscat_analysis.movie.folders import FORMATS, files_of
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
@@ -26,7 +26,7 @@ from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
 
-__all__ = ["ArrayLike", "Frames", "Stack", "beside", "open_stack"]
+__all__ = ["ArrayLike", "Frames", "Stack", "open_stack", "path_beside"]
 
 _READERS: Mapping[bytes, Callable[[Path], Frames]] = {
     signature: kind.open for kind in FORMATS for signature in kind.signatures
@@ -95,13 +95,13 @@ def open_stack(
     ConfigError
         A file was given what only arrays need, or a number is not positive.
     """
-    said = {
+    arguments = {
         "pixel_size_nm": pixel_size_nm,
         "exposure_ms": exposure_ms,
         "frame_rate_hz": frame_rate_hz,
     }
     if isinstance(movie, (str, Path)):
-        given = [key for key, value in {"name": name, **said}.items() if value is not None]
+        given = [key for key, value in {"name": name, **arguments}.items() if value is not None]
         if given:
             raise ConfigError(
                 f"{given[0]}: describes an array, but {movie} is a file, which has a name and "
@@ -115,10 +115,10 @@ def open_stack(
         raise DataError(
             f"{type(movie).__name__} is no movie; give the path of a file, or an array (t, y, x)"
         )
-    for key, value in said.items():
+    for key, value in arguments.items():
         if value is not None and not (isinstance(value, Real) and 0 < value < math.inf):
             raise ConfigError(f"{key} = {value!r} must be a positive number")
-    source = "arguments" if any(value is not None for value in said.values()) else "none"
+    source = "arguments" if any(value is not None for value in arguments.values()) else "none"
     metadata = StackMetadata(pixel_size_nm, exposure_ms, frame_rate_hz, source=source)
     name = name or "array"
     return Stack(Path(name), ArrayFrames(movie, name, metadata), files=())
@@ -190,7 +190,7 @@ def _stack(
 
 
 def _refusal(path: Path, signature: bytes) -> str:
-    """Say what a file is that is not read, and what to do."""
+    """Say what kind of file is not read, and what to do."""
     known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
     found = f"a film, {_LOSSY}; {_EXPORT}" if signature[4:] == _FILM else next(known, "")
     needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr or a NumPy array"

@@ -20,7 +20,7 @@ _SHAPE = re.compile(r"(?:(\d{1,12})x)?(\d{1,9})x(\d{1,9}),\s*(\S+)", flags=re.AS
 
 
 def split_address(address: Path) -> tuple[Path, str]:
-    """Tell the file from the part of it."""
+    """Split an address into file and dataset."""
     head, mark, part = str(address).partition(MARK)
     if mark and not (is_file(address) or is_folder(address)):
         return Path(head), part
@@ -37,12 +37,12 @@ def layout(part: str) -> tuple[int | None, int, int, str] | None:
 
 
 def setup_beside(address: Path) -> Path:
-    """Name the configuration that goes for the movies of a folder."""
+    """Path of the configuration for the movies of a folder."""
     return split_address(address)[0].parent / SETUP
 
 
-def beside(address: Path, suffix: str) -> Path:
-    """Name what is written about a movie, next to it."""
+def path_beside(address: Path, suffix: str) -> Path:
+    """Path of what is written about a movie, next to it."""
     path, part = split_address(address)
     if path.name in ("", ".."):  # the folder one is in, or the one above, has its name elsewhere
         try:

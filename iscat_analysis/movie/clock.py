@@ -1,4 +1,4 @@
-"""The camera's clock: its rate, and which frames it dropped, from the times of all frames."""
+"""The clock of the camera: its rate and dropped frames, from the times of all frames."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from iscat_analysis.records import FloatArray
 
-_REGULAR = 0.5  # |mean exp(2πi f t)| of times that tell the clock; a jitter of 0.19 intervals
+# |mean exp(2πi f t)| of times that tell the clock; a jitter of 0.19 intervals
+_LEAST_REGULARITY = 0.5
 _BLOCK = 64  # frames that tell the rate at first
 _REACH = 0.2  # of the rate by the median interval, where the true one is looked for
 _STEP = 0.1  # of the width of the maximum, 1/(time that passed)
@@ -36,7 +37,7 @@ def measure_clock(times_s: Mapping[int, float]) -> tuple[float | None, tuple[int
     middle = float(np.median(np.diff(times)))
     rate = _rate(times, 1 / middle) if middle > 0 else mean
     grid = np.mean(np.exp(2j * np.pi * rate * times))
-    if abs(grid) < _REGULAR:
+    if abs(grid) < _LEAST_REGULARITY:
         return mean, None
     behind = np.rint(rate * times - np.angle(grid) / (2 * np.pi)).astype(np.int64) - number
     ticks = number + np.minimum.accumulate(behind[::-1])[::-1]

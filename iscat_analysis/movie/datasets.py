@@ -67,7 +67,7 @@ def open_hdf5(path: Path, part: str) -> Frames:
 
 
 def is_one_movie(path: Path) -> bool:
-    """Tell whether an HDF5 file is a movie without anything being named in it."""
+    """Tell whether an HDF5 file holds exactly one movie."""
     try:
         with closing(Hdf5Reader(path)) as reader, closing(reader.data):
             return is_refeyn(reader) or len(list(_movies(reader))) == 1

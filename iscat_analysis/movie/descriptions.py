@@ -58,9 +58,9 @@ Resolution = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class Hints:
-    """What one kind of metadata says: lengths in nm, exposure in ms, frame rate in Hz.
+    """Values from one kind of metadata: lengths in nm, exposure in ms, frame rate in Hz.
 
-    None where it is silent; `ticks` and `source` are as in `StackMetadata`.
+    None where a value is missing; `ticks` and `source` are as in `StackMetadata`.
     """
 
     source: str
@@ -79,10 +79,10 @@ class Hints:
 
 @dataclass(frozen=True)
 class Described:
-    """What a description announces.
+    """What a description says about the frames.
 
-    `frames` counts from the image that carries the description; `axis` is theirs; `one_image` says
-    that one image may stand for all, the other frames' pixels following it.
+    `frames` counts from the image that has the description; `axis` is their axis.  With `one_image`
+    a single image may stand for all, the pixels of the other frames following its own.
     """
 
     frames: int
@@ -227,7 +227,7 @@ def plain_hints(resolution: Resolution | None) -> Hints:
 
 
 def positive(value: object, factor: float = 1.0) -> float | None:
-    """Read a number that must be finite and above zero to mean anything."""
+    """Read a number; None unless it is finite and positive."""
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
         return None
     try:
@@ -238,12 +238,12 @@ def positive(value: object, factor: float = 1.0) -> float | None:
 
 
 def inverse(value: float | None) -> float | None:
-    """Turn an interval into a rate, or back."""
+    """Convert an interval to a rate, or back."""
     return None if value is None else positive(1 / value)
 
 
 def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
-    """Take each value from the first kind of metadata that gives it."""
+    """Take each value from the first kind of metadata that has it."""
     found: dict[str, float] = {}
     sources = []
     for hint in hints:

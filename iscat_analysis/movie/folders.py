@@ -25,7 +25,7 @@ _REFEYN = ".mp"
 
 
 class Format(NamedTuple):
-    """A kind of file that its first four bytes tell: these, its suffixes, and what opens it."""
+    """A file format: its first bytes, its suffixes and the function that opens it."""
 
     signatures: tuple[bytes, ...]
     suffixes: tuple[str, ...]
@@ -67,7 +67,7 @@ def members_of(address: Path) -> tuple[Path, ...]:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Give size and time of change of a file, which tell it from earlier ones of its name."""
+    """Size and modification time of a file, which tell it from earlier versions."""
     try:
         state = path.stat()
     except OSError:
@@ -116,7 +116,7 @@ def _is_movie(path: Path) -> bool:
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:
-    """Leave one file of every set."""
+    """Keep one file of every set."""
     sets = {path: frozenset(files) for path in paths if len(files := members_of(path)) > 1}
     named: set[frozenset[Path]] = set()
     kept = []

@@ -28,8 +28,8 @@ from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_c
 
 _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
-_BOMB_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
-_BOMB_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
+_MOST_DECODED_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
+_HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
 _CACHE_BYTES = 64_000_000  # of decoded chunks that are kept
 _HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
 _HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
@@ -134,7 +134,7 @@ class Hdf5Reader:
             raise
 
     def close(self) -> None:
-        """Let h5py go of the file; its mapped bytes stay."""
+        """Close the file in h5py; the mapped bytes stay."""
         with self._believing_nothing():
             self._file.close()
 
@@ -202,9 +202,9 @@ class Hdf5Reader:
         try:
             yield
         except WHAT_LIBRARIES_RAISE as error:
-            said = next(iter(str(error).splitlines()), "") or type(error).__name__
+            reason = next(iter(str(error).splitlines()), "") or type(error).__name__
             raise DataError(
-                f"{self._path}: begins like an HDF5 file but is damaged ({said}); "
+                f"{self._path}: begins like an HDF5 file but is damaged ({reason}); "
                 "copy it again or export it again"
             ) from None
 
@@ -241,7 +241,7 @@ class Hdf5Reader:
         if not (plain and shape and dataset.id.get_type().equal(h5py.h5t.py_create(dtype))):
             raise self._no_numbers(dataset, name)
         total = math.prod(shape) * dtype.itemsize
-        if total > max(_BOMB_BYTES, _BOMB_RATIO * len(self.data)):
+        if total > max(_HARMLESS_BYTES, _MOST_DECODED_RATIO * len(self.data)):
             raise DataError(
                 f"{self._path}: {name} would grow from a file of {len(self.data)} to {total} "
                 "bytes, which no recording does; the file is damaged, export it again"
@@ -319,7 +319,7 @@ class Hdf5Reader:
 
 
 def _single(dataset: h5py.Dataset) -> bool:
-    """Whether a dataset is one value, in the file itself and not compressed."""
+    """Whether a dataset is one value, stored in the file and not compressed."""
     layout = dataset.id.get_create_plist().get_layout()
     inside = layout in (h5py.h5d.CONTIGUOUS, h5py.h5d.COMPACT) and not dataset.external
     return bool(inside and dataset.size == 1)

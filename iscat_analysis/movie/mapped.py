@@ -1,4 +1,4 @@
-"""A file in memory-mapped pages, and what the libraries that read files raise on damaged ones."""
+"""Memory-mapped files, and the errors that libraries raise on damaged ones."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def map_file(path: Path) -> mmap.mmap:
 
 
 def unmap(data: mmap.mmap) -> None:
-    """Close a file, or have it closed when nobody uses frames where they lie in it any more."""
+    """Close a file, or have it closed when its frames are no longer used."""
     with suppress(BufferError):
         data.close()
 
@@ -46,7 +46,7 @@ def unmap(data: mmap.mmap) -> None:
 def frames_in_place(
     path: Path, data: mmap.mmap, offset: int, shape: tuple[int, int, int], stored: np.dtype[Any]
 ) -> InPlace | None:
-    """Give frames that lie in a file one after the other."""
+    """View frames that are contiguous in a file."""
     if not stored.isnative or offset % stored.itemsize:
         return None
     refuse_changed(path, data)
@@ -59,9 +59,9 @@ def frames_in_place(
 
 
 class _Lying:
-    """Bytes that NumPy shall take for an array which one may write to, though one may not.
+    """Read-only bytes that NumPy takes for a writeable array.
 
-    Numba would compile all kernels anew for arrays that say that they cannot be written to.
+    Numba would compile all kernels again for read-only arrays.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ def refuse_changed(path: Path, data: mmap.mmap) -> None:
 
 
 def release(data: mmap.mmap, start: int, stop: int) -> None:
-    """Let go of pages that were copied; the system would count them as this process's memory."""
+    """Release mapped pages that were copied; the system counts them as memory of this process."""
     first = max(start - _MAPPED_ALONG, 0) // mmap.PAGESIZE * mmap.PAGESIZE
     last = min(stop + _MAPPED_ALONG, len(data))
     if last > first and hasattr(data, "madvise"):

@@ -1,4 +1,4 @@
-"""Movies whose numbers lie in the file one after the other: NumPy's, and files of nothing else."""
+"""Movies of contiguous numbers: NumPy files and raw files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0
 
 
 class MappedFrames:
-    """The frames of a file that is nothing but numbers, behind a header perhaps."""
+    """Frames of a file that holds only numbers, after a header."""
 
     metadata = StackMetadata()
     notes = ()
@@ -83,7 +83,7 @@ class MappedFrames:
         return block
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
-        """Frames ``[start, stop)`` where they lie in the file; None if they have to be read."""
+        """View frames ``[start, stop)`` in the file; None if they have to be read."""
         if self._last_first:
             return None
         shape = (stop - start, *self.shape[1:])
@@ -115,13 +115,13 @@ def open_npy(path: Path) -> MappedFrames:
 def open_raw(path: Path, part: str) -> MappedFrames:
     """Open a file that holds the counts and nothing else."""
     example = f"{path}{MARK}1500x128x128,uint16"
-    said = layout(part)
-    if said is None:
+    found = layout(part)
+    if found is None:
         raise DataError(
             f"{path}{MARK}{part}: a file of plain numbers needs frames x rows x columns and their "
             f"type, as in {example}"
         )
-    frames, rows, columns, name = said
+    frames, rows, columns, name = found
     try:
         stored = np.dtype(name)
     except (TypeError, ValueError, SyntaxError):

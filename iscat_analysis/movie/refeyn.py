@@ -30,12 +30,12 @@ PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
 
 _BLOCK_BYTES = 64_000_000
 _ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
-_FRAME_BOMB_RATIO = 100  # of one decoded frame over the file
+_MOST_FRAME_DECODED_RATIO = 100  # of one decoded frame over the file
 
 
 @dataclass(frozen=True)
 class _Dialect:
-    """Where one generation of files keeps things."""
+    """Names of datasets in one generation of files."""
 
     frames: str
     keyframes: str | None
@@ -104,10 +104,10 @@ class RefeynFrames:
 
 
 class DifferenceFrames(RefeynFrames):
-    """A movie stored as differences, summed as it is read.
+    """A movie stored as differences, which are summed as it is read.
 
-    Decoded frames are remembered here and there, so that no read starts from the first frame; a
-    movie read in order is summed once.
+    Some decoded frames are kept, so that a read need not start at the first frame.  A movie that is
+    read in order is summed once.
     """
 
     def __init__(
@@ -209,7 +209,7 @@ def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
             f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
         )
     frame_bytes = rows * columns * stored.dtype.itemsize
-    if frame_bytes > max(_BLOCK_BYTES, _FRAME_BOMB_RATIO * len(reader.data)):
+    if frame_bytes > max(_BLOCK_BYTES, _MOST_FRAME_DECODED_RATIO * len(reader.data)):
         raise DataError(
             f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
             f"file of {len(reader.data)}; the file is damaged, export it again"

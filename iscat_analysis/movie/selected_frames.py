@@ -1,4 +1,4 @@
-"""Some frames of a movie, as if it held no others."""
+"""A selection of the frames of a movie."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SelectedFrames(Generic[S]):
         return self.frames.size, *self.source.shape[1:]
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Read frames by their place among those kept.
+        """Read frames by their index in the selection.
 
         Shapes: result (stop − start, y, x).
         """

@@ -18,7 +18,7 @@ from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files,
 from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.text import printable
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
@@ -104,7 +104,7 @@ class ArrayFrames:
 
 
 def not_shared(path: Path) -> DataError:
-    """Say that a file is not, or not the same, where it shall be read."""
+    """Say that a file is missing or different where another process reads it."""
     return DataError(
         f"{path}: is not on {platform.node()}, or is another file there; workers read and write by "
         "path, so that their machines must share the file system"
@@ -212,7 +212,7 @@ class Stack:
 
     @property
     def identity(self) -> str:
-        """What tells this movie from others without reading all of it; empty for an array."""
+        """Hash that identifies the movie without reading all of it; empty for an array."""
         try:
             return fingerprint(self._files, self._part) if self._files else ""
         except OSError as error:
@@ -239,7 +239,7 @@ class Stack:
         return self._frames.notes
 
     def seen_as(self, frames: Frames) -> Stack:
-        """Give the same movie with other frames, which were made from its own.
+        """Make the same movie with frames that were derived from its own.
 
         Parameters
         ----------
@@ -283,7 +283,7 @@ class Stack:
         return seen
 
     def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
-        """Give the same movie with some pixels as dark as dead ones, which all stages leave out.
+        """Set some pixels to dark counts, so that all stages leave them out.
 
         Parameters
         ----------
@@ -443,7 +443,7 @@ class Stack:
             What `sha256` gives.
         """
         if self._hashing is None:
-            self._hashing = beside(self.sha256)
+            self._hashing = start_in_thread(self.sha256)
         return self._hashing
 
     def _require(self, start: int, stop: int) -> None:

@@ -10,7 +10,7 @@ _SEPARATORS = ",;\t"
 
 
 def without_remarks(text: str) -> list[str]:
-    """Leave out empty lines and those that begin with ``#``."""
+    """Drop empty lines and comments, which begin with ``#``."""
     return [line for line in text.splitlines() if line.strip() and line.lstrip()[0] != "#"]
 
 
@@ -37,5 +37,5 @@ def refuse_twice(names: Sequence[object], used: Collection[str], table: object) 
 
 
 def decimal_mark(between: str) -> str:
-    """Give what stands before the decimals of a table's numbers."""
+    """Find the decimal mark of a table's numbers."""
     return "." if between == "," else ","

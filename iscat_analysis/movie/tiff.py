@@ -47,8 +47,8 @@ from iscat_analysis.movie.mapped import (
 )
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
 from iscat_analysis.movie.tiff_checks import (
-    BOMB_RATIO,
-    FRAME_BOMB_RATIO,
+    MOST_DECODED_RATIO,
+    MOST_FRAME_DECODED_RATIO,
     STRIP_OFFSETS,
     STRIP_SIZES,
     TILE_OFFSETS,
@@ -230,9 +230,9 @@ def _open(
     size = math.prod(frames[0].shape) * dtype.itemsize
     for number, image in enumerate(frames):
         if image.start is None:
-            refuse_growth(size, sum(image.sizes), FRAME_BOMB_RATIO, f"image {number}", path)
+            refuse_growth(size, sum(image.sizes), MOST_FRAME_DECODED_RATIO, f"image {number}", path)
     if frames[0].start is None:
-        refuse_growth(n_frames * size, len(data), BOMB_RATIO, "it", path)
+        refuse_growth(n_frames * size, len(data), MOST_DECODED_RATIO, "it", path)
 
     if _MICRO_MANAGER in first.tags:
         summary = _micro_manager_summary(path)
@@ -376,7 +376,7 @@ def _resolution(page: tifffile.TiffPage) -> tuple[float, float, int] | None:
 
 @contextmanager
 def _unheard() -> Iterator[None]:
-    """Keep what tifffile logs from stderr where the program has set up no logging of its own."""
+    """Keep log messages of tifffile off stderr, unless the program has set up logging."""
     logger, handler = logging.getLogger("tifffile"), logging.NullHandler()
     logger.addHandler(handler)
     try:

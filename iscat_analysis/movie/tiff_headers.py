@@ -22,7 +22,7 @@ _PLACES = {3: "H", 4: "I", 16: "Q"}  # types of number that may say where pixels
 
 @dataclass(frozen=True, slots=True)
 class Repetition:
-    """What an image must look like to be like another; `repetition_of` makes it."""
+    """Header of an image, against which others are compared; `repetition_of` makes it."""
 
     tiff: tifffile.TiffFormat
     tags: bytes
@@ -48,7 +48,7 @@ class Repetition:
 def repetition_of(
     tiff: tifffile.TiffFormat, data: mmap.mmap, offset: int, size: int
 ) -> Repetition | None:
-    """Take an image for a pattern."""
+    """Make a pattern of the header of an image."""
     (count,) = struct.unpack_from(tiff.tagnoformat, data, offset)
     length = tiff.tagnosize + count * tiff.tagsize
     tags = bytearray(data[offset : offset + length])

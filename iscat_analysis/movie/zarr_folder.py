@@ -26,8 +26,8 @@ from iscat_analysis.reading import LARGEST_TEXT_BYTES, first_line
 
 _TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
 _LARGEST_CHUNK_BYTES = 2**28
-_BOMB_RATIO = 2000  # decoded over stored
-_BOMB_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
+_MOST_DECODED_RATIO = 2000  # decoded over stored
+_HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
 _GROWTH = 2  # of a chunk that a codec cannot compress, at most; and room for its header
 _HEADER_BYTES = 65_536
 _NOTHING = 2**64 - 1  # in the index of a shard, of a chunk that was not written
@@ -122,7 +122,7 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
             f"{name}: is stored in chunks of {chunk}, too large to be decoded one at a time; save "
             "it with smaller chunks"
         )
-    if size > max(_BOMB_BYTES, _BOMB_RATIO * held):
+    if size > max(_HARMLESS_BYTES, _MOST_DECODED_RATIO * held):
         raise DataError(
             f"{name}: would grow from {held} to {size} bytes, which no recording does; the file is "
             "damaged, export it again"
@@ -143,9 +143,10 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
 
 
 def _lacks_chunks(array: Any, path: Path, place: tuple[int, ...], shape: tuple[int, ...]) -> bool:
-    """Tell whether a shard was written without some of its chunks, which zarr gives as zeros.
+    """Tell whether a shard lacks some of its chunks, which zarr would read as zeros.
 
-    Its index names place and length of each, in two integers of 64 bits, before a checksum of 4.
+    Its index has place and length of each chunk as two integers of 64 bits, before a checksum of 4
+    bytes.
     """
     codec = array.metadata.codecs[0]
     names = [type(each).__name__ for each in codec.index_codecs]

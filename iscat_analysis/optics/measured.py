@@ -30,10 +30,10 @@ from iscat_analysis.reading import LARGEST_TEMPLATE_BYTES, npz_of, read_bytes
 
 FloatArray = NDArray[np.float64]
 
-_KEPT = 4  # lattices at hand, one for each number of orders
+_MOST_LATTICES = 4  # lattices at hand, one for each number of orders
 _SLOW = 1e-3  # a rate [rad/nm] for tables along z, where nothing changes
 _STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
-_LARGEST = 1e9  # of its numbers
+_LARGEST_NUMBER = 1e9  # of its numbers
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 
@@ -85,7 +85,7 @@ def sha256_of(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-@lru_cache(_KEPT)
+@lru_cache(_MOST_LATTICES)
 def _parsed(name: str, content: bytes) -> Template:
     try:
         values: dict[str, Any] = dict(npz_of(content, _STORED, LARGEST_TEMPLATE_BYTES))
@@ -96,9 +96,9 @@ def _parsed(name: str, content: bytes) -> Template:
         numbers = [picture, error, *(values[key] for key in _STORED[2:])]
         if not (picture.ndim == 2 and picture.shape == error.shape == picture.shape[::-1]):
             raise ValueError("no picture")
-        if not all(bool((np.abs(number) <= _LARGEST).all()) for number in numbers):
+        if not all(bool((np.abs(number) <= _LARGEST_NUMBER).all()) for number in numbers):
             raise ValueError("no numbers")
-        if not min(values["step_nm"], values["pixel_nm"], values["roi_nm"]) > 1 / _LARGEST:
+        if not min(values["step_nm"], values["pixel_nm"], values["roi_nm"]) > 1 / _LARGEST_NUMBER:
             raise ValueError("no lengths")
         values["contrast"], values["sigma"] = picture.astype(float), error.astype(float)
     except (ValueError, TypeError, OverflowError):
@@ -153,7 +153,7 @@ class MeasuredField:
             out[0] = self._coefficients()
             return out
 
-        return memoize(_KEPT, with_orders)
+        return memoize(_MOST_LATTICES, with_orders)
 
     def _coefficients(self) -> FloatArray:
         """Sample Re e on the lattice of the reach, and undo the smoothing of its window."""

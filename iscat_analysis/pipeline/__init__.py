@@ -1,12 +1,12 @@
 """The main job: load → calibrate → background → detect → fit → posterior → bounds → report.
 
-`analyse` is that line.  `prepare` loads and calibrates; one of `FIND` measures the background,
-searches, fits, samples and bounds; `gather` makes the rows, and describes tracks and species.
-Which of `FIND` is asked follows from ``background.method`` alone (`ways`).
+`analyse` does it in this order.  `prepare` loads and calibrates.  One of `FINDERS`, chosen by
+``background.method`` alone (`background_mode`), measures the background, searches, fits, samples
+posteriors and computes bounds.  `make_analysis` makes the table, and describes tracks and species.
 
-An event is a candidate, then `Fitted` while its neighbours are being found, then an `Event` with
-the verdict on it.  Its row is made when all events are there, with its number and with the errors
-that are known only then (`rows`).
+An event is first a candidate, then `Fitted` while its neighbours are still being found, then an
+`Event` with its verdict.  Its row is made when all events are known, because its number and some
+of its errors depend on all of them (`rows`).
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from iscat_analysis.fitting.checkpoint import (
 )
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.run import Notify, Run, unheard
+from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.landing.find import find_landings
-from iscat_analysis.movie import Stack, beside, open_stack
-from iscat_analysis.pipeline.bound import find_bound
-from iscat_analysis.pipeline.finish import gather
+from iscat_analysis.movie import Stack, open_stack, path_beside
+from iscat_analysis.pipeline.before_after import find_before_after
+from iscat_analysis.pipeline.finish import make_analysis
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.records import Analysis, Progress, silent
@@ -41,8 +41,8 @@ from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import check_output, claim_output
 from iscat_analysis.tracking.find import find_moving
 
-FIND: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
-    "fixed": find_bound,
+FINDERS: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
+    "fixed": find_before_after,
     "sliding": find_landings,
     "tracks": find_moving,
 }
@@ -59,10 +59,10 @@ def fit_stack(
     out: Path | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
-    notify: Notify = unheard,
+    notify: Notify = notify_nobody,
     command: str = "",
     inject: int = 0,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> Analysis:
     """Analyse a movie and write the report.
 
@@ -85,7 +85,7 @@ def fit_stack(
     inject : int
         Known particles to add to a landing movie in a second run, which tells how many are found
         and how well they are measured; ``summary["injection"]``.
-    place : Place, optional
+    executor : Executor, optional
         Where the chunks of a landing movie are analysed; default in this process.
 
     Returns
@@ -107,10 +107,10 @@ def fit_stack(
     if not isinstance(config, Config):
         raise ConfigError(f"`config`: is {type(config).__name__}; give what `configure` returns")
     inject = int(number_in("`inject`", inject, least=0, whole=True))
-    folder = beside(stack, ".iscat") if out is None else out
+    folder = path_beside(stack, ".iscat") if out is None else out
     overwrite = overwrite or is_resumable(folder)
-    way = background_mode(config)
-    figures = FEW_FIGURES if way == "sliding" else EVENT_FIGURES
+    mode = background_mode(config)
+    figures = FEW_FIGURES if mode == "sliding" else EVENT_FIGURES
     check_output(folder, overwrite)
     partial = partial_folder(folder.resolve())
     with claim_output(folder, overwrite):
@@ -124,10 +124,12 @@ def fit_stack(
                 command=command,
                 partial=partial,
                 inject=inject,
-                place=place,
+                executor=executor,
             )
-        with parts_kept(None if way == "fixed" else partial):
-            write_report(analysis, folder, overwrite=overwrite, event_figures=figures, place=place)
+        with parts_kept(None if mode == "fixed" else partial):
+            write_report(
+                analysis, folder, overwrite=overwrite, event_figures=figures, executor=executor
+            )
         if not analysis.summary["interrupted"]:
             remove_parts(partial)
     if analysis.summary["interrupted"]:
@@ -143,26 +145,27 @@ def analyse(
     config: Config,
     *,
     progress: Progress = silent,
-    notify: Notify = unheard,
+    notify: Notify = notify_nobody,
     command: str = "",
     partial: Path | None = None,
     inject: int = 0,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> Analysis:
     """Analyse an open movie."""
-    if place is not None and place.distant and not movie.identity:
+    if executor is not None and executor.distant and not movie.identity:
         raise ConfigError(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
             "numpy.save, and give its path; or leave `scheduler` out"
         )
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
-        run = Run(notify, progress, partial, place or LocalExecutor(), inject)
+        run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
-        found = FIND[ready.way](ready, run)  # background, detect, fit, posterior, bounds
-        with parts_kept(None if ready.way == "fixed" else partial):
+        # background, detect, fit, posterior, bounds
+        found = FINDERS[ready.background_mode](ready, run)
+        with parts_kept(None if ready.background_mode == "fixed" else partial):
             extra, stopped = injected(ready, run, found)
             stopped = stopped or found.interrupted
-            return gather(
+            return make_analysis(
                 ready, run, found, extra, command=command, started=started, interrupted=stopped
             )

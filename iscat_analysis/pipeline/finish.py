@@ -1,4 +1,4 @@
-"""From what was found to what is reported: errors, tracks, summary; the same for all movies."""
+"""From the results to the report: errors, tracks and summary, in the same way for all movies."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
 
 
-def gather(
+def make_analysis(
     ready: Prepared,
     run: Run,
     found: DetectionResult,
@@ -55,7 +55,7 @@ def gather(
     started: str,
     interrupted: bool,
 ) -> Analysis:
-    """Gather everything that is reported of a movie."""
+    """Put everything that is reported of a movie into an `Analysis`."""
     progress = run.progress
     if interrupted:  # what was finished is now gathered and kept, which takes a moment
         progress("report", 0, 1)
@@ -78,22 +78,22 @@ def gather(
     for flag in ready.flags:
         table = flagged(table, flag)
     scale = context.model.scale
-    if rows.course:
-        run.warn(rows.course)
-    for name, beside in (
+    if rows.changing_light:
+        run.warn(rows.changing_light)
+    for name, finding in (
         ("heights", rows.heights), ("extension", rows.extension),
         ("fluctuation", rows.fluctuation),
     ):  # fmt: skip
-        if beside is not None:
-            further[name] = beside.summary
-            if beside.message:
-                run.warn(beside.message)
+        if finding is not None:
+            further[name] = finding.summary
+            if finding.message:
+                run.warn(finding.message)
     for doubt in (
         scale_warning(scale),
         line_warning(config, table),
         nonlinearity_warning(scale, table),
         sign_warning(config, table),
-        landing_rate_warning(table) if ready.way == "sliding" else "",
+        landing_rate_warning(table) if ready.background_mode == "sliding" else "",
     ):
         if doubt:
             run.warn(doubt)
@@ -102,7 +102,8 @@ def gather(
         had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
         verdict = spread_verdict(
             {name: one for name, one in achieved.items() if name not in had}, found.summary,
-            scaled=scaled, rejected=bool(rejection(table)), sliding=ready.way == "sliding",
+            scaled=scaled, rejected=bool(rejection(table)),
+            sliding=ready.background_mode == "sliding",
         )  # fmt: skip
         further["repeats"] = verdict
         if verdict["message"]:
@@ -116,16 +117,16 @@ def gather(
     films: tuple[Film, ...] = ()
     if found.followed is not None:
         followed = found.followed
-        tracks, said = tracks_of(
+        tracks, track_summary = tracks_of(
             context, table, followed.windows,
             masses=followed.masses, ticks=ticks, warn=run.warn, progress=progress,
         )  # fmt: skip
-        further |= said
+        further |= track_summary
         for text in warnings_of(table, config.camera.frame_rate_hz, ticks):
             run.warn(text)
-        flat = fixed_height_warning(config, table)
-        if flat:
-            run.warn(flat)
+        height_warning = fixed_height_warning(config, table)
+        if height_warning:
+            run.warn(height_warning)
         backgrounds = followed.parts or (followed.windows,)
         films = make_films(context, ready.steady, ready.camera, backgrounds, table, tracks)
         run.clock.lap("tracks")
@@ -155,7 +156,7 @@ def gather(
         "interrupted": interrupted,
         "warnings": run.warnings,
     }
-    frames, first = _each_once(compared)
+    frames, first = _unique_frames(compared)
     analysis = Analysis(
         config_toml=config_to_toml(as_given(config)),
         mode=context.mode,
@@ -184,10 +185,10 @@ def gather(
     return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 
 
-def _each_once(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
-    """Give the frames of both ranges in their order, and where the light of each stands.
+def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Sort the frames of both ranges, each once, and give the index of each in the power.
 
-    Where particles move, both ranges are the whole movie, and each frame stands there twice.
+    Where particles move, both ranges are the whole movie, so that every frame is in it twice.
     """
     ranges = compared.frames_before, compared.frames_after
     both = np.concatenate([np.arange(*span, dtype=np.int64) for span in ranges])

@@ -28,14 +28,14 @@ from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.run import Run, unheard
+from iscat_analysis.fitting.run import Run, notify_nobody
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
-STAY = 3
+FEWEST_WINDOWS_PRESENT = 3
 """Windows between landing and leaving."""
 
 _SAME_PX = 2.0
@@ -107,7 +107,7 @@ class InjectedMovie:
         return counts
 
     def _mover(self, particle: Injected) -> Callable[[int], FloatArray]:
-        """Give what makes a particle's contrast in a frame."""
+        """Make the function that gives the contrast of a particle in a frame."""
         way = self._trajectory
         if way is None:
             return lambda _: particle.contrast
@@ -138,7 +138,7 @@ def _with_particle(
 
 
 def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[str, Any], bool]:
-    """Tell how many known particles are found, and how well they are measured."""
+    """Summarise how many injected particles are found, and how well they are measured."""
     if not run.inject or found.interrupted:
         return {}, False
     try:
@@ -148,7 +148,7 @@ def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[st
             config = config.model_copy(update={"fit": fit})
         recovered = inject_and_recover(
             ready.movie, config, ready.camera, found, run.inject,
-            progress=run.progress, place=run.place,
+            progress=run.progress, executor=run.executor,
         )  # fmt: skip
     except KeyboardInterrupt:
         return {}, True
@@ -165,7 +165,7 @@ def inject_and_recover(
     count: int,
     *,
     progress: Progress,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> dict[str, Any]:
     """Add known particles to a movie, analyse it again and compare."""
     frames = fitted_frames(movie, config)
@@ -179,10 +179,10 @@ def inject_and_recover(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
-        warn=unheard,  # the user has been told already
+        warn=notify_nobody,  # the user has been told already
         progress=progress,
         lines=result.context.lines,
-        place=place,
+        executor=executor,
     )
     if again.interrupted:
         raise KeyboardInterrupt
@@ -208,13 +208,13 @@ def draw_particles(
     table: pd.DataFrame,
     seed: int,
 ) -> list[Injected]:
-    """Choose what to add: anywhere, at any time, of masses as they were found."""
+    """Draw random places, times and masses, the masses from those that were found."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2**31,)))
     good = table["mass_kda"][table["status"] == Status.OK].abs().to_numpy(dtype=float)
     if not good.size:
         good = np.array([context.model.material.mass_kda])
     margin = min(context.roi_px / 2, (min(field_px) - 1) / 2)
-    stay = STAY * window
+    stay = FEWEST_WINDOWS_PRESENT * window
     first = frames[0] + window
     last = max(frames[1] - window - stay, first + 1)
     landings = np.sort(rng.integers(first, last, count))

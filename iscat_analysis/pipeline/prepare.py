@@ -15,7 +15,7 @@ from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.camera.processed import find_processing
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.camera_numbers import law_said
+from iscat_analysis.diagnosis.camera_numbers import law_messages
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
@@ -28,7 +28,7 @@ from iscat_analysis.diagnosis.recognise import (
     look_at_changes,
 )
 from iscat_analysis.diagnosis.repeated_frames import without_repeats
-from iscat_analysis.diagnosis.stage import followed, motion_said
+from iscat_analysis.diagnosis.stage import motion_message, with_drift_correction
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
 from iscat_analysis.diagnosis.turns import refuse_channels
 from iscat_analysis.errors import ConfigError, DataError
@@ -40,10 +40,10 @@ from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
-from iscat_analysis.threads import beside, one_thread_algebra
+from iscat_analysis.threads import one_thread_algebra, start_in_thread
 from iscat_analysis.tracking.tracks import judge_times
 
-_OPENING = 64  # frames that are looked at before anything else
+_FIRST_FRAMES = 64  # frames that are looked at before anything else
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
@@ -54,7 +54,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         run.warn(note)
-    way = background_mode(config)
+    mode = background_mode(config)
     run.notify(describe_background_mode(config))
     span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
@@ -67,7 +67,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             "bound, because a picture does not say what light made it"
         )
     stretches = Stretches((span,))
-    if way == "sliding" and config.optics.scheme != "darkfield":
+    if mode == "sliding" and config.optics.scheme != "darkfield":
         stretches = find_stretches(movie, span)
     asked = config.fit.frames
     if stretches.breaks:  # all that is learned of the movie is learned within one of its parts
@@ -78,10 +78,11 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     stored, auto = movie, config.camera.assumed is not config.camera
     stated = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
-    refuse_channels(movie.read(start, min(stop, start + _OPENING)), stated, movie.name)
+    begun = movie.read(start, max(start, min(stop, start + _FIRST_FRAMES, movie.shape[0])))
+    refuse_channels(begun, stated, movie.name)
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
-    for text in (*known.messages, *law_said(known)):
+    for text in (*known.messages, *law_messages(known)):
         run.warn(f"{movie.name}: {text}")
     if known.text is not None:
         stored = without_text(stored, known.text, camera)
@@ -89,9 +90,9 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     if known.padding:
         run.notify(f"{movie.name}: {known.padding}")
     if auto:
-        run.notify(f"{movie.name}: {known.said}")
+        run.notify(f"{movie.name}: {known.description}")
     whole, kept = movie, None
-    if way == "fixed" and not tracked and config.optics.scheme != "darkfield":
+    if mode == "fixed" and not tracked and config.optics.scheme != "darkfield":
         kept = without_repeats(movie, config, camera)
         movie, config = kept.movie, kept.config
         if kept.message:
@@ -101,9 +102,9 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
-    stop = min(stop, start + _OPENING, movie.shape[0])
+    stop = min(stop, start + _FIRST_FRAMES, movie.shape[0])
     seen = movie.read(start, max(start, stop))
-    if way != "sliding":  # windows that slide pass over frames that repeat
+    if mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
     refuse_overflow(stored.read(start, max(start, stop)), movie.name)
     swapped = axes_warning(movie.name, seen)
@@ -112,20 +113,20 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     summary: dict[str, Any] = {"camera": known.summary}
     if processing is not None:
         summary["processing"] = processing.summary
-    looking: Future[Changes] | None = None
-    opened: NoiseSurvey | None = None
+    changes_future: Future[Changes] | None = None
+    noise_survey: NoiseSurvey | None = None
 
     with one_thread_algebra():  # in all threads until the light is judged
-        if way == "sliding":
-            judged, opened, motion = _landing_light(movie, config, camera, span)
+        if mode == "sliding":
+            judged, noise_survey, motion = _landing_light(movie, config, camera, span)
             if config.background.drift_correction == "auto":
-                config = followed(config, moves=bool(motion))
+                config = with_drift_correction(config, moves=bool(motion))
             if motion:
                 run.notify(f"{movie.name}: {motion}; its motion is followed and divided out")
-                judged, opened, _ = _landing_light(movie, config, camera, span)
+                judged, noise_survey, _ = _landing_light(movie, config, camera, span)
         else:
             if tracked:  # in the light as it is; again if anything of it is unsteady
-                looking = beside(look_at_changes, movie, config, camera, span)
+                changes_future = start_in_thread(look_at_changes, movie, config, camera, span)
             judged = judge_light(movie, config, camera)
     for text in judged.messages:
         run.warn(f"{movie.name}: {text}")
@@ -133,34 +134,34 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     movie, lines, steady = judged.movie, judged.lines, judged.steady
     if lines is not None:
         summary["lines"] = lines.summary
-    if way == "sliding" or (tracked and unsteady):
-        looking = beside(look_at_changes, steady, config, camera, span)
+    if mode == "sliding" or (tracked and unsteady):
+        changes_future = start_in_thread(look_at_changes, steady, config, camera, span)
     digest = movie.hashed()
     configured = config
     wrong = wrong_sign(config)
     if wrong is not None:
         config, learned = learn_sign(
-            steady, wrong, camera, warn=run.warn, notify=run.notify, opening=opened
+            steady, wrong, camera, warn=run.warn, notify=run.notify, opening=noise_survey
         )
         config = _with_standards(config, run)
     else:
         config, learned = learn_optics(
             steady, _with_standards(config, run), camera,
-            warn=run.warn, notify=run.notify, opening=opened,
+            warn=run.warn, notify=run.notify, opening=noise_survey,
         )  # fmt: skip
     if learned:
         summary["optics"] = learned
     run.clock.lap("optics")
     other_kind = ""
-    if looking is not None:
-        changes = looking.result()
+    if changes_future is not None:
+        changes = changes_future.result()
         if config.optics.na != configured.optics.na:
             changes = look_at_changes(steady, config, camera, span)
         summary["changes"] = changes_summary(changes)
         other_kind = (as_landing if tracked else as_moving)(changes, movie.name)
         if other_kind:
             run.warn(other_kind)
-    if way != "sliding":
+    if mode != "sliding":
         _refuse_what_only_slides(run, movie.name)
     if stretches.breaks:
         config = _within(config, asked)
@@ -168,8 +169,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         "texts": [] if known.text is None else text_summary(known.text)
     }
     return Prepared(
-        whole, movie, steady, config, camera, way, lines, opened, other_kind, digest, summary,
-        stretches, known.response, processing, kept,
+        whole, movie, steady, config, camera, mode, lines, noise_survey, other_kind, digest,
+        summary, stretches, known.response, processing, kept,
     )  # fmt: skip
 
 
@@ -180,7 +181,7 @@ def _within(config: Config, frames: tuple[int, int] | None) -> Config:
 
 
 def _with_standards(config: Config, run: Run) -> Config:
-    """Say once that a gradient came without the optics of its standards, and where it is taken."""
+    """Say where the gradient is taken whose standards have no recorded optics."""
     found = with_standards(config)
     if found is not config:
         optics = found.optics
@@ -196,36 +197,37 @@ def _with_standards(config: Config, run: Run) -> Config:
 def _landing_light(
     movie: Stack, config: Config, camera: Camera, span: tuple[int, int]
 ) -> tuple[JudgedLight, NoiseSurvey, str]:
-    """Judge the light of a landing movie and, in steady light, noise and motion of some frames.
+    """Judge the light of a landing movie, and its noise and motion once the light is steady.
 
-    Motion is looked for where that is left open, and told in words.  The first chunk, which is
-    wanted next, is summed while the light is still being judged.
+    The message about motion is empty where drift correction was configured or nothing moves.  The
+    first chunk, which is needed next, is summed while the light is still being judged.
     """
 
-    def opening_of(seen: Stack) -> tuple[NoiseSurvey, str]:
-        opened = survey_noise(reader_of(seen, config, camera, span), config)
+    def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
+        noise_survey = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
-        motion = motion_said(seen, opened) if left_open else ""
+        motion = motion_message(seen, noise_survey) if left_open else ""
         if not motion:
-            sum_first_chunk(opened.reader, config, opened.window)
-        return opened, motion
+            sum_first_chunk(noise_survey.reader, config, noise_survey.window)
+        return noise_survey, motion
 
-    opening = beside(opening_of, movie)  # in the light as it is; again if anything is unsteady
+    # in the light as it is; again if anything is unsteady
+    survey = start_in_thread(survey_light, movie)
     judged = judge_light(movie, config, camera)
     if judged.steady is not movie:
-        opening = beside(opening_of, judged.steady)
-    return judged, *opening.result()
+        survey = start_in_thread(survey_light, judged.steady)
+    return judged, *survey.result()
 
 
 def _refuse_still(counts: NDArray[Any], name: str) -> None:
-    """Refuse frames that are all the same: they have no noise, by which everything is judged."""
+    """Refuse identical frames: without noise no error can be estimated."""
     if len(counts) > 1 and all(np.array_equal(frame, counts[0]) for frame in counts[1:]):
         raise DataError(f"{name} are all the same; export the movie again")
 
 
 def _refuse_what_only_slides(run: Run, name: str) -> None:
-    """Say that workers are left idle, and refuse to inject particles."""
-    if run.place.distant:
+    """Refuse to inject particles, and say that workers are idle, where windows do not slide."""
+    if run.executor.distant:
         run.notify(f"{name}: is analysed in this process: only landing movies have chunks")
     if run.inject:
         raise ConfigError(

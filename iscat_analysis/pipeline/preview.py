@@ -20,17 +20,17 @@ from iscat_analysis.fitting.background_mode import BackgroundMode, background_mo
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
-from iscat_analysis.pipeline.looks import (
-    BoundSearch,
+from iscat_analysis.pipeline.preview_searches import (
+    BeforeAfterSearch,
     LandingSearch,
     Look,
     MovingSearch,
     Search,
-    positive,
+    positive_threshold,
 )
 
 _SEARCHES: Mapping[BackgroundMode, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
-    "fixed": BoundSearch,
+    "fixed": BeforeAfterSearch,
     "sliding": LandingSearch,
     "tracks": MovingSearch,
 }
@@ -148,7 +148,7 @@ class Preview:
         """
         templates = self._search.context(self._checked(window)).templates
         above = templates.excursions.above
-        share = above(positive(threshold)) / above(templates.threshold)
+        share = above(positive_threshold(threshold)) / above(templates.threshold)
         return self.config.detection.false_alarms_per_movie * share
 
     def look(self, frame: int, window: int | None = None) -> Look:

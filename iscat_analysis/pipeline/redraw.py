@@ -1,8 +1,8 @@
-"""Images of events that were fitted before: the frames of the fit, summed and fitted again.
+"""Images of events of a stored result, made again from the movie.
 
-A result keeps numbers.  With its movie, the counts that a fit saw are summed again, the other
-events of the table are in their places, and the fit, begun where it ended, gives the images that
-the report has.
+A result keeps numbers only.  With its movie, the counts of an event are summed again, the other
+events of the table are put in their places, and a fit that starts at the stored estimate gives the
+images of the report.
 """
 
 from __future__ import annotations
@@ -47,16 +47,16 @@ from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Loca
 from iscat_analysis.tracking.moving import blurred_rows
 from iscat_analysis.tracking.moving_field import (
     exposure_of,
-    give_back,
+    initial_background,
     load_field,
-    opening_ground,
-    track_scene,
+    restore_particle_light,
+    tracking_context,
 )
 
 Redraw = Callable[[int], EventView]
 """Row of the table → its images."""
 
-_TURNS = 3  # of level and power of a background under particles that are known
+_BACKGROUND_TURNS = 3  # of level and power of a background under particles that are known
 
 
 def redraw(
@@ -66,7 +66,7 @@ def redraw(
     tracks: pd.DataFrame | None,
     summary: Mapping[str, Any],
 ) -> Redraw:
-    """Prepare to draw the rows of a result."""
+    """Make the function that draws the rows of a result."""
     movie = movie.channel(config.camera.channels)
     text = find_text(movie, config.background.recorded or fitted_frames(movie, config))
     movie = linear(movie, config.camera)
@@ -86,7 +86,7 @@ def redraw(
     if way == "tracks":
         blocks = int(summary["blocks"]["number"])
         return _moving(seen, config, camera, lines, table, tracks, blocks)
-    return _bound(seen, config, camera, lines, table)
+    return _before_after(seen, config, camera, lines, table)
 
 
 def _landings(
@@ -98,7 +98,7 @@ def _landings(
     window: int,
     stretches: Sequence[Sequence[int]],
 ) -> Redraw:
-    """Draw what landed or left: windows before and after, in a chunk of their own."""
+    """Draw rows of a landing movie: the windows before and after each step."""
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     reader = reader_of(frames, config, camera, (first, last))
@@ -136,7 +136,7 @@ def _landings(
 
 
 def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
-    """Make a step of a row of the table."""
+    """Make a `Step` of a row of the table."""
     frames = row["n_before"] * row["n_after"] / (row["n_before"] + row["n_after"])
     at = StepFrame(
         frame=int(row["frame"]), half_width=int(row["frame_ci95"]), height=1.0,
@@ -149,10 +149,10 @@ def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
     return neighbours.draw(-1 if mass < 0 else 1, at, start)
 
 
-def _bound(
+def _before_after(
     movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
 ) -> Redraw:
-    """Draw what is there after the background, or in mode ``track`` in a frame after it."""
+    """Draw rows over a recorded background; in mode ``track`` each in its frame."""
     before, after = frame_ranges(movie, config)
     tracked = config.fit.mode == "track"
     shape = (movie.shape[1], movie.shape[2])
@@ -211,10 +211,10 @@ def _moving(
     tracks: pd.DataFrame | None,
     blocks: int,
 ) -> Redraw:
-    """Draw particles in single frames, over the background of their block under all of them."""
+    """Draw particles in single frames, over the background of their block."""
     first, last = fitted_frames(movie, config)
     shape = movie.shape[1], movie.shape[2]
-    context = track_scene(config, shape, max(last - first, 1), lines)
+    context = tracking_context(config, shape, max(last - first, 1), lines)
     edges = [first + (last - first) * k // blocks for k in range(blocks + 1)]
     known = table["mass_kda"].notna() & table["track"].notna()
     _, exposure_s = exposure_of(config)
@@ -245,9 +245,9 @@ def _moving(
             field = load_field(context, movie, camera, (start, stop), check, pool, silent)
             field.set_blurs(variances)
             follows = config.background.power_normalization
-            ground = opening_ground(config, field)
-            give_back(context, field, movie, camera, start, ground, rows)
-            for _ in range(_TURNS):
+            ground = initial_background(config, field)
+            restore_particle_light(context, field, movie, camera, start, ground, rows)
+            for _ in range(_BACKGROUND_TURNS):
                 found = field.fit(ground, rows, sweeps=0)[1]
                 level = found.level if config.background.method == "tracks" else ground.level
                 ground = BackgroundEstimate(level, found.power if follows else ground.power)

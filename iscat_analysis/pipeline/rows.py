@@ -1,9 +1,8 @@
-"""The rows of ``fits.csv``: fits get their errors from all that is known of them together, at once.
+"""The rows of ``fits.csv``, made when all events are known.
 
-A fit knows the error of its own likelihood.  What calibrations may be wrong by, what its frames
-show elsewhere, and how the spread of all fits compares with the bound is known when all are there;
-only then a row is made, and with ``fit.sigma = "measured"`` its σ is the measured one from the
-beginning.
+A fit knows the error of its own likelihood.  Calibration errors, the spread of an event's own
+frames and the ratio of the measured spread to the bound follow from all events together.  With
+``fit.sigma = "measured"`` the σ in a row is already the measured one.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, flagged, make_rows
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import budget_of
-from iscat_analysis.trust.course import at_a_shared_place, may_rise, rise_said
+from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
@@ -31,7 +30,7 @@ from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 @dataclass(frozen=True)
 class ReportedRows:
-    """The rows of all events of a movie, and what they say together."""
+    """The rows of all events of a movie, and what all events together say."""
 
     table: pd.DataFrame
     achieved: Mapping[str, EmpiricalSpread]
@@ -39,29 +38,29 @@ class ReportedRows:
     heights: Heights | None = None
     extension: Extension | None = None
     fluctuation: Fluctuation | None = None
-    course: str = ""
+    changing_light: str = ""
 
 
 def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
     """Make the rows of all events of a movie."""
     fits, config, mode = found.fits, found.context.config, found.context.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
-    told, heights, extension = None, None, None
+    evidence, heights, extension = None, None, None
     if found.evidence is not None and len(found.evidence):
-        told = Evidence(*found.evidence.T)
-        heights = Heights.of(config, fits, told, learned_optics=learned_optics)
+        evidence = Evidence(*found.evidence.T)
+        heights = Heights.of(config, fits, evidence, learned_optics=learned_optics)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(fits, told, achieved, config.particle.wiggle_nm)
+            extension = Extension.of(fits, evidence, achieved, config.particle.wiggle_nm)
     shifts = {
-        name: beside.mass_shift_kda
-        for name, beside in (("heights", heights), ("extension", extension))
-        if beside is not None
+        name: finding.mass_shift_kda
+        for name, finding in (("heights", heights), ("extension", extension))
+        if finding is not None
     }
     if extension is not None:
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
-    course = ""
+    changing_light = ""
     if found.heading == "landing":
-        fits, course = _with_courses(fits, told)
+        fits, changing_light = _with_changing(fits, evidence)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -84,15 +83,15 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
         table, shared, achieved,
         calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
-    return ReportedRows(table, achieved, budget, heights, extension, fluctuation, course)
+    return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_courses(fits: pd.DataFrame, told: Evidence | None) -> tuple[pd.DataFrame, str]:
-    """Flag steps whose light may go on changing, and say what there is of that."""
+def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
+    """Flag steps whose light may still be changing, and describe that in a message."""
     fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
-    if told is None:
+    if evidence is None:
         return fits, ""
-    unseen, frames = may_rise(fits, told)
-    rising = int(np.nan_to_num(told.rise_frames).astype(bool).sum())
-    text = rise_said(frames, int(unseen.sum()), rising, len(fits))
+    unseen, frames = may_rise(fits, evidence)
+    rising = int(np.nan_to_num(evidence.rise_frames).astype(bool).sum())
+    text = rise_message(frames, int(unseen.sum()), rising, len(fits))
     return flagged(fits, Status.CHANGING, unseen), text

@@ -35,14 +35,14 @@ ANSWER, DEFAULT, MEASURED = "your answer", "default", "measured here"
 SAMPLES = ("protein", "gold", "silica", "polystyrene")
 """Kinds of samples: what the particles are made of."""
 
-_LOOKS = 5  # places in a movie at which the search looks
-_LIT = 16  # frames whose light is averaged
-_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
+_PREVIEW_PLACES = 5  # places in a movie at which the search looks
+_LIGHT_FRAMES = 16  # frames whose light is averaged
+_SIGMA_PER_MAD = 1.4826  # of normal numbers: standard deviation over median absolute deviation
 
 
 @dataclass(frozen=True)
 class Question:
-    """What nobody but the user may know, and what is taken otherwise; None: it must be known."""
+    """A key that only the user may know, and its default; None where there is none."""
 
     key: str
     words: str
@@ -50,12 +50,12 @@ class Question:
     choices: tuple[str, ...] = ()
 
 
-_NOBODY = Config()  # what is taken where nobody says anything
+_DEFAULTS = Config()  # what is taken where nobody says anything
 _QUESTIONS = (
     Question("camera.pixel_size_nm", "size of a pixel in the sample plane [nm]", None),
-    Question("optics.wavelength_nm", "wavelength in vacuum [nm]", _NOBODY.optics.wavelength_nm),
-    Question("optics.na", "numerical aperture of the objective", _NOBODY.optics.na),
-    Question("particle.kind", "kind of sample", _NOBODY.particle.kind, SAMPLES),
+    Question("optics.wavelength_nm", "wavelength in vacuum [nm]", _DEFAULTS.optics.wavelength_nm),
+    Question("optics.na", "numerical aperture of the objective", _DEFAULTS.optics.na),
+    Question("particle.kind", "kind of sample", _DEFAULTS.particle.kind, SAMPLES),
 )
 _STANDING = ("optics.n_immersion", "optics.n_sample")  # shown, since they may have to be changed
 _EACH_MOVIE = ("camera.exposure_ms", "camera.frame_rate_hz")  # left to the metadata of each
@@ -65,9 +65,9 @@ _CAMERA = ("camera.gain_e_per_adu", "camera.offset_adu", "camera.read_noise_e")
 
 @dataclass(frozen=True)
 class Value:
-    """A key of the configuration, its value, and where that comes from.
+    """A key of the configuration, its value, and its origin.
 
-    What is not `written` is shown in the file as a comment, and every movie tells it anew.
+    Where it is not `written`, the file has it as a comment, because it is read from each movie.
     """
 
     key: str
@@ -78,7 +78,7 @@ class Value:
 
     @property
     def shown(self) -> str:
-        """The value in words, with its standard error where there is one."""
+        """The value as text, with its standard error where there is one."""
         if isinstance(self.value, str):
             return self.value
         return f"{self.value:.4g}" + (f" ± {self.se:.2g}" if self.se else "")
@@ -132,15 +132,15 @@ def write_setup(
     with open_stack(movie) as stack:
         frames, rows, columns = stack.shape
         warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
-        known = _known(stack.metadata, answers or {})
-        warn(_metadata_said(stack))
+        known = _known_values(stack.metadata, answers or {})
+        warn(_metadata_line(stack))
         values, config = _ask_the_rest(known, ask, warn)
         if config.camera.pixel_size_nm is None:
             raise DataError(
                 f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
                 "guess: give `pixel_size_nm`, in the sample plane"
             )
-        values += [Value(key, _get(_NOBODY, key), DEFAULT) for key in _STANDING]
+        values += [Value(key, _config_value(_DEFAULTS, key), DEFAULT) for key in _STANDING]
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
         values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.camera)]
@@ -150,31 +150,31 @@ def write_setup(
             values=tuple(values),
             config=preview.config,
             notes=preview.notes,
-            preview=_look_around(preview),
+            preview=_search_preview(preview),
             out=target,
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(target) as partial:
-        partial.write_text(_toml(found), encoding="utf-8")
+        partial.write_text(_toml_text(found), encoding="utf-8")
     return found
 
 
-def _known(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
-    """Collect what answers and metadata say of what would be asked; answers win."""
+def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
+    """Collect values from answers and metadata; answers win."""
     known = []
     for question in _QUESTIONS:
-        said = getattr(metadata, question.key.partition(".")[2], None)
+        value = getattr(metadata, question.key.partition(".")[2], None)
         if question.key in answers:
             known.append(Value(question.key, answers[question.key], ANSWER))
-        elif said is not None:
-            known.append(Value(question.key, said, _of_file(metadata)))
+        elif value is not None:
+            known.append(Value(question.key, value, _origin_in_file(metadata)))
     return known
 
 
 def _ask_the_rest(
     known: list[Value], ask: Callable[[Question], str] | None, warn: Callable[[str], None]
 ) -> tuple[list[Value], Config]:
-    """Put one question at a time, and once more where the answer cannot be."""
+    """Ask for each open key, again where an answer is invalid."""
     config = configure(None, settings={each.key: each.value for each in known})
     values = list(known)
     open_questions = [q for q in _QUESTIONS if q.key not in {each.key for each in known}]
@@ -191,14 +191,14 @@ def _ask_the_rest(
                 warn(str(error))
         if answer is None:
             continue
-        given = _get(config, question.key)
+        given = _config_value(config, question.key)
         values.append(Value(question.key, given, DEFAULT if given == question.default else ANSWER))
     config = configure(None, settings={each.key: each.value for each in values})
     return values, config
 
 
 def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Preview]:
-    """Take particles to move where the frames show it clearly, and to land otherwise."""
+    """Choose mode track where the frames clearly show moving particles, else keep the mode."""
     changes = look_at_changes(preview.steady, preview.config, preview.camera.camera, preview.frames)
     if not as_moving(changes, stack.name):
         return Value("fit.mode", config.fit.mode, DEFAULT), preview
@@ -207,17 +207,17 @@ def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Pre
 
 
 def _each_movie(metadata: StackMetadata) -> list[Value]:
-    """Show what the metadata of every movie say, and its configuration should not."""
-    said = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
+    """List values that each movie has in its own metadata, so that the file need not hold them."""
+    stated = {key: getattr(metadata, key.partition(".")[2]) for key in _EACH_MOVIE}
     return [
-        Value(key, value, _of_file(metadata), written=False)
-        for key, value in said.items()
+        Value(key, value, _origin_in_file(metadata), written=False)
+        for key, value in stated.items()
         if value is not None
     ]
 
 
 def _camera_values(camera: LearnedCamera) -> list[Value]:
-    """Give the camera's numbers, which every movie tells anew."""
+    """List the numbers of the camera, which are measured anew in each movie."""
     values = []
     for key in _CAMERA:
         number = camera.numbers[key.partition(".")[2]]
@@ -226,15 +226,15 @@ def _camera_values(camera: LearnedCamera) -> list[Value]:
     return values
 
 
-def _look_around(preview: Preview) -> dict[str, Any]:
-    """Search at places all over the movie that have no frame in common."""
+def _search_preview(preview: Preview) -> dict[str, Any]:
+    """Search some frames all over the movie."""
     (first, last), window = preview.frames, preview.window
     apart = 1 if preview.config.fit.mode == "track" else window
-    places = max(1, min(_LOOKS, (last - first) // (2 * apart)))
+    places = max(1, min(_PREVIEW_PLACES, (last - first) // (2 * apart)))
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
     found = [look.found() for look in looks]
-    lit = preview.steady.read(first, min(first + _LIT, last))
+    lit = preview.steady.read(first, min(first + _LIGHT_FRAMES, last))
     strongest = max((float(table["snr"].abs().max()) for table in found if len(table)), default=0.0)
     return {
         "frames": [look.frame for look in looks],
@@ -248,16 +248,18 @@ def _look_around(preview: Preview) -> dict[str, Any]:
 
 
 def _spread(image: np.ndarray[Any, Any]) -> float:
-    """Give the standard deviation of the pixels, which a few particles do not change.
+    """Give the standard deviation of the pixels, robust against a few particles.
 
     Shapes: `image` (y, x).
     """
     used = image[np.isfinite(image)]
-    return float(_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
+    return (
+        float(_SIGMA_PER_MAD * np.median(np.abs(used - np.median(used)))) if used.size else math.nan
+    )
 
 
-def _toml(setup: Setup) -> str:
-    """Write the file: each value with what it is and where it comes from."""
+def _toml_text(setup: Setup) -> str:
+    """Write the file: each value, its meaning and its origin."""
     lines = [
         f"# Configuration for {in_toml(setup.movie)}, written by `iscat init`; iscat-fit finds it",
         "# where it lies beside a movie.  Behind each value stands where it comes from.  A line",
@@ -278,8 +280,8 @@ def _toml(setup: Setup) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _metadata_said(stack: Stack) -> str:
-    """Give in one line what the file says of itself."""
+def _metadata_line(stack: Stack) -> str:
+    """Describe the metadata of the file in one line."""
     metadata = stack.metadata
     parts = [
         words.format(value)
@@ -301,17 +303,17 @@ def _metadata_said(stack: Stack) -> str:
     return f"{stack.name}: its {metadata.source} metadata say " + ", ".join(parts)
 
 
-def _of_file(metadata: StackMetadata) -> str:
+def _origin_in_file(metadata: StackMetadata) -> str:
     return f"the file's metadata ({metadata.source})"
 
 
-def _get(config: Config, key: str) -> Any:
+def _config_value(config: Config, key: str) -> Any:
     section, _, name = key.partition(".")
     return getattr(getattr(config, section), name)
 
 
-def preview_said(setup: Setup) -> list[str]:
-    """Say in a few lines what the search saw."""
+def preview_lines(setup: Setup) -> list[str]:
+    """Describe in a few lines what the search found."""
     seen = setup.preview
     total, places = sum(seen["candidates"]), len(seen["frames"])
     moving = setup.config.fit.mode == "track"

@@ -1,4 +1,4 @@
-"""A result in its folder, and what its events looked like in the movie."""
+"""A stored result, and the images of its events, made again from the movie."""
 
 from __future__ import annotations
 
@@ -129,13 +129,13 @@ class StoredResult:
         DataError
             It is at none of these places.
         """
-        said = Path(self.summary["input"]["path"])
+        recorded = Path(self.summary["input"]["path"])
         given = [] if self._movie is None else [self._movie]
-        for path in given or [said, self.folder.parent / said.name]:
+        for path in given or [recorded, self.folder.parent / recorded.name]:
             if split_address(path)[0].exists():
                 return path
         raise DataError(
-            f"{self.folder}: its movie is neither {given[0] if given else said} nor beside it; "
+            f"{self.folder}: its movie is neither {given[0] if given else recorded} nor beside it; "
             "give the place of the movie"
         )
 

@@ -57,7 +57,7 @@ def summary_of(
         "emission": context.model.optics.emission,
         "convention": context.model.optics.convention,
         "mass_scale": "calibration" if context.config.calibration else "absolute model",
-        **_carried(context),
+        **_scale_transfer(context),
         "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
         "frames_before": list(compared.frames_before),
@@ -78,8 +78,8 @@ def summary_of(
     }
 
 
-def _carried(context: AnalysisContext) -> dict[str, Any]:
-    """Say how far the scale was carried from the optics of its standards."""
+def _scale_transfer(context: AnalysisContext) -> dict[str, Any]:
+    """Describe how the mass scale was transferred from the optics of its standards."""
     scale = context.model.scale
     if scale.calibration is None:
         return {}
@@ -95,15 +95,15 @@ def _carried(context: AnalysisContext) -> dict[str, Any]:
 def species_of(
     context: AnalysisContext, table: pd.DataFrame, searched: float | None = None
 ) -> dict[str, Any]:
-    """Describe the species of all events, of which so large a share could be seen."""
+    """Describe the species of all events; `searched` is the share that was searched."""
     good = table[table["status"] == Status.OK]
     distribution = _distribution(context, good, searched or 1.0)
-    across = _across(context, table, distribution)
+    across = _species_width(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
 
 
 def _repeats(found: EmpiricalSpread) -> dict[str, Any]:
-    """Give what the summary says of a measured spread."""
+    """Summarise a measured spread."""
     return {
         "repeat_over_crb": found.over_crb,
         "repeat_over_crb_ci95": list(found.ci95),
@@ -152,10 +152,10 @@ def _distribution(
     return found.to_dict()
 
 
-def _across(
+def _species_width(
     context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """Say how much wider than σ each species is; of a rejected model, poor fits are judged too."""
+    """Compare the width of each species with σ; poor fits are included if the model is rejected."""
     if distribution is None:
         return []
     species, status = distribution["species"], table["status"]

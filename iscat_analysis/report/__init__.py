@@ -51,7 +51,7 @@ def write_report(
     *,
     overwrite: bool = False,
     event_figures: int = EVENT_FIGURES,
-    place: Executor | None = None,
+    executor: Executor | None = None,
 ) -> Path:
     """Write everything one analysis found into a folder.
 
@@ -61,12 +61,12 @@ def write_report(
     appears complete or not at all; an earlier result is replaced only once the new one is complete.
     """
     with atomic_folder(folder, overwrite) as building:
-        fill_report(analysis, building, event_figures=event_figures, place=place)
+        fill_report(analysis, building, event_figures=event_figures, executor=executor)
     return folder
 
 
 def fill_report(
-    analysis: Analysis, folder: Path, *, event_figures: int, place: Executor | None = None
+    analysis: Analysis, folder: Path, *, event_figures: int, executor: Executor | None = None
 ) -> None:
     """Write a report into a folder of its own."""
     pictures = folder / "figures"
@@ -75,6 +75,6 @@ def fill_report(
     write_posterior(analysis, folder / "posterior.nc")
     from iscat_analysis.report.drawing import draw  # Matplotlib takes long to load
 
-    nearby = LocalExecutor() if place is None or place.distant else place  # it writes here
+    nearby = LocalExecutor() if executor is None or executor.distant else executor  # it writes here
     page = draw(analysis, pictures, event_figures, nearby)
     (folder / "report.html").write_text(page, encoding="utf-8")

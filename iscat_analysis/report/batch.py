@@ -109,7 +109,7 @@ def _overview(
 ) -> dict[str, Any]:
     done = movies[movies["state"] == "done"]
     analysed = done[done["role"] != "flat"]
-    told = int((done["cautions"].fillna("") != "").sum())
+    cautioned = int((done["cautions"].fillna("") != "").sum())
     tables = []
     if failed:
         columns: list[Any] = ["not analysed", "why"]
@@ -127,7 +127,7 @@ def _overview(
             },
             {"label": "Samples", "value": str(analysed["sample"].nunique())},
             {"label": "Events", "value": str(int(analysed["events"].sum()))},
-            {"label": "With cautions", "value": str(told), "note": "see the quality"},
+            {"label": "With cautions", "value": str(cautioned), "note": "see the quality"},
         ],
         "tables": tables,
     }
@@ -290,13 +290,13 @@ def _equilibria(
     equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
     drawn: Mapping[str, Markup],
 ) -> dict[str, Any] | None:
-    """Say what K_D is, and whether the movies follow the equilibrium."""
+    """Tabulate K_D of every series, and whether the movies follow the equilibrium."""
     if not equilibria:
         return None
     section = _charts("equilibrium", "Equilibrium", drawn, ("kd",)) or {}
     charts = section["charts"]
     rows = []
-    for chart, (condition, found, remarks) in zip(charts, equilibria, strict=True):
+    for chart, (condition, found, notes) in zip(charts, equilibria, strict=True):
         chart["title"] = f"K_D, {condition}" if condition else "K_D"
         kd, low, high = (found[name] for name in ("kd_nm", "kd_low", "kd_high"))
         rows.append(
@@ -307,7 +307,7 @@ def _equilibria(
                 number(kd),
                 f"{number(low)} to {number(high) if math.isfinite(high) else '∞'}",
                 probability(found["p_value"]),
-                "; ".join(remarks) or "none",
+                "; ".join(notes) or "none",
             ]
         )
     columns = [
@@ -356,13 +356,13 @@ def _landing(movies: pd.DataFrame, drawn: Mapping[str, Markup]) -> dict[str, Any
 
 
 def _quality(movies: pd.DataFrame) -> dict[str, Any]:
-    """Say of every movie how far it can be trusted."""
+    """Tabulate the quality of every movie."""
     links = dict(_links(movies))
     further = list(movies.attrs.get("further", ()))
     rows = []
     for row in movies.to_dict("records"):
         failed = row["state"] != "done"
-        said = row["why"] if failed else row["cautions"]
+        text = row["why"] if failed else row["cautions"]
         rows.append(
             [
                 links[row["movie"]],
@@ -370,7 +370,7 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
                 unbroken(row["sample"]),
                 *(plain(row[name]) for name in further),
                 {"done": "done", "failed": "failed", "missing": "not yet"}[row["state"]],
-                said or "none",
+                text or "none",
                 whole(row["events"]),
                 share(row["ok"], row["events"]),
                 fixed(row["noise_over_shot"], 2),
@@ -408,11 +408,11 @@ def _quality(movies: pd.DataFrame) -> dict[str, Any]:
 
 
 def _links(movies: pd.DataFrame) -> list[tuple[str, Any]]:
-    """Give every movie's name, as a link to its report where there is one."""
+    """Make every movie's name a link to its report, where there is one."""
     pages = zip(movies["movie"], movies["report"], strict=True)
     return [(name, link(report, name)) for name, report in pages]
 
 
 def summary_line(movies: pd.DataFrame) -> str:
-    """Say in one line what there is."""
+    """Describe the batch in one line."""
     return f"{count(len(movies), 'movie')} of {count(movies['sample'].nunique(), 'sample')}"

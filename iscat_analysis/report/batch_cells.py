@@ -1,4 +1,4 @@
-"""What stands in the cells of a batch's tables."""
+"""Contents of the cells of a batch's tables."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _SHORT_NAME = 28  # characters
 
 
 def link(page: Any, name: str) -> str:
-    """Make a name a link, where there is a page."""
+    """Make a link of a name, if there is a page."""
     if not isinstance(page, str) or not page:
         return name
     return Markup('<a href="{}">{}</a>').format(quote(page), name)
@@ -23,7 +23,7 @@ def link(page: Any, name: str) -> str:
 def with_interval(
     value: float | None, low: float | None, high: float | None, *, unit: str = ""
 ) -> tuple[str, str]:
-    """Write a number, and its interval, with as many decimals as the interval supports."""
+    """Write a number and its interval, with as many decimals as the interval supports."""
     if value is None or not math.isfinite(value):
         return "—", "—"
     known = low is not None and high is not None and math.isfinite(low) and math.isfinite(high)
@@ -54,17 +54,17 @@ def share(part: float, whole: float) -> str:
 
 
 def unbroken(text: Any, longest: int = _SHORT_NAME) -> Any:
-    """Keep a short text in one line."""
+    """Keep a short text on one line."""
     if not isinstance(text, str) or len(text) > longest:
         return text
     return text.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def whole(value: float) -> Any:
-    """Give a number as a whole one."""
+    """Round a number to an integer."""
     return int(value) if value is not None and math.isfinite(value) else None
 
 
 def plain(value: Any) -> Any:
-    """Put a dash in place of what is empty."""
+    """Write a dash for an empty value."""
     return "—" if value is None or value != value or value == "" else value

@@ -77,7 +77,7 @@ def batch_figures(
 
 
 def _limit(curves: Sequence[Curve], species: pd.DataFrame) -> float:
-    """Find where the axis of the masses ends: beyond every species and almost all events."""
+    """Upper end of the mass axis: beyond every species and almost all events."""
     masses = np.concatenate([curve.masses_kda for curve in curves])
     heaviest = species["mass_kda"][~species["outlier"]].max() if len(species) else math.nan
     return 1.1 * float(np.fmax(np.quantile(masses, _QUANTILE), heaviest))
@@ -113,8 +113,8 @@ def _overlaid(curves: Sequence[Curve], limit: float, label: str) -> Figure:
         if panel.get_legend_handles_labels()[0]:
             panel.legend(fontsize=6, ncols=1 if len(samples) <= _SHORT else 2)
         elif len(samples) > _NAMED:
-            said = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
-            panel.set_title(said.strip(": "))
+            title = f"{in_figure(group)}: {len(samples)} samples, from dark to bright"
+            panel.set_title(title.strip(": "))
     panels[0].set(xlim=(0, limit))
     panels[0].set_ylim(0, _HEADROOM * panels[0].get_ylim()[1])
     _leave_out(panels, len(groups), columns)
@@ -124,7 +124,7 @@ def _overlaid(curves: Sequence[Curve], limit: float, label: str) -> Figure:
 
 
 def _leave_out(panels: Sequence[Axes], shown: int, columns: int) -> None:
-    """Hide the panels after the last, and number the axis of those that stand above them."""
+    """Hide unused panels, and label the axes of the panels above them."""
     for panel in panels[shown:]:
         panel.set_visible(False)
     for panel in panels[max(0, shown - columns) : shown]:
@@ -174,7 +174,7 @@ def _named(key: tuple[str, str], events: int, groups: int) -> str:
 
 
 def _places(table: pd.DataFrame, axes: Axes) -> FloatArray:
-    """Give every row the place of its sample along an axis that names the samples."""
+    """Position of the sample of every row on an axis with the names of samples."""
     samples = list(dict.fromkeys(table["sample"]))
     place = {sample: k for k, sample in enumerate(samples)}
     # Movies of one sample stand beside each other.

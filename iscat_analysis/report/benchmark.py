@@ -212,7 +212,7 @@ def _row(entry: Mapping[str, Any], at: Mapping[str, Any], name: str) -> list[Any
     return [
         f"{LABELS[name]} [{UNITS[name]}]",
         at[name],
-        _beside(e["bias"], e["bias_se"]),
+        _with_error(e["bias"], e["bias_se"]),
         _with(e["spread"], e["spread_ci95"]),
         _plain(e["crb"]),
         _plain(e["qcrb"]),
@@ -323,7 +323,7 @@ def _percent(value: float | None, interval: Sequence[float]) -> str:
     return f"{100 * value:.1f} % [{low}, {high}]"
 
 
-def _beside(value: float | None, error: float) -> str:
+def _with_error(value: float | None, error: float) -> str:
     if value is None or not math.isfinite(value):
         return "—"
     return f"{_plain(value, 2)} ± {_plain(error, 2)}"

@@ -1,4 +1,4 @@
-"""What the report page of one analysis is made of."""
+"""Contents of the report page of one analysis."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "Dark field"}
 
 
 def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
-    """Gather everything that ``report.html`` shows beside figures."""
+    """Collect everything that ``report.html`` shows except figures."""
     source = analysis.provenance.input_path
     tracked = analysis.tracks is not None  # then `tracks_context` says what is said of events
     images = {} if tracked else event_details(analysis, table)
@@ -113,7 +113,7 @@ def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
 
 
 def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
-    """Give the large numbers at the top: how many, how much, how well."""
+    """Make the large numbers at the top: counts and precision."""
     table = counted(table)
     flagged = int((table["status"] != Status.OK.value).sum())
     tiles = [
@@ -263,7 +263,7 @@ def _statuses(table: pd.DataFrame) -> list[list[str]]:
 
 
 def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say what windows, drift and added particles came to."""
+    """Describe windows, drift and injected particles in sentences."""
     landing, injection = summary.get("landing"), summary.get("injection")
     for name, lines in (("row", "rows"), ("column", "columns")):
         share = summary.get("lines", {}).get(f"{name}_share")
@@ -352,7 +352,7 @@ def measured_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _when(started: str) -> str:
-    """Write an ISO time as people do; other text stays as it is."""
+    """Format an ISO time; other text stays as it is."""
     try:
         moment = datetime.fromisoformat(started)
     except ValueError:

@@ -51,7 +51,7 @@ HALO = [withStroke(linewidth=1.6, foreground="black", alpha=0.7)]
 
 
 class EventDetail(NamedTuple):
-    """What the page shows of one event when its row is opened; empty where there is none."""
+    """What the page shows of one event when its row is opened; may be empty."""
 
     images: str
     scales: str
@@ -121,7 +121,7 @@ def _strip(view: EventView, low: float, high: float, limit: float) -> str:
 
 
 def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple[int, EventView]]:
-    """Pair each view with its row: by position where the numbers agree, else by number."""
+    """Assign views to rows: by position where the numbers agree, else by number."""
     numbers = table["event"].tolist()
     if [view.event for view in views] == numbers:
         return list(enumerate(views))
@@ -132,7 +132,7 @@ def views_of_rows(table: pd.DataFrame, views: Sequence[EventView]) -> list[tuple
 
 
 def credible_shades(counts: FloatArray) -> NDArray[np.int64]:
-    """Say of each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
+    """Tell for each cell of a histogram which of the `CREDIBLE_LEVELS` contain it."""
     flat = counts.ravel()
     order = np.argsort(-flat, kind="stable")
     before = np.cumsum(flat[order]) - flat[order]

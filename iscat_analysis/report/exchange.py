@@ -174,11 +174,11 @@ def export_result(
     path = folder.with_name(f"{folder.stem}.{layout}{SUFFIXES[layout]}") if out is None else out
     if not is_file(folder / "fits.csv"):
         raise DataError(f"{folder}: holds no fits.csv; give an output folder of iscat fit")
-    beside = path.with_suffix(".yaml")
-    for taken in [path, *([beside] if layout == "picasso" else [])]:
+    yaml_path = path.with_suffix(".yaml")
+    for taken in [path, *([yaml_path] if layout == "picasso" else [])]:
         if taken.exists() and not overwrite:
             raise DataError(f"{taken}: exists already; give another name, or pass `overwrite`")
-    if layout == "picasso" and path == beside:
+    if layout == "picasso" and path == yaml_path:
         raise DataError(f"{path}: is the name of Picasso's metadata; let `out` end in .hdf5")
     tracked = is_file(folder / "tracks.csv")
     if tracked and layout == "photomol":
@@ -192,7 +192,7 @@ def export_result(
         path.parent.mkdir(parents=True, exist_ok=True)
         if layout == "picasso":
             locs, info = to_picasso(fits, tracked=tracked), _metadata(folder, fits)
-            with whole_file(beside) as partial_yaml, whole_file(path) as partial:
+            with whole_file(yaml_path) as partial_yaml, whole_file(path) as partial:
                 _write_yaml(partial_yaml, info)
                 _write_locs(partial, locs, info)
         else:
@@ -242,7 +242,7 @@ def _write_yaml(path: Path, info: dict[str, Any]) -> None:
 
 
 def _metadata(folder: Path, fits: pd.DataFrame) -> dict[str, Any]:
-    """Say of the movie what Picasso must know."""
+    """Metadata of the movie that Picasso needs."""
     shape = _summary(folder).get("input", {}).get("shape")
     if not shape:
         raise DataError(
@@ -267,7 +267,7 @@ def _summary(folder: Path) -> dict[str, Any]:
 
 
 def _calibrated(folder: Path) -> bool:
-    """Whether masses are masses; a table of unknown origin is believed."""
+    """Whether masses are calibrated; true for a table of unknown origin."""
     summary = _summary(folder)
     return summary.get("mode") != "localize" and summary.get("mass_scale") != "absolute model"
 
@@ -301,7 +301,7 @@ def _events(fits: pd.DataFrame) -> pd.DataFrame:
 
 
 def _checked(fits: pd.DataFrame) -> pd.DataFrame:
-    """Refuse what is no table of fits, and give its columns of numbers as such."""
+    """Refuse what is not a table of fits, and convert its columns to numbers."""
     if not isinstance(fits, pd.DataFrame):
         raise DataError(f"`fits`: is {type(fits).__name__}; give `Result.table`")
     missing = [name for name in EVENT_COLUMNS if name not in fits]

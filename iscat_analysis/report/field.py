@@ -27,8 +27,8 @@ def field_axes(shape: tuple[int, int]) -> tuple[Figure, Axes, tuple[float, float
     figure = new_figure(_WIDE_IN + _WRITTEN_IN[0], tall + _WRITTEN_IN[1] + title)
     axes = figure.add_subplot()
     if drawn != true:
-        way = "tall as wide" if stretched > 1 else "wide as tall"
+        stretch = "tall as wide" if stretched > 1 else "wide as tall"
         times = max(stretched, 1 / stretched)
-        axes.set_title(f"pixels are drawn {times:.2g} times as {way}", fontsize=8)
+        axes.set_title(f"pixels are drawn {times:.2g} times as {stretch}", fontsize=8)
     wide = min(_WIDE_IN, tall / drawn)
     return figure, axes, (shape[1] / wide, shape[0] / (wide * drawn))

@@ -74,11 +74,11 @@ def _points(
     mark: str,
     *,
     linked: bool = True,
-    **look: Any,
+    **style: Any,
 ) -> None:
-    """Draw points that know the rows of the table they stand for, unless it is not on the page."""
+    """Draw points with the table rows they stand for, if the table is on the page."""
     at = np.flatnonzero(rows & np.isfinite(x) & np.isfinite(y))
-    (line,) = axes.plot(x[at], y[at], mark, ls="none", **look)
+    (line,) = axes.plot(x[at], y[at], mark, ls="none", **style)
     if linked and at.size <= MOST_POINTS:
         line.set_gid("rows-" + "_".join(map(str, at)))
     elif at.size > MOST_POINTS:
@@ -92,9 +92,14 @@ def overview(analysis: Analysis, table: pd.DataFrame) -> Figure:
     figure, axes, per_inch = field_axes((rows, columns))
     low, high = display_range([image], analysis.scheme)
     # Matplotlib leaves the pixels of small images to the browser, and averages those of large ones.
-    way = "none" if max(rows, columns) <= LARGEST_FIELD else "antialiased"
+    interpolation = "none" if max(rows, columns) <= LARGEST_FIELD else "antialiased"
     shown = axes.imshow(
-        image, cmap="gray", vmin=low, vmax=high, interpolation=way, aspect=per_inch[0] / per_inch[1]
+        image,
+        cmap="gray",
+        vmin=low,
+        vmax=high,
+        interpolation=interpolation,
+        aspect=per_inch[0] / per_inch[1],
     )
     scale_bar(axes, columns, rows, analysis.pixel_size_nm)
     unit = "photoelectrons" if analysis.scheme == "darkfield" else "contrast"
@@ -162,7 +167,7 @@ def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, F
 
 
 def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw the histogram of what the analysis is about: mass, contrast or height."""
+    """Draw the histogram of the main quantity: mass, contrast or height."""
     table = counted(table)
     values, sigma, label = _main_values(analysis, table)
     finite, good = np.isfinite(values), _is_ok(table)
@@ -181,7 +186,7 @@ def histogram(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def timeline(analysis: Analysis, table: pd.DataFrame) -> Figure:
-    """Draw what the analysis is about against the frame."""
+    """Draw the main quantity against the frame."""
     values, _, label = _main_values(analysis, table)
     spans = analysis.summary.get("landing", {}).get("partly_searched", ())
     figure = new_figure(6.2, 3.3 if spans else 2.8)
@@ -211,25 +216,25 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
     free = free_parameters(analysis.mode, table)
     figure = new_figure(3.0 * len(free), 3.4)
     good = _is_ok(table)
-    for place, name in enumerate(free):
-        axes = figure.add_subplot(1, len(free), place + 1)
+    for column, name in enumerate(free):
+        axes = figure.add_subplot(1, len(free), column + 1)
         sigma, crb, qcrb = (
             table[f"{kind}_{name}"].to_numpy(float) for kind in ("sigma", "crb", "qcrb")
         )
         usable = np.isfinite(crb) & (crb > 0)
         axes.set(title=label_of(analysis, name), xlabel=f"CRB [{UNITS[name]}]")
-        if place == 0:
+        if column == 0:
             axes.set_ylabel("σ and QCRB")
         if not usable.any():
             axes.text(0.5, 0.5, "no bound", ha="center", va="center", transform=axes.transAxes)
             continue
         ends = np.array([crb[usable].min() / 1.15, crb[usable].max() * 1.15])
         axes.plot(ends, ends, color=INK, lw=1.2, label="CRB")
-        look: dict[str, Any] = {
+        style: dict[str, Any] = {
             "ms": 3.5, "alpha": 0.7, "mew": 0, "linked": analysis.tracks is None
         }  # fmt: skip
-        _points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **look)
-        _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **look)
+        _points(axes, crb, qcrb, usable, "s", color=BLUE, label="QCRB", **style)
+        _points(axes, crb, sigma, usable & good, "o", color=VERMILLION, label="σ", **style)
         if (usable & ~good).any():
             _points(axes, crb, sigma, usable & ~good, "x", color=PURPLE, label="σ, flagged",
                     linked=analysis.tracks is None, ms=4)  # fmt: skip
@@ -246,7 +251,7 @@ def precision(analysis: Analysis, table: pd.DataFrame) -> Figure:
 
 
 def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
-    """Draw what tells whether model and noise describe the movie."""
+    """Draw the tests of model and noise."""
     columns = [table[name].to_numpy(float) for name in ("chi2_reduced", "p_value")]
     chi2, p_value = (values[np.isfinite(values)] for values in columns)
     noise = analysis.summary.get("landing") or analysis.summary.get("background") or {}

@@ -33,7 +33,7 @@ NOT_A_MASS = (
 
 @dataclass(frozen=True)
 class Quantity:
-    """The column that an analysis is about."""
+    """The main quantity of an analysis: a column, its name and unit."""
 
     column: str
     label: str
@@ -42,7 +42,7 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Precision:
-    """The likelihood's σ of one parameter beside its bounds, over the rows that are ok."""
+    """σ of one parameter and its bounds, over the rows that are ok."""
 
     name: str
     events: int
@@ -70,7 +70,7 @@ class Precision:
 
     @property
     def shared(self) -> str:
-        """The error that all events share, as text beside σ; empty where it is not known."""
+        """The error that all events share, as text; empty where it is not known."""
         known = math.isfinite(self.systematic)
         return f", common to all events {number(self.systematic)}" if known else ""
 
@@ -82,7 +82,7 @@ def is_uncalibrated(analysis: Analysis) -> bool:
 
 
 def main_quantity(analysis: Analysis) -> Quantity:
-    """Choose what the headline is about."""
+    """Choose the main quantity."""
     if "mass_kda" not in FREE_PARAMETERS[analysis.mode]:
         return Quantity("z_nm", "height", "nm")
     if not is_uncalibrated(analysis):
@@ -93,7 +93,7 @@ def main_quantity(analysis: Analysis) -> Quantity:
 
 
 def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
-    """Put contrasts where the masses are: right for a scale that is proportional to the mass."""
+    """Convert masses to contrasts, for a scale that is proportional to the mass."""
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
     columns = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
     scaled = {name: table[name] * per_kda for name in columns}
@@ -103,7 +103,7 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def label_of(analysis: Analysis, name: str) -> str:
-    """Say what a parameter is called in tables and figures."""
+    """Name a parameter in tables and figures."""
     return "mass, model scale" if name == "mass_kda" and is_uncalibrated(analysis) else LABELS[name]
 
 
@@ -179,7 +179,7 @@ def sizes(analysis: Analysis, table: pd.DataFrame) -> FloatArray:
 
 
 def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Say in two or three sentences what was found."""
+    """Summarise the result in two or three sentences."""
     table = counted(table)
     if table.empty:
         return [
@@ -210,7 +210,7 @@ def _with_unit(value: float, main: Quantity) -> str:
 
 
 def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Set σ of the mass, or else of the height, beside the bounds."""
+    """Compare σ of the mass, or else of the height, with the bounds."""
     free = FREE_PARAMETERS[analysis.mode]
     name = "mass_kda" if "mass_kda" in free else "z_nm"
     p = precision_of(analysis, table, name)
@@ -237,13 +237,15 @@ def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:
 
 
 def spread_lines(analysis: Analysis, table: pd.DataFrame) -> list[str]:
-    """Say what spread was measured, and where the model is rejected."""
+    """Describe the measured spread, and whether the model is rejected."""
     free = FREE_PARAMETERS[analysis.mode]
     rejected = rejection(table)
-    said = analysis.summary.get("repeats", {}).get("message", "")
+    message = analysis.summary.get("repeats", {}).get("message", "")
     lines = []
-    if said:
-        lines.append(f"{said if said.startswith('σ') else said[:1].upper() + said[1:]}.")
+    if message:
+        lines.append(
+            f"{message if message.startswith('σ') else message[:1].upper() + message[1:]}."
+        )
     else:
         name = "mass_kda" if "mass_kda" in free else "z_nm"
         p = precision_of(analysis, table, name)

@@ -43,7 +43,7 @@ OUTPUT_NAMES = frozenset(
 
 _HEADING = "Files of iscat-analysis; what is not in this list is never removed."
 _SIGNED = "lock of iscat-analysis, process "
-_LITTER = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+_SYSTEM_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 _BUILDING, _EARLIER, _LOCK = ".iscat-building.", ".iscat-earlier.", ".iscat-lock."
 _LONGEST_NAME = 200  # bytes; longer ones leave no room for the words above
 
@@ -60,7 +60,7 @@ def check_output(
             raise DataError(f"{folder}: is a file, not a folder; choose another `out`")
         listed = _listed(target)
         foreign = _foreign(target, listed, known)
-        empty = all(entry.name in _LITTER for entry in target.iterdir())
+        empty = all(entry.name in _SYSTEM_FILES for entry in target.iterdir())
     except OSError as error:
         raise DataError(f"{folder}: cannot be read ({error.strerror})") from None
     if foreign and not listed and foreign in known:
@@ -84,7 +84,7 @@ def check_output(
 def claim_output(
     folder: Path, overwrite: bool = False, *, known: Collection[str] = OUTPUT_NAMES
 ) -> Iterator[None]:
-    """Hold an output folder for this process, before any work is done."""
+    """Lock an output folder for this process, before any work is done."""
     check_output(folder, overwrite, known=known)
     target = _resolved(folder)
     with _locked(target, folder) as first:
@@ -101,7 +101,7 @@ def atomic_folder(
     """Fill a temporary sibling, and put it in place only once the block has ended well."""
     with claim_output(folder, overwrite, known=known):
         target = _resolved(folder)
-        building = _hidden(_BUILDING, target)
+        building = _hidden_folder(_BUILDING, target)
         try:
             with unfinished(building):
                 try:
@@ -138,7 +138,7 @@ def _short(target: Path) -> str:
     return target.name if len(raw) <= _LONGEST_NAME else hashlib.sha256(raw).hexdigest()
 
 
-def _hidden(kind: str, target: Path) -> Path:
+def _hidden_folder(kind: str, target: Path) -> Path:
     """Choose the name of a hidden folder beside the target, without making the folder."""
     return target.with_name(f"{kind}{secrets.token_hex(4)}.{_short(target)}")
 
@@ -147,20 +147,20 @@ def _hidden(kind: str, target: Path) -> Path:
 
 
 def _make_ours(folder: Path) -> None:
-    """Make a folder with a list that is empty so far."""
+    """Make a folder with an empty list of its files."""
     folder.mkdir(0o700)
     (folder / FILE_LIST).write_text(f"{_HEADING}\n", encoding="utf-8")
 
 
 def _list_files(folder: Path) -> None:
-    """Put everything into the list that is in a folder of ours."""
+    """Add all files of a folder to its list."""
     names = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*"))
     with (folder / FILE_LIST).open("a", encoding="utf-8") as file:
         file.writelines(f"{json.dumps(name)}\n" for name in names)
 
 
 def _listed(folder: Path) -> frozenset[str]:
-    """Give the paths that a folder's list names, itself among them; none without a list of ours."""
+    """Read the paths in a folder's list, the list included; empty if the list is not ours."""
     path = folder / FILE_LIST
     try:
         if path.is_symlink() or not path.is_file():
@@ -174,7 +174,7 @@ def _listed(folder: Path) -> frozenset[str]:
 
 
 def _foreign(folder: Path, listed: Collection[str], known: Collection[str]) -> str:
-    """Name something in a folder that its list does not name, or that is no part of this result."""
+    """Find something in a folder that its list does not name."""
     for name in _inside(folder):
         top = name.partition("/")[0]
         if name not in listed or not (top in known or top == FILE_LIST):
@@ -183,18 +183,18 @@ def _foreign(folder: Path, listed: Collection[str], known: Collection[str]) -> s
 
 
 def _inside(folder: Path, *, deepest_first: bool = False) -> Iterator[str]:
-    """Give the paths in a folder, without following links or naming what systems leave."""
+    """List the paths in a folder without following links, system files left out."""
 
     def refuse(error: OSError) -> None:
         raise error
 
     for where, folders, files in os.walk(folder, topdown=not deepest_first, onerror=refuse):
-        for name in sorted({*folders, *files} - _LITTER):
+        for name in sorted({*folders, *files} - _SYSTEM_FILES):
             yield (Path(where) / name).relative_to(folder).as_posix()
 
 
 def _remove_listed(folder: Path) -> None:
-    """Remove what a folder's list names, the list last, and the folder if nothing else is left."""
+    """Remove the files of a folder's list, the list last, and the folder if it is then empty."""
     listed = _listed(folder)
     with suppress(OSError):
         for name in _inside(folder, deepest_first=True):
@@ -203,12 +203,12 @@ def _remove_listed(folder: Path) -> None:
                 continue
             with suppress(OSError):  # a folder that holds something else
                 if path.is_dir() and not path.is_symlink():
-                    for litter in _LITTER:
-                        (path / litter).unlink(missing_ok=True)
+                    for system_file in _SYSTEM_FILES:
+                        (path / system_file).unlink(missing_ok=True)
                     path.rmdir()
                 else:
                     path.unlink()
-        if all(entry.name in {*_LITTER, FILE_LIST} for entry in folder.iterdir()):
+        if all(entry.name in {*_SYSTEM_FILES, FILE_LIST} for entry in folder.iterdir()):
             remove_folder(folder)
 
 
@@ -216,7 +216,7 @@ def _remove_listed(folder: Path) -> None:
 
 
 def _sign(handle: int) -> None:
-    """Say in a lock file whose it is; on a full disk it stays empty."""
+    """Write the owner into a lock file; on a full disk it stays empty."""
     with suppress(OSError):
         os.ftruncate(handle, 0)
         os.write(handle, f"{_SIGNED}{os.getpid()}\n".encode())
@@ -224,7 +224,7 @@ def _sign(handle: int) -> None:
 
 @contextmanager
 def _locked(target: Path, folder: Path) -> Iterator[bool]:
-    """Hold the lock of a folder; tell whether this process did not hold it before."""
+    """Lock a folder; tell whether this process did not hold the lock before."""
     # What the lock file is called must not depend on who may write into the folder itself.
     path = target.parent / f"{_LOCK}{_short(target)}"
     lock = FileLock(
@@ -276,14 +276,14 @@ def _owner(path: Path) -> str | None:
     """Read which process holds a lock file; empty where it says nothing, None if it is no lock."""
     try:
         with path.open("rb") as file:
-            said = file.read(len(_SIGNED) + 20).decode("ascii", "replace")
+            head = file.read(len(_SIGNED) + 20).decode("ascii", "replace")
     except OSError:
         return ""
-    return None if said and not said.startswith(_SIGNED) else said.removeprefix(_SIGNED).strip()
+    return None if head and not head.startswith(_SIGNED) else head.removeprefix(_SIGNED).strip()
 
 
 def _is_still(path: Path, before: os.stat_result) -> bool:
-    """Tell whether a file is the one that it was."""
+    """Tell whether a path is still the file that it was."""
     try:
         return os.path.samestat(path.lstat(), before)
     except OSError:
@@ -294,7 +294,7 @@ def _is_still(path: Path, before: os.stat_result) -> bool:
 
 
 def _recover(target: Path) -> None:
-    """Remove what a killed run left beside the target, and put an earlier result back."""
+    """Remove what a killed run left, and restore an earlier result."""
     end = f".{_short(target)}"
     for entry in list(target.parent.iterdir()):
         for kind in (_BUILDING, _EARLIER):
@@ -313,7 +313,7 @@ def _recover(target: Path) -> None:
 
 
 def _remove_earlier(earlier: Path, kept: Path) -> None:
-    """Remove a result that was set aside; what came into it since then stays."""
+    """Remove an earlier result that was set aside; files added to it since then stay."""
     if kept.is_dir():
         _remove_listed(kept)
     if not kept.exists():
@@ -333,7 +333,7 @@ def _swap(building: Path, target: Path) -> None:
     if not target.exists():
         building.rename(target)
         return
-    earlier = _hidden(_EARLIER, target)
+    earlier = _hidden_folder(_EARLIER, target)
     kept = earlier / target.name
     try:
         _make_ours(earlier)

@@ -62,7 +62,7 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
 
 
 def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
-    """Name the figures of the page, and what draws them."""
+    """List the figures of the page, with the functions that draw them."""
     yield from page_figures(analysis, table)
     if (found := _species(analysis, table)) is not None:
         yield "species", partial(species_figure, found)
@@ -78,7 +78,7 @@ def _species(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any] | None:
 def page_context(
     analysis: Analysis, table: pd.DataFrame, folder: Path | None = None
 ) -> dict[str, Any]:
-    """Gather what the page says."""
+    """Collect the text of the page."""
     found = _species(analysis, table)
     species = distribution_section(found) if found else None
     if species is not None and is_uncalibrated(analysis):
@@ -108,7 +108,7 @@ def page_context(
 
 
 def page_of(about: Mapping[str, Any], figures: Mapping[str, Markup]) -> str:
-    """Put words and figures together."""
+    """Combine text and figures."""
     shown = {
         "figures": figures,
         "histogram": next((name for name in figures if name.endswith("_histogram")), None),

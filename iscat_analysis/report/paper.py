@@ -110,7 +110,7 @@ def _sections(table: pd.DataFrame, drawn: Mapping[str, Markup]) -> list[dict[str
         {"label": label, "numeric": True} for label in WAYS.values()
     ]
     rows = [
-        [QUANTITY_LABELS[row["quantity"]], *(float(row[way]) for way in WAYS)]
+        [QUANTITY_LABELS[row["quantity"]], *(float(row[key]) for key in WAYS)]
         for _, row in table.iterrows()
     ]
     sections: list[dict[str, Any]] = [

@@ -148,11 +148,11 @@ def panel_figure(
     for authors, exact in zip(
         curves_of(panel, rows, "dong2021"), curves_of(panel, rows, "exact"), strict=True
     ):
-        look: dict[str, Any] = {"color": exact.color, "alpha": 0.55 if exact.joint else 1.0}
-        top.plot(exact.x, exact.y, lw=1.6, label=exact.name, **look)
-        top.plot(authors.x, authors.y, "--", lw=1.1, **look)
+        style: dict[str, Any] = {"color": exact.color, "alpha": 0.55 if exact.joint else 1.0}
+        top.plot(exact.x, exact.y, lw=1.6, label=exact.name, **style)
+        top.plot(authors.x, authors.y, "--", lw=1.1, **style)
         apart = exact.y / authors.y if spec.log else exact.y - authors.y
-        low.plot(exact.x, apart, lw=1.3, **look)
+        low.plot(exact.x, apart, lw=1.3, **style)
     for convention, dots in (("exact", (1.5, 2)), ("dong2021", (1.5, 6))):
         for limit in limits_of(panel, quantum, convention):
             label = limit.name if convention == "exact" else None
@@ -212,9 +212,9 @@ def table_figure(table: pd.DataFrame) -> Figure:
     rows = table[table["unit"] == "nm"]
     marks = {"printed": ("s", GREY), "authors": ("x", GREY), "dong2021": ("+", INK),
              "exact": ("o", BLUE), "reciprocal": ("D", VERMILLION)}  # fmt: skip
-    for number, (way, (mark, color)) in enumerate(marks.items()):
+    for number, (key, (mark, color)) in enumerate(marks.items()):
         at = np.arange(len(rows)) + 0.13 * (number - 2)
-        axes.plot(rows[way], at, mark, color=color, label=WAYS[way], ms=6, mew=1.4)
+        axes.plot(rows[key], at, mark, color=color, label=WAYS[key], ms=6, mew=1.4)
     for y, (printed, exact) in enumerate(zip(rows["printed"], rows["exact"], strict=True)):
         axes.text(
             1.02, y, f"printed {printed:g}\nexact {exact:.1f}", va="center", fontsize=8,

@@ -1,4 +1,4 @@
-"""What the report says of the measured spread, and of what it cannot show."""
+"""Sentences of the report about the measured spread."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
 
 
 def counted(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out the rows that stay in the table but are no events: side lobes of others."""
+    """Leave out rows that are not events: side lobes of others."""
     return table[table["status"] != "sidelobe"]
 
 

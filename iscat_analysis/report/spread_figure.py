@@ -29,15 +29,15 @@ def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) 
     good = analysis.table["status"] != Status.SIDELOBE.value
     window = float(np.median(analysis.table.loc[good, "n_after"]))
     figure = new_figure(3.0 * len(found), 3.0)
-    for place, (name, part) in enumerate(found.items()):
-        axes = figure.add_subplot(1, len(found), place + 1)
+    for column, (name, part) in enumerate(found.items()):
+        axes = figure.add_subplot(1, len(found), column + 1)
         axes.axhline(1.0, color=INK, lw=1)
         if analysis.mode == "track":
             _draw_frames(axes, part)
         else:
             _draw_windows(axes, part, window)
         axes.set_title(label_of(analysis, name))
-        if place == 0:
+        if column == 0:
             axes.set_ylabel("spread over CRB")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize=8)

@@ -1,4 +1,4 @@
-"""Page of `iscat calibrate optics --measured`: the picture, its noise, and who agrees with it."""
+"""Page of `iscat calibrate optics --measured`: the picture, its noise, and events that agree."""
 
 from __future__ import annotations
 

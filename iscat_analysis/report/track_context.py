@@ -1,4 +1,4 @@
-"""What the report page of a movie of moving particles is made of."""
+"""Contents of the report page of a movie of moving particles."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ _TWO = ("exponent", "p_confinement", "p_anomalous", "p_steady", "mass_scatter")
 def tracks_context(
     analysis: Analysis, fits: pd.DataFrame, folder: Path | None = None
 ) -> dict[str, Any]:
-    """Gather what the page says of tracks, in place of what it says of events."""
+    """Collect what the page shows of tracks instead of events."""
     tracks = tracks_of(analysis)
     numbered = tracks.rename(columns={"track": "event"})
     images = event_details(analysis, numbered)
-    said = tracks_headline(analysis, fits)
+    headlines = tracks_headline(analysis, fits)
     return {
         "n_events": len(tracks),
-        "headline": [text for text in said if text != NOT_A_MASS],
+        "headline": [text for text in headlines if text != NOT_A_MASS],
         "flagged": bool(len(tracks)) and tracks_caution(tracks) is not None,
-        "cautions": [text for text in said if text == NOT_A_MASS],
+        "cautions": [text for text in headlines if text == NOT_A_MASS],
         "tiles": _tiles(analysis, fits),
         "events": track_rows(analysis),
         "images": {str(row): list(packed) for row, packed in images.items()},
@@ -129,7 +129,7 @@ def _decimals(values: Any, digits: int) -> int:
 
 
 def _statuses(tracks: pd.DataFrame) -> list[list[str]]:
-    """Count the verdicts on tracks and other remarks, with what each means."""
+    """Count statuses and flags of tracks, with their meanings."""
     counts = tracks["status"].value_counts()
     rows = [[s.value, str(counts[s.value]), s.advice] for s in TrackStatus if s.value in counts]
     crossed = sum("crosses" in flags.split(";") for flags in tracks["flags"])

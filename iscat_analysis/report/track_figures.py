@@ -143,9 +143,9 @@ def trajectories(analysis: Analysis, fits: pd.DataFrame) -> Figure:
     return figure
 
 
-def _points(axes: Axes, x: FloatArray, y: FloatArray, rows: NDArray[np.intp], **look: Any) -> None:
+def _points(axes: Axes, x: FloatArray, y: FloatArray, rows: NDArray[np.intp], **style: Any) -> None:
     """Draw points that know the rows of the table of tracks they stand for."""
-    (line,) = axes.plot(x, y, "o", ls="none", **look)
+    (line,) = axes.plot(x, y, "o", ls="none", **style)
     if len(rows) <= MOST_TRACKS:
         line.set_gid("rows-" + "_".join(map(str, rows)))
     else:
@@ -215,17 +215,17 @@ def distributions(analysis: Analysis) -> Figure:
         curve = _density_1d(np.log(grid) if log else grid, at[shown], wide[shown])
         above.fill_between(grid, curve, color=BLUE, alpha=0.3, lw=0)
         above.plot(grid, curve, color=BLUE, lw=1)
-        order, place = np.argsort(value[usable]), np.arange(usable.sum(), dtype=float)
+        order, rank = np.argsort(value[usable]), np.arange(usable.sum(), dtype=float)
         rows = np.flatnonzero(usable)[order]
         bars = _bars(tracks, rows) if log else error[rows]
         for part, color in ((good[rows], BLUE), (~good[rows], PURPLE)):
             if part.any() and rows.size <= MOST_TRACKS:
                 below.errorbar(
-                    value[rows][part], place[part],
+                    value[rows][part], rank[part],
                     xerr=bars[..., part], ls="none", color=color, elinewidth=0.7,
                 )  # fmt: skip
             if part.any():
-                _points(below, value[rows][part], place[part], rows[part], color=color, ms=2.5,
+                _points(below, value[rows][part], rank[part], rows[part], color=color, ms=2.5,
                         mew=0)  # fmt: skip
         above.set(ylim=(0, None))
         above.spines.left.set_visible(False)

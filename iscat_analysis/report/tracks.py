@@ -1,4 +1,4 @@
-"""What the tracks of a movie say in a few words: on the page, on stdout, in a notebook."""
+"""Sentences about the tracks of a movie: for the page, stdout and notebooks."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def tracks_of(analysis: Analysis) -> pd.DataFrame:
 
 
 def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
-    """Say in two or three sentences what the tracks come to."""
+    """Summarise the tracks in two or three sentences."""
     tracks = tracks_of(analysis)
     warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
     if fits.empty:
@@ -47,9 +47,9 @@ def tracks_headline(analysis: Analysis, fits: pd.DataFrame) -> list[str]:
     )
     if (flagged := tracks_caution(tracks)) is not None:
         return [f"{text} {flagged}", *spread_lines(analysis, fits), *warned]
-    said = [f"{label} {value}" for label, value in medians(analysis)]
-    if said:
-        text += f" Medians over tracks: {', '.join(said)}."
+    labelled = [f"{label} {value}" for label, value in medians(analysis)]
+    if labelled:
+        text += f" Medians over tracks: {', '.join(labelled)}."
     return [text, *spread_lines(analysis, fits), *warned]
 
 
@@ -87,7 +87,7 @@ def medians(analysis: Analysis) -> list[tuple[str, str]]:
 
 
 def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Say where tracks begin, end and meet."""
+    """Describe where tracks begin, end and meet."""
     motion = summary.get("motion")
     if not motion or not summary.get("tracks"):
         return
@@ -114,8 +114,8 @@ TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
 
 
 def advice(tracks: pd.DataFrame) -> Iterator[str]:
-    """Explain the remarks on tracks."""
-    remarks = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
+    """Explain the flags of tracks."""
+    flag_counts = Counter(flag for flags in tracks["flags"] for flag in str(flags).split(";"))
     for status in TrackStatus:
-        if remarks[status.value]:
-            yield f"{count(remarks[status.value], 'track')} {status}: {status.advice}"
+        if flag_counts[status.value]:
+            yield f"{count(flag_counts[status.value], 'track')} {status}: {status.advice}"

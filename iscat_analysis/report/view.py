@@ -1,4 +1,4 @@
-"""Which page a result has."""
+"""The page of a result."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class Closed(BaseModel):
     model_config = ConfigDict(extra="forbid", defer_build=True)
 
 
-def row_model(name: str, said: str, columns: Iterable[Column], status: Any) -> type[Closed]:
+def row_model(name: str, doc: str, columns: Iterable[Column], status: Any) -> type[Closed]:
     """Make the model of one row of a table from the registry of its columns."""
     fields: dict[str, Any] = {}
     for column in columns:
@@ -64,4 +64,4 @@ def row_model(name: str, said: str, columns: Iterable[Column], status: Any) -> t
             fields[column.name] = values | None, maybe(column.description)
         else:
             fields[column.name] = values, key(column.description)
-    return create_model(name, __base__=Closed, __doc__=said, **fields)
+    return create_model(name, __base__=Closed, __doc__=doc, **fields)

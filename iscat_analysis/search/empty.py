@@ -27,7 +27,7 @@ and n/2 frames on one side."""
 FEWEST_PLACES = 60
 """Places below which nothing is said."""
 
-_TRIM = 4.0  # robust standard deviations beyond which something else than noise is there
+_TRIM_SIGMAS = 4.0  # robust standard deviations beyond which something else than noise is there
 _KEPT_VARIANCE = 0.998929  # of a normal law inside ±_TRIM standard deviations
 _NORMAL_QUARTILE = 0.6744897501960817
 _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where nothing is measured
@@ -35,7 +35,7 @@ _LEAST_LEFT = 0.5  # share of a variance; less is left only next to fits, where 
 
 @dataclass(frozen=True)
 class EmptySpread:
-    """Squared errors at empty places over the variance that the model expects, summed."""
+    """Sums of squared errors at places without a particle, over the expected variance."""
 
     squares: FloatArray
     counts: FloatArray
@@ -43,7 +43,7 @@ class EmptySpread:
     distances: tuple[float, ...] | None = None
 
     def __add__(self, other: EmptySpread) -> EmptySpread:
-        """Join what other frames of the same field say."""
+        """Add those of other frames of the same field."""
         squares, counts = self.squares + other.squares, self.counts + other.counts
         return EmptySpread(squares, counts, self.shared, self.distances)
 
@@ -105,7 +105,7 @@ class EmptyField:
         self._unit = unit
 
     def errors(self, sum_e: FloatArray, power: float, known: FloatArray | None) -> FloatArray:
-        """Give the errors that a sum of frames contributes everywhere.
+        """Contribution of a sum of frames to the errors at all places.
 
         Shapes: `sum_e` (y, x), `known` (y, x), result (n, rows, columns).
         """
@@ -117,9 +117,9 @@ class EmptyField:
         return errors
 
     def left(self, particles: Sequence[tuple[float, float]]) -> FloatArray:
-        """Give what fitted particles, which are taken off, leave of the variance around them.
+        """Share of the variance that is left around fitted particles after their subtraction.
 
-        A fit follows the noise, also of pixels that matter to its neighbourhood.
+        A fit follows the noise, also in pixels that matter to its neighbourhood.
 
         Notes
         -----
@@ -169,7 +169,7 @@ class EmptyField:
             noise = noise * left[:, kept]
         whole = (means[1] - means[0]) / np.sqrt(noise)
         scale = np.median(np.abs(whole), axis=1, keepdims=True) / _NORMAL_QUARTILE
-        quiet = np.all(np.abs(whole) < _TRIM * scale, axis=0)
+        quiet = np.all(np.abs(whole) < _TRIM_SIGMAS * scale, axis=0)
         if quiet.sum() < FEWEST_PLACES:
             return nothing
         found = [(whole**2 / _KEPT_VARIANCE, 1)]
@@ -218,7 +218,7 @@ class EmptyField:
 
     @cached_property
     def _related(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """F⁻¹, F, and the covariance of estimates at every distance of two places."""
+        """F⁻¹, F, and the covariance of estimates at every distance between two places."""
         unit = self._unit
         size = (2 * unit.shape[-1] - 1,) * 2
         spectra = fft.rfft2(unit, size)
@@ -257,7 +257,7 @@ class EmptyField:
 
 
 def _mean(power: FloatArray, parts: Sequence[FloatArray]) -> FloatArray:
-    """Average parts, each with its light; one after the other, as all together take memory."""
+    """Average parts, weighted with their light; one after the other, to save memory."""
     mean = np.zeros_like(parts[0])
     for share, part in zip(power / power.sum(), parts, strict=True):
         mean += share * part

@@ -1,4 +1,4 @@
-"""Peaks of smooth fields that are known at pixels only."""
+"""Peaks of smooth fields that are sampled at pixels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FINE = np.linspace(-0.625, 0.625, 11)
 
 
 def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Find what stands out of a stack of fields and has nothing higher beside it.
+    """Find local maxima above a threshold in a stack of fields.
 
     Shapes: `fields` (k, y, x), result (n, 3).
     """
@@ -32,11 +32,11 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
     apart = [math.prod(fields.shape[axis + 1 :]) for axis in range(fields.ndim)]
     offsets = product(*(range(-n, n + 1) for n in reach))
     for offset in sorted(offsets, key=lambda o: sum(map(abs, o))):  # the nearest leave few others
-        beside = at
+        neighbour = at
         for axis in np.flatnonzero(offset):  # at an edge, the outermost pixel
             moved = np.minimum(np.maximum(place[axis] + offset[axis], 0), fields.shape[axis] - 1)
-            beside = beside + apart[axis] * (moved - place[axis])
-        kept = values[at] >= values[beside]
+            neighbour = neighbour + apart[axis] * (moved - place[axis])
+        kept = values[at] >= values[neighbour]
         at, place = at[kept], place[:, kept]
     return place.T
 
@@ -44,7 +44,7 @@ def maxima(fields: NDArray[Any], least: float, reach: tuple[int, int, int]) -> N
 def summits(
     fields: NDArray[Any], at: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Find the tops of smooth fields, or their bottoms, between the pixels.
+    """Find maxima or minima of smooth fields between the pixels.
 
     Shapes: `fields` (k, y, x), `at` (n, 3), `dy, dx` (n,), `above` (n,).
     """
@@ -60,8 +60,8 @@ def summits(
     fine[~(inside[0][:, :, None] & inside[1][:, None, :])] = -np.inf
     i, j = np.divmod(fine.reshape(-1, _FINE.size**2).argmax(axis=1), _FINE.size)
     each = np.arange(len(at))
-    (dy, higher), (dx, beside) = vertices(fine[each, :, j], i), vertices(fine[each, i], j)
-    height = fine[each, i, j] + higher + beside
+    (dy, higher), (dx, neighbour) = vertices(fine[each, :, j], i), vertices(fine[each, i], j)
+    height = fine[each, i, j] + higher + neighbour
     spacing = float(_FINE[1] - _FINE[0])
     return (
         _FINE[i] + spacing * dy,
@@ -71,7 +71,7 @@ def summits(
 
 
 def _mirrored(places: NDArray[np.int64], size: int) -> NDArray[np.int64]:
-    """Fold indices that lie outside back into an axis, at its first and last pixel."""
+    """Reflect indices outside an axis at its first and last pixel."""
     period = max(2 * (size - 1), 1)
     folded = places % period
     return np.minimum(folded, period - folded) if size > 1 else np.zeros_like(places)
@@ -97,7 +97,9 @@ def vertices(lines: NDArray[Any], index: NDArray[np.int64]) -> tuple[FloatArray,
     low, mid, high = (lines[each, place] for place in (before, index, after))
     inner = (index > 0) & (index < last) & np.isfinite(low) & np.isfinite(high)
     low, high = np.where(inner, low, mid), np.where(inner, high, mid)
-    bend = low - 2 * mid + high
-    bent = bend < 0
-    shift = np.where(bent, 0.5 * (low - high) / np.where(bent, bend, 1.0), 0.0).clip(-0.5, 0.5)
+    curvature = low - 2 * mid + high
+    is_peak = curvature < 0
+    shift = np.where(is_peak, 0.5 * (low - high) / np.where(is_peak, curvature, 1.0), 0.0).clip(
+        -0.5, 0.5
+    )
     return shift, 0.25 * (high - low) * shift

@@ -27,7 +27,7 @@ EXCEEDS = 1.5
 EXPLAINS = 0.5
 """Share of the χ² in excess that a particle inside the fitted region must explain."""
 
-DWARFS = 3.0
+DOMINANT_RATIO = 3.0
 """Times the signal-to-noise ratio of an event from which on another one near it dwarfs it."""
 
 LISTED = 0.7
@@ -40,20 +40,20 @@ is not measured."""
 _EXCESS_SIGMAS = 3.0  # of χ²'s own scatter, below which an excess may be noise
 _RING_PX = 2.0  # on either side of the candidate's distance
 _SECTOR_PX = 4.0  # of the ring, along it
-_HEIGHT = 0.8  # share of the ring that is lower than what counts as its height
+_RING_QUANTILE = 0.8  # share of the ring that is lower than what counts as its height
 _PATCH_PX = 5.0  # around the candidate, which is its own
 
 
 @dataclass(frozen=True)
 class Described:
-    """How well a fit describes its region."""
+    """How well a fit describes its region: what it explains, and its misfit."""
 
     snr: float
     excess: float
 
     @classmethod
     def of(cls, snr: float, chi2_reduced: float, n_pixels: int) -> Described:
-        """Take it from a fit."""
+        """Make it of a fit."""
         return cls(snr, _significant((chi2_reduced - 1) * n_pixels, n_pixels))
 
     def is_dwarfed(self, others: Iterable[Described]) -> bool:
@@ -64,7 +64,9 @@ class Described:
         """
         brightest = max(others, key=lambda other: other.snr, default=self)
         own = brightest.excess * (self.snr / brightest.snr) ** 2 if brightest.snr else 0.0
-        return brightest.snr > DWARFS * self.snr and self.snr**2 < EXPLAINS * (self.excess - own)
+        return brightest.snr > DOMINANT_RATIO * self.snr and self.snr**2 < EXPLAINS * (
+            self.excess - own
+        )
 
 
 def is_hidden(snr: float, size: float) -> bool:
@@ -73,13 +75,13 @@ def is_hidden(snr: float, size: float) -> bool:
 
 
 def chi2_excess(residuals: NDArray[Any]) -> float:
-    """Measure what a fit left over."""
+    """Measure the misfit of a fit."""
     n = int(np.count_nonzero(np.isfinite(residuals)))
     return _significant(float(np.nansum(residuals**2)) - n, n)
 
 
 def _significant(excess: float, n_pixels: int) -> float:
-    """Give a χ² in excess, 0 where that may be noise."""
+    """Excess of χ², 0 where it may be noise."""
     return excess if excess > _EXCESS_SIGMAS * math.sqrt(2 * n_pixels) else 0.0
 
 
@@ -108,4 +110,4 @@ def size_on_ring(
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
         return 0.0
-    return float(np.interp(_HEIGHT * (seen.size - 1), np.arange(seen.size), seen))
+    return float(np.interp(_RING_QUANTILE * (seen.size - 1), np.arange(seen.size), seen))

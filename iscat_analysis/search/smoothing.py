@@ -21,7 +21,7 @@ T = TypeVar("T", np.float32, np.float64)
 
 
 def spot_response(shape: tuple[int, ...], sigma_px: float) -> NDArray[np.float64]:
-    """Give what a Gaussian spot leaves of each cosine of an image.
+    """Factors by which a Gaussian filter weakens each cosine of an image.
 
     Shapes: result (y, x).
     """

@@ -46,7 +46,7 @@ wrong, the first ring of a bright particle can be as high as the particle."""
 LARGEST_IMAGE = 3.5
 """Regions from the centre to the edge of a strong particle's image; the rings go on, faintly."""
 
-FLOOD = 1000
+MOST_CANDIDATES = 1000
 """Candidates beyond which a search is given up where they are noise."""
 
 _NOISE_SHARE = 0.1  # of these that noise must account for; particles have a thousand times as many
@@ -54,7 +54,7 @@ _NOISE_SHARE = 0.1  # of these that noise must account for; particles have a tho
 
 @dataclass(frozen=True)
 class ExcessNoise:
-    """Noise beyond the expected."""
+    """Noise beyond that of the camera's numbers."""
 
     ratio: float
     message: str
@@ -62,7 +62,7 @@ class ExcessNoise:
 
 @dataclass(frozen=True)
 class Templates:
-    """The model's images, normalised, at the heights searched."""
+    """Normalised images of the model at the searched heights."""
 
     z_nm: FloatArray
     images: FloatArray
@@ -218,7 +218,7 @@ def find_particles(
                 z_nm=float(templates.z_nm[peak.layer]),
                 mass_kda=_mass(likelihood.model, templates, float(strength[at]) * higher),
                 snr=float(snr[at]) * higher,
-                beside=_beside(best, peak, known, roi_px),
+                beside=_strongest_lobe(best, peak, known, roi_px),
             )
         )
     return tuple(found)
@@ -253,22 +253,22 @@ def _peaks(
     return [_Peak(*each) for each in zip(*columns, strict=True) if each[-1] > threshold]
 
 
-def _beside(
+def _strongest_lobe(
     best: FloatArray, peak: _Peak, known: Sequence[tuple[float, float]], roi_px: float
 ) -> float:
-    """Size of what known particles left over, at a candidate's distance from each.
+    """Height of the residuals of known particles at a candidate's distance from each.
 
-    The nearest come first, and the search ends with one that hides the candidate.
+    The nearest particles are tried first; the search ends with one that hides the candidate.
     """
     place = peak.x_px, peak.y_px
     away = {k: math.hypot(k[0] - place[0], k[1] - place[1]) for k in known}
     near = sorted((k for k in away if away[k] < LARGEST_IMAGE * roi_px), key=lambda k: away[k])
-    beside = 0.0
+    lobe = 0.0
     for k in near:
-        beside = max(beside, size_on_ring(best, k, place, [o for o in near if o is not k]))
-        if is_hidden(peak.height, EXCEEDS * beside):
+        lobe = max(lobe, size_on_ring(best, k, place, [o for o in near if o is not k]))
+        if is_hidden(peak.height, EXCEEDS * lobe):
             break
-    return beside
+    return lobe
 
 
 def refuse_flood(
@@ -279,12 +279,12 @@ def refuse_flood(
     images: int = 1,
     frames: str = "",
 ) -> None:
-    """Give up a search in which noise passes the threshold; many particles are no reason to.
+    """Stop a search in which noise passes the threshold, but not one with many particles.
 
-    The rings of many particles look like noise as well, but normal noise of that variance would
+    The rings of many particles look like noise as well; but normal noise of that variance would
     hardly pass the threshold.
     """
-    if excess_noise is None or candidates <= FLOOD:
+    if excess_noise is None or candidates <= MOST_CANDIDATES:
         return
     if images * templates.reached_by(excess_noise.ratio) > _NOISE_SHARE * candidates:
         raise FloodError(
@@ -342,7 +342,7 @@ def _correlate(image: FloatArray, kernels: FloatArray) -> FloatArray:
 
 
 def _weak_amplitude(bare: ForwardModel) -> float:
-    """Return an amplitude whose signal is linear; in dark field any will do."""
+    """Amplitude whose signal is linear; in dark field any will do."""
     nominal = bare.material.mass_kda
     peak = abs(bare.peak_contrast(bare.height_nm, nominal))
     return nominal * min(1.0, 1e-4 / max(peak, 1e-30)) if bare.rho else nominal

@@ -6,8 +6,8 @@ A ladder is oligomers: n_k copies of one monomer at
 
 m₁ free or held, b free or zero.  Which n there are is given, or found: from all that the masses
 reach, the rung with the fewest events goes as long as BIC falls.  Where no monomer is named, masses
-of free species over small numbers are tried, and the heaviest that is within `_TIE` of the least
-BIC is taken, for half of a monomer's mass explains as much as the monomer.
+of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the
+least is taken, for half of a monomer's mass explains as much as the monomer.
 
 Given masses and ladders share one width τ unless widths are free, and stand on a background: a
 species of fixed, great width that takes what is none of them.
@@ -37,10 +37,10 @@ Widths = Literal["common", "free"]
 MOST_RUNGS = 12
 """Rungs that a ladder without given steps may have."""
 
-_TIE = 6.0  # of BIC
-_SMALL = 4  # multiples that a free species may be
+_BIC_TIE = 6.0  # of BIC
+_MOST_FREE_MULTIPLES = 4  # multiples that a free species may be
 _REACH = 0.97  # quantile of the masses that the ladder must reach
-_WIDEST = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
+_MOST_RELATIVE_WIDTH = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
 _SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
 
 
@@ -63,7 +63,7 @@ class LadderFit:
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """Species that were chosen."""
+    """The chosen species, and what is known of their choice."""
 
     tried: tuple[Mixture, ...]
     best: Mixture
@@ -77,12 +77,12 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Searched:
-    """As many species as BIC likes."""
+    """The number of species with the smallest BIC."""
 
     most: int = 6
 
     def choose(self, events: Events) -> Chosen:
-        """Fit one number after another."""
+        """Fit one number of species after another."""
         fits = fit_species(events, self.most)
         bic = [fit.bic(events.x.size) for fit in fits]
         return Chosen(tuple(fits), fits[int(np.argmin(bic))].by_mass(), searched=True)
@@ -90,26 +90,26 @@ class Searched:
 
 @dataclass(frozen=True)
 class Number:
-    """So many species, all free."""
+    """A given number of species with free masses."""
 
     k: int
 
     def choose(self, events: Events) -> Chosen:
-        """Fit so many species."""
+        """Fit this number of species."""
         fits = fit_species(events, self.k, least=self.k)
         return Chosen(tuple(fits), fits[-1].by_mass())
 
 
 @dataclass(frozen=True)
 class Given:
-    """Species whose masses are known; shares and widths are fitted."""
+    """Species of known masses with free fractions and widths."""
 
     masses_kda: tuple[float, ...]
     widths: Widths = "common"
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
-        """Fit shares and widths."""
+        """Fit fractions and widths."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         structure, limits = rungs(
             events, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
@@ -132,20 +132,22 @@ class Ladder:
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
-        """Fit the ladder, and find what is not given."""
+        """Fit the ladder, and find the steps that are not given."""
         if self.monomer_kda is not None:
             return self._from(events, self.monomer_kda)
         free = Searched().choose(events).best
-        wanted = sorted({float(m / n) for m in free.mean for n in range(1, _SMALL + 1)})
+        wanted = sorted(
+            {float(m / n) for m in free.mean for n in range(1, _MOST_FREE_MULTIPLES + 1)}
+        )
         least = 0.5 * float(events.x.min())
         found = [self._from(events, m) for m in wanted if m >= least]
         n = events.x.size
         bic = np.array([one.best.bic(n) for one in found])
-        near = [one for one, value in zip(found, bic, strict=True) if value < bic.min() + _TIE]
+        near = [one for one, value in zip(found, bic, strict=True) if value < bic.min() + _BIC_TIE]
         return max(near, key=lambda one: one.best.mean[0] / one.steps[0])
 
     def _from(self, events: Events, monomer: float) -> Chosen:
-        """Find the steps of a ladder whose monomer is about known."""
+        """Find the steps of a ladder whose monomer mass is approximately known."""
         if self.steps:
             steps = tuple(sorted(self.steps))
         else:
@@ -167,7 +169,7 @@ class Ladder:
         return given if self.held else self.values(found)[0]
 
     def values(self, found: Chosen, mixture: Mixture | None = None) -> tuple[float, float]:
-        """Give m₁ and b of a ladder."""
+        """Monomer mass m₁ and offset b of a ladder."""
         mean = (found.best if mixture is None else mixture).mean[: len(found.steps)]
         steps = np.array(found.steps, dtype=np.float64)
         if self.held and self.monomer_kda is not None:
@@ -201,7 +203,7 @@ class Ladder:
         return Chosen((best,), best, structure, limits, self.background, tuple(steps))
 
     def _against_free(self, events: Events, found: Chosen) -> float:
-        """Ask whether free means describe the events better than a ladder's."""
+        """Test whether free masses describe the events better than those of the ladder."""
         k = len(found.steps)
         means = (0 if self.held else 1) + int(self.offset and (self.held or k > 1))
         if k <= means:
@@ -233,7 +235,7 @@ def rungs(
     background: bool,
     unit_kda: float,
 ) -> tuple[Structure, Limits]:
-    """Make a structure of species whose means are linear in few parameters.
+    """Make the structure of a ladder: means that are linear in m₁ and b.
 
     Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,).
     """
@@ -251,7 +253,7 @@ def rungs(
         start[1, k] = (low + high) / 2
         start[2, k] = max((high - low) / 2, unit_kda) ** 2
     sigma = max(float(np.median(events.sigma)), 1e-9)
-    widest = (_WIDEST * unit_kda) ** 2
+    widest = (_MOST_RELATIVE_WIDTH * unit_kda) ** 2
     return Structure(design, start), Limits(
         np.concatenate([np.full(every - 1, -LOGIT_REACH), ranges[0], np.zeros(q)]),
         np.concatenate([np.full(every - 1, LOGIT_REACH), ranges[1], np.full(q, widest)]),
@@ -260,7 +262,7 @@ def rungs(
 
 
 def _start(events: Events, mean: FloatArray, structure: Structure, background: bool) -> Mixture:
-    """Take shares from the events near each mass, and the typical error as width."""
+    """Start from the fractions of events near each mass, and the typical error as width."""
     edges = (mean[:-1] + mean[1:]) / 2
     near = np.searchsorted(edges, events.x)
     size = np.bincount(near, minlength=mean.size) + 1.0

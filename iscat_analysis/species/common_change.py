@@ -18,14 +18,15 @@ from iscat_analysis.records import FloatArray
 
 _DEGREE = 2
 _FEWEST_TRACKS = 3
-_SURE = 1e-4  # chance of it, whichever two tracks are left out: what two exchange is no drift
+# p-value below which a common change is reported, whichever two tracks are left out.
+_LARGEST_CHANCE = 1e-4
 _SUSPECTS = 12  # that change most by themselves; two of these are left out in turn
 
 
 def common_change(
     tracks: Sequence[tuple[FloatArray, FloatArray, FloatArray]], frames: tuple[int, int]
 ) -> float:
-    """Say by how much the masses of all tracks change together.
+    """Range of the relative change of all masses with time; 0 where none is significant.
 
     Shapes: `tracks` (n,).
     """
@@ -45,7 +46,7 @@ def common_change(
         return 0.0
     pulls, known = np.array(pull), np.array(information)
     every, whole = pulls.sum(axis=0), known.sum(axis=0)
-    least = chdtri(_DEGREE, _SURE)
+    least = chdtri(_DEGREE, _LARGEST_CHANCE)
     own = np.einsum("ni,nij,nj->n", pulls, np.linalg.pinv(known), pulls)
     suspects = np.argsort(-own)[:_SUSPECTS].tolist()
     for left_out in (*combinations(range(len(pulls)), 1), *combinations(suspects, 2)):

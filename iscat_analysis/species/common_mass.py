@@ -30,7 +30,7 @@ from iscat_analysis.records import FloatArray
 _Factor = tuple[FloatArray, bool]
 
 _ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
-_SETTLED = 1e-9  # of the mass
+_MASS_TOLERANCE = 1e-9  # of the mass
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def combine_masses(
     for _ in range(_ROUNDS):
         before, there = mass, _at(mass, mass_kda, power)
         mass, variance = _least_squares(mass_kda, sigma_kda * there, factor)
-        if abs(mass - before) <= _SETTLED * abs(mass):
+        if abs(mass - before) <= _MASS_TOLERANCE * abs(mass):
             break
     there = _at(mass, mass_kda, power)
     _, bound = _least_squares(mass_kda, crb_kda * there, factor)
@@ -80,10 +80,10 @@ def combine_masses(
 
 
 def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
-    """Learn how a frame's information on the mass follows its estimate: p of J ∝ m^p.
+    """Estimate how the information of a frame grows with its own estimate: p of J ∝ m^p.
 
-    A line through ln J against ln m inside the tracks, with one slope for all, so that what differs
-    between particles takes no part.
+    The line through ln J against ln m has one slope for all tracks and an intercept for each, so
+    that differences between particles do not matter.
     """
     product = square = 0.0
     for mass, sigma in tracks:
@@ -95,14 +95,14 @@ def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
 
 
 def _at(common: float, own: FloatArray, power: float) -> FloatArray:
-    """Give what takes each frame's σ from its own estimate to the common mass."""
+    """Factor that scales each frame's σ from its own estimate to the common mass."""
     return np.asarray(np.abs(own / common) ** (power / 2) if power else np.ones_like(own))
 
 
 def _least_squares(
     values: FloatArray, sigma: FloatArray, factor: _Factor | None
 ) -> tuple[float, float]:
-    """Mean of values whose correlation has this factor, and its variance."""
+    """Weighted mean of correlated values, and its variance."""
     weights = _without_correlation(1 / sigma, factor) / sigma
     total = float(weights.sum())
     return float(weights @ values) / total, 1 / total

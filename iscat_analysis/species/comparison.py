@@ -57,7 +57,7 @@ COMPARISON_COLUMNS = (
 other's less the first's, intervals are 95 %, fractions are of the particles that came."""
 
 _TWO_SIDED_95 = 1.959964
-_BROAD = 0.3  # width over mass
+_MOST_RELATIVE_WIDTH = 0.3  # width over mass
 _TOLERANCE = 1e-9  # of the log-likelihood per event: 2·10⁻⁵ of χ² for 10 000 events
 
 
@@ -131,7 +131,7 @@ def compare(
     known = start.weight.size - int(background)
     samples = (first, other)
     seen = np.array([start.shares(events).sum(axis=0)[:known] for events in samples])
-    narrow = np.sqrt(start.variance[:known]) < _BROAD * start.mean[:known]
+    narrow = np.sqrt(start.variance[:known]) < _MOST_RELATIVE_WIDTH * start.mean[:known]
     moves = (seen.min(axis=0) >= LEAST_COMPARED) & narrow
     free = _Hypothesis(samples, start, known, moves, own_fractions=True)
     full = free.fit(start)
@@ -198,7 +198,7 @@ class _Hypothesis:
         self.limits = self._limits(start)
 
     def _limits(self, start: Mixture) -> Limits:
-        """Means may go halfway to their neighbours, and shifts as far."""
+        """Limits of parameters: a mean may go halfway to its neighbours, a shift as far."""
         at_mean, at_shift, at_width = (int(place) for place in self.places[3:6])
         low = np.full(int(self.places[-1]), -LOGIT_REACH)
         high, scale = -low, np.ones(low.shape)
@@ -216,7 +216,10 @@ class _Hypothesis:
         return Limits(low, high, scale)
 
     def theta(self, first: Mixture, other: Mixture) -> FloatArray:
-        """Parameters of species that are nearly this hypothesis's."""
+        """Parameters of a similar hypothesis, converted to this one.
+
+        Parameters of species that are nearly this hypothesis's.
+        """
         k = self.known
         logits = [np.log(np.maximum(m.weight, 1e-6)) - math.log(max(m.weight[0], 1e-6))
                   for m in (first, other)]  # fmt: skip
@@ -239,7 +242,7 @@ class _Hypothesis:
         )
 
     def against(self, full: Optimum, narrow: _Hypothesis) -> Test:
-        """Test a hypothesis inside this one, whose optimum is known."""
+        """Test a hypothesis that this one contains, whose optimum is known."""
         dof = full.theta.size - int(narrow.places[-1])
         if not dof:
             return Test(0.0, 0, math.nan)
@@ -290,14 +293,14 @@ class _Hypothesis:
         return pd.DataFrame(columns, columns=list(COMPARISON_COLUMNS))
 
     def _fractions(self, sample: int, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Fractions among the species of a sample, and their slopes."""
+        """Fractions among the species of a sample, and their derivatives."""
         weight = self.structures[sample].mixture(theta).weight[: self.known]
         part = weight / weight.sum()
         logits = self.structures[sample].design[0, : self.known]
         return part, part[:, None] * (logits - part @ logits)
 
     def _covariance(self, theta: FloatArray) -> FloatArray:
-        """Inverse of the observed information, over what is not at an end of its range."""
+        """Inverse of the observed information, without parameters at a limit."""
         samples = list(zip(self.samples, self.structures, strict=True))
         known = information(samples, theta, self.limits)
         margin = 1e-6 * (self.limits.high - self.limits.low)

@@ -68,7 +68,7 @@ def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
 
 
 def _reach(events: Events) -> float:
-    """Where the drawing ends: a few giants must not squeeze everything else."""
+    """Upper end of the figure: a few very heavy events must not compress all others."""
     most = float(np.quantile(events.x, 0.98)) * 1.3
     return min(float(events.x.max()), most) + 3 * float(np.median(events.sigma))
 
@@ -86,7 +86,7 @@ def _edges(events: Events) -> FloatArray:
 
 
 def _selected(events: Events, x: FloatArray) -> FloatArray:
-    """Probability that an event measured at x was detected, over the events' own noise."""
+    """Probability that an event of measured mass x was detected, averaged over its noise."""
     if events.efficiency is None:
         return np.ones(x.shape)
     extra = events.efficiency.extra_sigma(np.quantile(events.sigma, _NOISES))

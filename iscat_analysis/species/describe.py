@@ -55,9 +55,9 @@ is where its events lie at the lowest, without error or interval, and what came 
 its fraction; those of the others are among the others."""
 
 _TWO_SIDED_95 = 1.959964
-_ENDS = (0.025, 0.975)
+_INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
-_BROAD = 0.4  # width over mass
+_MOST_RELATIVE_WIDTH = 0.4  # width over mass
 _NO_LADDER = 0.01  # p-value
 _DIGITS = 6  # of the curves in summary.json
 
@@ -231,17 +231,17 @@ def _table(
     seen = share.sum(axis=0)
     outlier = seen < LEAST_SPECIES - 0.5
     efficiency = best.chance(events).mean(axis=0)
-    hidden = efficiency < LEAST_EFFICIENCY
-    hidden[known:] = False
+    undetectable = efficiency < LEAST_EFFICIENCY
+    undetectable[known:] = False
     some = np.arange(best.weight.size) < known
-    some &= ~hidden
+    some &= ~undetectable
     some &= ~outlier | outlier[some].all()
 
     def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
         if not values:
             nothing = np.full(best.weight.size, math.nan)
             return nothing, nothing
-        low, high = np.quantile(np.array(values), _ENDS, axis=0, method=_UNBIASED)
+        low, high = np.quantile(np.array(values), _INTERVAL_ENDS, axis=0, method=_UNBIASED)
         return low, high
 
     mass_low, mass_high = interval([r.mixture.mean for r in repeats])
@@ -270,7 +270,7 @@ def _table(
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
             "efficiency": searched * efficiency,
-            "stay_frames": _stay(events, best, window_frames),
+            "stay_frames": _residence(events, best, window_frames),
             "count_corrected": best.weight * best.arrived(events) / searched,
             "corrected_low": came_low / searched,
             "corrected_high": came_high / searched,
@@ -281,7 +281,7 @@ def _table(
     unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
     if found.structure is None:
         unknown += ["mass_se", "mass_low", "mass_high"]
-    table.loc[hidden, unknown] = math.nan
+    table.loc[undetectable, unknown] = math.nan
     if found.structure is not None:
         table["background"] = np.arange(best.weight.size) >= known
     if found.steps:
@@ -300,13 +300,13 @@ def _ladder(
     repeats: Sequence[Repeat],
     scale_error: Callable[[FloatArray], FloatArray] | None,
 ) -> LadderFit:
-    """Say what the monomer weighs."""
+    """Describe the mass of the monomer."""
     monomer, offset = choice.values(found)
     drawn = np.array([choice.values(found, r.mixture) for r in repeats]).reshape(-1, 2)
     error, low, high = (np.full(2, math.nan) for _ in range(3))
     if len(drawn) > 1:
         error = drawn.std(axis=0, ddof=1)
-        low, high = np.quantile(drawn, _ENDS, axis=0, method=_UNBIASED)
+        low, high = np.quantile(drawn, _INTERVAL_ENDS, axis=0, method=_UNBIASED)
     scale = np.zeros(1) if scale_error is None else scale_error(np.array([monomer]))
     below, above = (float(_widening(np.array([r]), scale)[0]) for r in
                     (monomer - low[0], high[0] - monomer))  # fmt: skip
@@ -319,7 +319,7 @@ def _ladder(
 
 
 def _doubts(ladder: LadderFit | None) -> list[str]:
-    """Say where a ladder is none."""
+    """List reasons why the masses may be no ladder."""
     if ladder is None or not ladder.p_value < _NO_LADDER:
         return []
     return [
@@ -329,8 +329,8 @@ def _doubts(ladder: LadderFit | None) -> list[str]:
     ]
 
 
-def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
-    """Frames that a particle of each species must stay to be found every other time."""
+def _residence(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
+    """Frames that a particle of each species must stay for a detection probability of one half."""
     if window_frames is None or events.efficiency is None:
         return np.full(best.mean.shape, math.nan)
     with np.errstate(divide="ignore"):  # one of no mass is never found
@@ -339,35 +339,35 @@ def _stay(events: Events, best: Mixture, window_frames: int | None) -> FloatArra
 
 
 def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
-    """By how much an end of a 95 % interval moves when the error of the scale is added."""
+    """Distance by which the error of the scale moves an end of a 95 % interval."""
     reach = np.maximum(reach, 0.0)
     return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
 def _remarks(species: pd.DataFrame) -> list[str]:
-    """Say of which species not to believe everything."""
+    """List reasons to doubt single species."""
     if "background" in species:
         species = species[~species["background"]]
-    hidden = species["efficiency"] < LEAST_EFFICIENCY
+    undetectable = species["efficiency"] < LEAST_EFFICIENCY
     cases = (
         (
-            hidden,
+            undetectable,
             f"of what lies at {{}} kDa or below fewer than {100 * LEAST_EFFICIENCY:g} % are "
             "detected: its mass and number are not determined, and fractions are of the others",
         ),
         (
-            (species["efficiency"] < 0.5) & ~hidden,
+            (species["efficiency"] < 0.5) & ~undetectable,
             "fewer than half of the particles of {} kDa are detected: their mass and number rest "
             "on the detection model",
         ),
         (
             species["outlier"],
-            f"what lies at {{}} kDa is fewer than {LEAST_SPECIES} events: outliers, and no species",
+            f"at {{}} kDa there are fewer than {LEAST_SPECIES} events: outliers, and no species",
         ),
         (
-            species["width_kda"] > _BROAD * species["mass_kda"],
-            "the species at {} kDa is as broad as a background: read it as what the other species "
-            "leave over",
+            species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
+            "the species at {} kDa is as broad as a background: it may hold all events that the "
+            "other species do not explain",
         ),
     )
     return [
@@ -378,25 +378,25 @@ def _remarks(species: pd.DataFrame) -> list[str]:
 
 
 def _brief(species: pd.DataFrame, window_frames: int | None) -> list[str]:
-    """Say for how long a particle must stay for its efficiency to be what the table says."""
+    """Say how long a particle must stay for its efficiency to be that of the table."""
     known = species[np.isfinite(species["stay_frames"].to_numpy(dtype=float)) & ~species["outlier"]]
     if window_frames is None or known.empty:
         return []
-    stays = ", ".join(
+    residence = ", ".join(
         f"{row.mass_kda:.3g} kDa from {count(round(row.stay_frames), 'frame')}"
         for row in known.itertuples()
     )
     return [
         "efficiencies and corrected counts are of particles that stay "
         f"{count(window_frames, 'frame')} or longer; briefer visitors are missed more often and "
-        f"appear lighter: every other one is found of {stays}"
+        f"appear lighter: every other one is found of {residence}"
     ]
 
 
 def _undescribed(
     events: Events, branch: Branch, draws: int, seed: int, notes: Sequence[str]
 ) -> Distribution:
-    """Events, but too few to say what they are."""
+    """Describe events that are too few for a mixture."""
     some = events.x.size > 0
     return Distribution(
         species=pd.DataFrame(columns=list(SPECIES_COLUMNS)),

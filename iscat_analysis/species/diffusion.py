@@ -26,7 +26,7 @@ from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.displacements import Displacements, gather
 
-_UM2 = 1e6  # nm²
+_NM2_PER_UM2 = 1e6  # nm²
 
 
 @dataclass(frozen=True)
@@ -140,15 +140,15 @@ def fit_diffusion(
     other, other_sigma = _covariance_based(track, best)
     spare = other_sigma**2 - crb**2
     return Diffusion(
-        d_um2_s=best / _UM2,
-        sigma_d_um2_s=sigma / _UM2,
-        crb_d_um2_s=crb / _UM2,
-        interval_um2_s=tuple(end / _UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
+        d_um2_s=best / _NM2_PER_UM2,
+        sigma_d_um2_s=sigma / _NM2_PER_UM2,
+        crb_d_um2_s=crb / _NM2_PER_UM2,
+        interval_um2_s=tuple(end / _NM2_PER_UM2 for end in _interval(track, best, level)),  # type: ignore[arg-type]
         level=float(level),
         log_likelihood=log_likelihood,
         n_positions=track.counted.size + 1,
-        covariance_d_um2_s=other / _UM2,
-        covariance_sigma_d_um2_s=other_sigma / _UM2,
+        covariance_d_um2_s=other / _NM2_PER_UM2,
+        covariance_sigma_d_um2_s=other_sigma / _NM2_PER_UM2,
         disagreement=(other - best) / math.sqrt(spare) if spare > 0 else math.nan,
     )
 
@@ -168,7 +168,7 @@ def estimate_diffusion(
         frame_rate_hz=frame_rate_hz, exposure_ms=exposure_ms, counted=counted,
     )  # fmt: skip
     best, sigma, *_ = _estimated(track)
-    return best / _UM2, sigma / _UM2
+    return best / _NM2_PER_UM2, sigma / _NM2_PER_UM2
 
 
 def _estimated(track: Displacements) -> tuple[float, float, float, float]:
@@ -299,13 +299,15 @@ def _covariance_based(track: Displacements, d_nm2_s: float) -> tuple[float, floa
     diagonal[1:-1] = track.linked[1:] & track.linked[:-1]
     if not diagonal.any():
         return math.nan, math.nan
-    beside = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
+    off_diagonal = np.where(track.linked, 0.5 * (diagonal[1:] + diagonal[:-1]), 0.0)
     time = 2 * float(track.gaps_s @ diagonal) * len(steps)
-    total = float(np.sum(diagonal * steps**2) + 2 * np.sum(beside * steps[:, 1:] * steps[:, :-1]))
+    total = float(
+        np.sum(diagonal * steps**2) + 2 * np.sum(off_diagonal * steps[:, 1:] * steps[:, :-1])
+    )
     variance = 0.0
     for error, band in zip(*track.error, strict=True):
         main, next_ = error + d_nm2_s * track.rate[0], band + d_nm2_s * track.rate[1]
-        variance += 2 * _square_trace((diagonal, beside), (main, next_))
+        variance += 2 * _square_trace((diagonal, off_diagonal), (main, next_))
     return total / time, math.sqrt(variance) / time
 
 

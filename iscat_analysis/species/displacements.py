@@ -68,7 +68,7 @@ class Displacements:
 
     @cached_property
     def linked(self) -> NDArray[np.bool_]:
-        """Whether a displacement ends where the next one begins, shape (m − 1,)."""
+        """Whether a displacement begins where the one before ended, shape (m − 1,)."""
         return np.asarray(np.diff(self.counted) == 1)
 
     @cached_property
@@ -85,7 +85,7 @@ class Displacements:
         return 2 * (self.gaps_s - blur), np.where(self.linked, blur, 0.0)
 
     def moved(self, positions_nm: FloatArray) -> Displacements:
-        """Give a track of the same frames and errors at other places.
+        """Replace the positions; frames and errors stay.
 
         Shapes: `positions_nm` (c, n).
         """
@@ -107,7 +107,7 @@ def gather(
     exposure_ms: float | None,
     counted: ArrayLike | None = None,
 ) -> Displacements:
-    """Check a track.
+    """Check the arrays of a track, and make its displacements.
 
     Shapes: `frames` (n,), `positions_nm` (n,) or (n, c).
     """

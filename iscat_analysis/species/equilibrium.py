@@ -50,7 +50,8 @@ from iscat_analysis.species.series import Free, Series
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID = 25
 _SIGMAS = 1.959964
-_ABOVE = 0.1  # of log-likelihood, by which no point of the profile may exceed the maximum
+# Of log-likelihood, by which no point of the profile may exceed the maximum
+_LOG_LIKELIHOOD_TOLERANCE = 0.1
 _FIRST_STEP = 0.1  # of ln K_D towards an end of its interval
 _PROFILE = 9  # points of the profile between the ends of the interval
 _STEP = 1e-4  # of ln K_D and of β, for their slopes
@@ -177,7 +178,7 @@ class _Equilibrium(Series):
         )
 
     def logits(self, theta: FloatArray) -> FloatArray:
-        """Give the logits of the species, as the constants want them."""
+        """Logits of the species that follow from the constants."""
         values = dict(zip(self.names[self.own :], theta[self.own :], strict=True))
         return landing_logits(
             self.model, self.totals, math.exp(values["ln_kd"]), values.get("inactive", 0.0),
@@ -237,7 +238,7 @@ def _interval(found: Minuit) -> tuple[float, float, FloatArray]:
     def deviance(ln_kd: float) -> float:
         found.values["ln_kd"] = ln_kd
         found.migrad()  # from where the last one ended
-        if found.fval < top - _ABOVE:
+        if found.fval < top - _LOG_LIKELIHOOD_TOLERANCE:
             raise DataError(
                 "K_D: the fit did not end at the largest likelihood, which lies near "
                 f"{math.exp(ln_kd):.3g} nM: give the masses, or hold the landing exponent"

@@ -1,4 +1,4 @@
-"""What is seen, and the chance that a particle is seen at all."""
+"""Events with masses, and the probability that a particle is detected."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ a protein as large as the wavelength 1e8.  Their squares, and ratios of these, a
 
 
 def possible(mass_kda: FloatArray, sigma_kda: FloatArray) -> BoolArray:
-    """Tell which events have a mass, of either sign, and an error that can be true.
+    """Tell which events have a possible mass and a possible error.
 
     Shapes: `mass_kda, sigma_kda` (n,), result (n,).
     """
@@ -29,7 +29,7 @@ def possible(mass_kda: FloatArray, sigma_kda: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True)
 class Efficiency:
-    """The chance that a particle is detected."""
+    """Probability that a particle is detected."""
 
     threshold_snr: float
     sigma_kda: float
@@ -44,7 +44,7 @@ class Efficiency:
 
     @property
     def threshold_kda(self) -> float:
-        """Mass that is detected every other time [kDa]."""
+        """Mass with a detection probability of one half [kDa]."""
         return self.threshold_snr * self.sigma_kda
 
     def __call__(self, mass_kda: ArrayLike) -> FloatArray:

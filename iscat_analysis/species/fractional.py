@@ -22,12 +22,13 @@ from iscat_analysis.species.displacements import Displacements
 
 _EXPONENTS = (0.02, 1.98)
 _LN_D = 20.0  # from ln D of free diffusion at most
-_FLASH = 1e-2  # an exposure this small a part of a lag blurs by a series; the closed form cancels
-_PART = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
-_SETTLED = 0.1  # standard errors: of a step of Newton's method that is the last one
+# An exposure this small a part of a lag blurs by a series; the closed form cancels
+_SHORT_EXPOSURE = 1e-2
+_EXPONENT_STEP = 1e-3  # of an exponent, for the derivatives of the mean-squared displacement
+_LAST_STEP_SIGMAS = 0.1  # standard errors: of a step of Newton's method that is the last one
 _NO_STEP = 1e-6  # of ln D and α
-_MOST = 50  # steps
-_SMALL = 80  # rows of a matrix that is not halved to be inverted
+_MOST_STEPS = 50  # steps
+_MOST_ROWS_DIRECT = 80  # rows of a matrix that is not halved to be inverted
 
 
 class Fractional(NamedTuple):
@@ -49,14 +50,14 @@ class _There(NamedTuple):
 
 
 class Lags(NamedTuple):
-    """Every distance in time between two frames, in frames, and which pair has which."""
+    """All time differences between frames, in frames, and the index of the one of each pair."""
 
     distinct: FloatArray
     which: NDArray[np.int64]
 
     @classmethod
     def of(cls, track: Displacements) -> Lags:
-        """Find those of a track."""
+        """Collect those of a track."""
         pairs = np.abs(np.subtract.outer(track.frames, track.frames))
         longest = int(pairs[0, -1])
         if longest < pairs.size:  # few gaps or none: all lags up to the longest
@@ -73,9 +74,9 @@ def most_likely_power(track: Displacements, free: float) -> Fractional:
     here = _likelihood(track, lags, free, 1.0)
     if not math.isfinite(here.value):
         return Fractional(here.value, free, 1.0, math.nan)
-    for _ in range(_MOST):
+    for _ in range(_MOST_STEPS):
         step, gain = _newton(here, low - at, high - at)
-        if 2 * gain < _SETTLED**2:
+        if 2 * gain < _LAST_STEP_SIGMAS**2:
             break
         there = _likelihood(track, lags, *_powers(at + step))
         while not there.value > here.value and np.abs(step).max() > _NO_STEP:
@@ -95,33 +96,34 @@ def _powers(at: FloatArray) -> tuple[float, float]:
 
 
 def _newton(here: _There, least: FloatArray, most: FloatArray) -> tuple[FloatArray, float]:
-    """Step to the vertex of the parabola within a range, and what the likelihood gains there."""
-    bends = here.curvature
-    if not (bends[1, 1] > 0 and np.linalg.det(bends) > 0):
-        bends = here.information
-    alpha = float(np.clip(np.linalg.solve(bends, here.slope)[1], least[1], most[1]))
-    ln_d = (here.slope[0] - bends[0, 1] * alpha) / bends[0, 0]
+    """Newton step inside a range, and the expected gain of the likelihood."""
+    curvature = here.curvature
+    if not (curvature[1, 1] > 0 and np.linalg.det(curvature) > 0):
+        curvature = here.information
+    alpha = float(np.clip(np.linalg.solve(curvature, here.slope)[1], least[1], most[1]))
+    ln_d = (here.slope[0] - curvature[0, 1] * alpha) / curvature[0, 0]
     step: FloatArray = np.array([float(np.clip(ln_d, least[0], most[0])), alpha])
-    return step, float(here.slope @ step - step @ bends @ step / 2)
+    return step, float(here.slope @ step - step @ curvature @ step / 2)
 
 
 def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> _There:
     """Log-likelihood of fractional Brownian motion, all axes; −∞ where rounding spoils it."""
     before, there, after = (
-        d * _msd(track, lags.distinct, power) for power in exponent + _PART * np.arange(-1, 2)
+        d * _msd(track, lags.distinct, power)
+        for power in exponent + _EXPONENT_STEP * np.arange(-1, 2)
     )
     motion = covariance(lags, there)
-    turn = covariance(lags, (after - before) / (2 * _PART))
-    bend = covariance(lags, (after - 2 * there + before) / _PART**2)
+    turn = covariance(lags, (after - before) / (2 * _EXPONENT_STEP))
+    motion_curvature = covariance(lags, (after - 2 * there + before) / _EXPONENT_STEP**2)
     n = len(motion)
     value, slope = -0.5 * track.steps_nm.size * math.log(2 * math.pi), np.zeros(2)
     curvature, information = np.zeros((2, 2)), np.zeros((2, 2))
-    for main, beside, steps in zip(*track.error, track.steps_nm, strict=True):
+    for main, off_diagonal, steps in zip(*track.error, track.steps_nm, strict=True):
         sigma = motion.copy()
         flat = sigma.reshape(n * n)
         flat[:: n + 1] += main
-        flat[1 :: n + 1] += beside
-        flat[n :: n + 1] += beside
+        flat[1 :: n + 1] += off_diagonal
+        flat[n :: n + 1] += off_diagonal
         try:
             inverse, log_determinant = _inverse(sigma)
         except np.linalg.LinAlgError:
@@ -130,32 +132,32 @@ def _likelihood(track: Displacements, lags: Lags, d: float, exponent: float) -> 
         z = inverse @ steps
         value -= float(steps @ z) / 2
         by_d = -main[:, None] * inverse  # Σ_a W
-        by_d[1:] -= beside[:, None] * inverse[:-1]
-        by_d[:-1] -= beside[:, None] * inverse[1:]
+        by_d[1:] -= off_diagonal[:, None] * inverse[:-1]
+        by_d[:-1] -= off_diagonal[:, None] * inverse[1:]
         by_d.reshape(n * n)[:: n + 1] += 1
         by_alpha = turn @ inverse
         force = np.array([by_d @ steps, by_alpha @ steps])  # Σ_a z
         trace = np.array([np.trace(by_d), np.trace(by_alpha)])
         slope += (force @ z - trace) / 2
-        told = np.empty((2, 2))
-        told[0, 0], told[1, 1] = (np.einsum("ij,ji", by, by) / 2 for by in (by_d, by_alpha))
-        told[0, 1] = told[1, 0] = np.einsum("ij,ji", by_d, by_alpha) / 2
+        fisher = np.empty((2, 2))
+        fisher[0, 0], fisher[1, 1] = (np.einsum("ij,ji", by, by) / 2 for by in (by_d, by_alpha))
+        fisher[0, 1] = fisher[1, 0] = np.einsum("ij,ji", by_d, by_alpha) / 2
         second = np.empty((2, 2))  # z·Σ_ab z − tr WΣ_ab
         second[0] = second[:, 0] = force @ z - trace
-        second[1, 1] = z @ bend @ z - np.einsum("ij,ij", inverse, bend)
-        curvature += force @ inverse @ force.T - told - second / 2
-        information += told
+        second[1, 1] = z @ motion_curvature @ z - np.einsum("ij,ij", inverse, motion_curvature)
+        curvature += force @ inverse @ force.T - fisher - second / 2
+        information += fisher
     return _There(value, slope, curvature, information)
 
 
 def _inverse(sigma: FloatArray) -> tuple[FloatArray, float]:
-    """Invert a covariance by halves, and give the logarithm of its determinant.
+    """Invert a covariance by halves, and compute the logarithm of its determinant.
 
-    That is products almost alone, during which, unlike in LAPACK's own inverse as SciPy calls it,
-    other threads go on.
+    This needs little but matrix products.  These release other threads, which LAPACK's inverse, as
+    SciPy calls it, does not.
     """
     n = len(sigma)
-    if n <= _SMALL:
+    if n <= _MOST_ROWS_DIRECT:
         factor = np.linalg.cholesky(sigma)
         out = np.asarray(np.linalg.inv(sigma), dtype=np.float64)
         return out, 2 * float(np.log(np.diag(factor)).sum())
@@ -182,7 +184,7 @@ def _msd(track: Displacements, lags: FloatArray, exponent: float) -> FloatArray:
         high = exponent + 2
         closed = (lags + e) ** high + np.abs(lags - e) ** high - 2 * lags**high
         closed /= e**2 * (exponent + 1) * high
-        far = lags * _FLASH > e
+        far = lags * _SHORT_EXPOSURE > e
         series = 1 + exponent * (exponent - 1) / 12 * (e / np.where(far, lags, 1.0)) ** 2
         smooth = np.where(far, smooth * series, closed)
     return np.asarray(2 * track.interval_s * (smooth - smooth[0]))

@@ -15,7 +15,7 @@ from functools import cache
 import scipy
 
 _SIGMAS = 1.959964
-_PRECISE = 1e-5  # of the parameter
+_TOLERANCE = 1e-5  # of the parameter
 
 
 def interval(
@@ -37,6 +37,6 @@ def interval(
                 return limit
             inner, outer = outer, min(max(best + reach, low), high)
             reach *= 2
-        return float(scipy.optimize.brentq(beyond, inner, outer, xtol=_PRECISE))
+        return float(scipy.optimize.brentq(beyond, inner, outer, xtol=_TOLERANCE))
 
     return end(low), end(high)

@@ -40,11 +40,11 @@ LEAST_LANDINGS = 10
 """Fewer landings have no rate that depends on time."""
 
 _TWO_SIDED_95 = 1.959964
-_STEEPEST = 200.0  # of kT
+_LARGEST_RATE_TIME = 200.0  # of kT
 _GRID = 400  # rates among which the maximum is looked for
-_PRECISE = 1e-7  # of its logarithm
+_RATE_TOLERANCE = 1e-7  # of its logarithm
 _SMALL = 1e-6  # of kT, below which series take over
-_ALIKE = 4.0  # standard errors between the masses of a pair
+_MASS_SIGMAS = 4.0  # standard errors between the masses of a pair
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,11 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
     def rise(x: float) -> float:
         return _middle(x) - mean
 
-    best = float(scipy.optimize.brentq(rise, -_STEEPEST, _STEEPEST, xtol=1e-10))
+    best = float(scipy.optimize.brentq(rise, -_LARGEST_RATE_TIME, _LARGEST_RATE_TIME, xtol=1e-10))
     top = height(best)
-    ends = interval(lambda x: 2 * (top - height(x)), best, -_STEEPEST, _STEEPEST, step=1.0)
+    ends = interval(
+        lambda x: 2 * (top - height(x)), best, -_LARGEST_RATE_TIME, _LARGEST_RATE_TIME, step=1.0
+    )
     flat = 2 * (top - height(0.0))
     # Information on ln λ₀ and x = kT: n, −n g', and that of ∫λ.
     slope = -_middle(best)
@@ -139,7 +141,7 @@ def pair_events(
     for leaving in leaves[np.argsort(frame[leaves], kind="stable")]:
         near = lands[tree.query_ball_point(place_px[leaving], radius_px)]
         error = np.hypot(sigma_kda[near], sigma_kda[leaving])
-        alike = np.abs(mass_kda[near] + mass_kda[leaving]) < _ALIKE * error
+        alike = np.abs(mass_kda[near] + mass_kda[leaving]) < _MASS_SIGMAS * error
         fit = [int(i) for i in near[alike & (frame[near] < frame[leaving])] if int(i) not in taken]
         if fit:
             taken[max(fit, key=lambda i: frame[i])] = int(leaving)
@@ -177,7 +179,10 @@ def unbinding_rate(
         around = float(grid[max(near - 1, 0)]), float(grid[min(near + 1, grid.size - 1)])
         best = float(
             scipy.optimize.minimize_scalar(
-                lambda x: -height(x), bounds=around, method="bounded", options={"xatol": _PRECISE}
+                lambda x: -height(x),
+                bounds=around,
+                method="bounded",
+                options={"xatol": _RATE_TOLERANCE},
             ).x
         )
     top = height(best)

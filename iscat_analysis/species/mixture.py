@@ -51,28 +51,28 @@ class Mixture:
         return np.asarray(np.exp(terms - logsumexp(terms, axis=1, keepdims=True)))
 
     def chance(self, events: Events) -> FloatArray:
-        """Probability that a particle of each species is seen, per event's noise (n or 1, k)."""
+        """Probability that a particle of each species is detected, for each noise (n or 1, k)."""
         if events.efficiency is None:
             return np.ones((1, self.mean.size))
         reach = np.sqrt(self.variance + events.filter_variance)
         return np.asarray(np.exp(log_ndtr((self.mean - events.efficiency.threshold_kda) / reach)))
 
     def arrived(self, events: Events) -> float:
-        """Particles that came for these events to be seen: Σ_i 1/Z_i."""
+        """Give the expected number of particles that arrived, detected or not: Σ_i 1/Z_i."""
         return float(
             np.sum(np.broadcast_to(1 / (self.chance(events) @ self.weight), events.x.shape))
         )
 
 
 def ascend(events: Events, start: Mixture) -> Mixture:
-    """Climb towards the maximum as if nothing were missed: a start for `structure.polish`."""
+    """EM steps without selection by the detector: a start for `structure.polish`."""
     weight, mean, variance = start.weight.copy(), start.mean.copy(), start.variance.copy()
     mixture_em(events.x, events.variance, weight, mean, variance, _EM_STEPS)
     return Mixture(weight, mean, variance)
 
 
 def height(events: Events, start: Mixture) -> float:
-    """Say how good a start is, as if nothing were missed."""
+    """Log-likelihood of a start, without selection by the detector."""
     return float(
         mixture_score(events.x, events.variance, start.weight, start.mean, start.variance)[0]
     )

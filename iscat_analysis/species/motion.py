@@ -24,7 +24,7 @@ from iscat_analysis.species.diffusion import most_likely
 from iscat_analysis.species.displacements import Displacements, gather
 from iscat_analysis.species.fractional import most_likely_power
 
-_UM2 = 1e6  # nm²
+_NM2_PER_UM2 = 1e6  # nm²
 STRETCH = 40
 """Displacements at least of a stretch of a track whose D is compared with that of the others."""
 
@@ -32,8 +32,8 @@ _MOST_STRETCHES = 25
 MOST_POSITIONS = 4000
 """Of a track whose exponent is tested."""
 
-_STIFFEST = 3.0  # times the frame rate: there a well is flat noise within one frame
-_SOFTEST = 0.3  # per length of the track: there a well is not felt
+_LARGEST_STIFFNESS = 3.0  # times the frame rate: there a well is flat noise within one frame
+_LEAST_STIFFNESS = 0.3  # per length of the track: there a well is not felt
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def anomalous_test(
         ratio=ratio,
         exponent=found.exponent,
         sigma_exponent=found.sigma_exponent,
-        d_um2_s=found.d_nm2_s / _UM2,
+        d_um2_s=found.d_nm2_s / _NM2_PER_UM2,
     )
 
 
@@ -215,17 +215,17 @@ def confinement_test(
     free = most_likely(track)
     if not free > 0:
         return ConfinementTest(1.0, 0.0, math.inf, 0.0)
-    ratio, d, stiffness = _well(track, free)
+    ratio, d, stiffness = _harmonic_trap(track, free)
     larger, p_value = 0, math.nan
     for number in range(1, turns + 1):
         drawn = _free_track(track, free, draw)
-        larger += _well(drawn, most_likely(drawn))[0] >= ratio
+        larger += _harmonic_trap(drawn, most_likely(drawn))[0] >= ratio
         p_value = (larger + 1) / (number + 1)
         if larger == enough:
             p_value = larger / number
             break
     size = math.sqrt(d / stiffness) if ratio > 0 else math.inf
-    return ConfinementTest(p_value, ratio, size, d / _UM2)
+    return ConfinementTest(p_value, ratio, size, d / _NM2_PER_UM2)
 
 
 def steadiness_test(
@@ -268,12 +268,12 @@ def steadiness_test(
     return float(chdtrc(count - 1, max(ratio, 0.0)))
 
 
-def _well(track: Displacements, free: float) -> tuple[float, float, float]:
+def _harmonic_trap(track: Displacements, free: float) -> tuple[float, float, float]:
     """Find the well of highest likelihood: the ratio, D [nm²/s] and κ [1/s]."""
     none = track.likelihood(free).value
     scale = free or float(np.mean(track.steps_nm**2 / track.rate[0]))
-    softest = _SOFTEST / float(track.gaps_s.sum())
-    stiffest = _STIFFEST / track.interval_s
+    softest = _LEAST_STIFFNESS / float(track.gaps_s.sum())
+    stiffest = _LARGEST_STIFFNESS / track.interval_s
 
     value, d, stiffness = most_likely_well(
         track.positions_nm, track.variance_nm2, track.gaps_s, track.exposure_s,

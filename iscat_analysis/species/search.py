@@ -1,4 +1,4 @@
-"""How many species: starts for one number after another, until BIC likes no more."""
+"""The number of species: fits with one after another, until BIC stops improving."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _POLISHED = 2  # starts, the best after climbing
 
 
 def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mixture]:
-    """Fit 1, 2, … species; stop after two numbers that BIC likes no better."""
+    """Fit 1, 2, … species; stop after two numbers without a better BIC."""
     fits: list[Mixture] = []
     most = min(max_species, max(1, events.x.size // 5))
     for k in range(1, most + 1):
@@ -42,7 +42,7 @@ def _spread_start(events: Events, k: int) -> Mixture:
 
 
 def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
-    """Add a narrow species where events crowd most above the model, or split the widest."""
+    """Add a narrow species at the largest excess of events, or split the widest species."""
     starts = []
     sigma = float(np.median(events.sigma))
     places = np.sort(events.x)
@@ -79,7 +79,7 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
 
 
 def joined_starts(fit: Mixture) -> list[Mixture]:
-    """Join two neighbours."""
+    """Merge two neighbouring species."""
     starts = []
     k = fit.weight.size
     for i in range(k - 1):

@@ -41,25 +41,26 @@ _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass
 _WIDEST = 0.35  # of the lightest: standard deviation of a species
 _LONGEST = 0.4  # of the lightest: a tail
-_UNEQUAL = 0.5  # of the squared width: how the widths of species differ
-_SKEW = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
-_BEND = 1.5  # of the logarithm of the background's density from one middle to another
+_WIDTH_SPREAD = 0.5  # of the squared width: how the widths of species differ
+_TAIL_SPREAD = 1.5  # of a peak's width: a tail; less, and a tail of one width is taken for a limit
+_BACKGROUND_SPREAD = 1.5  # of the logarithm of the background's density from one middle to another
 _FIRST_BACKGROUND, _BACKGROUND = -5.0, 2.0  # its logit
 _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detection
-_LIMIT = 0.5  # of the lightest mass: where the limit may lie about the lower end of the events
-_RISING = 0.02  # quantile of the events where their edge is sought
+# Of the lightest mass: where the limit may lie about the lower end of the events
+_LIMIT_SPREAD = 0.5
+_EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
 _NODES = 64
-_KINDS = 8  # of noise, in each table
-_NEAR = 0.4  # of the lightest mass: events of a peak
-_MAD = 1.4826
-_FAST = 0  # strategy of Minuit without second derivatives, which take n²/2 values
+_NOISE_KINDS = 8  # of noise, in each table
+_PEAK_REACH = 0.4  # of the lightest mass: events of a peak
+_SIGMA_PER_MAD = 1.4826
+_MINUIT_STRATEGY = 0  # strategy of Minuit without second derivatives, which take n²/2 values
 _TOLERANCE = 0.01  # of Minuit: 1e-5 of the log-likelihood
-_INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
+_LEAST_INSET = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The events of one table within the window, and how its detector sees it.
+    """The events of one table inside the mass window, and its detector.
 
     Shapes: `x, noise` (n,), `size, kind_noise` (c,), `nodes, steps` (g,), `seen` (c, g).
     """
@@ -78,7 +79,7 @@ class Window:
 
 @dataclass(frozen=True, eq=False)
 class Shared:
-    """What all tables have in common, of parameters; `Series.shared` makes it."""
+    """Parameters that all tables share; `Series.shared` makes it."""
 
     mean: FloatArray
     variance: FloatArray
@@ -130,7 +131,7 @@ class Series(ABC):
         if self.learned:
             names += ["limit", "spread of the limit"]
             edge = np.concatenate([t.x for t in self.tables if t.learned])
-            rise = float(np.quantile(edge, _RISING)) if edge.size else self.ends[0]
+            rise = float(np.quantile(edge, _EDGE_QUANTILE)) if edge.size else self.ends[0]
             low += [self.ends[0] - 3 * self.width, 0.25 * self.width]
             high += [max(1.3 * lightest, rise + self.width), 1.6 * self.width]
             start += [rise, _SOFT * self.width]
@@ -154,9 +155,9 @@ class Series(ABC):
         lightest = float(self.masses.min())
         found = []
         for mass in self.masses:
-            near = x[np.abs(x - mass) < _NEAR * lightest]
+            near = x[np.abs(x - mass) < _PEAK_REACH * lightest]
             if near.size > 0.05 * x.size:
-                found.append(_MAD * float(np.median(np.abs(near - np.median(near)))))
+                found.append(_SIGMA_PER_MAD * float(np.median(np.abs(near - np.median(near)))))
         return min(max(min(found, default=0.12 * lightest), 0.02 * lightest), 0.3 * lightest)
 
     def _middles(self) -> FloatArray:
@@ -170,7 +171,7 @@ class Series(ABC):
         return np.array([self.ends[0], *gaps, self.ends[1]])
 
     def _hats(self, x: FloatArray) -> FloatArray:
-        """Densities of area 1 that are each linear from one middle to the next."""
+        """Triangular basis functions of area 1 on the middles."""
         found = np.array([np.interp(x, self.knots, row) for row in np.eye(self.knots.size)])
         step = np.diff(self.knots)
         area = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))
@@ -186,7 +187,11 @@ class Series(ABC):
             low = min(max(low, known.threshold_kda), 0.5 * (low + high))
         inside = (table.x >= low) & (table.x < high)
         x, sigma = table.x[inside], table.sigma[inside]
-        parts = np.array_split(np.sort(sigma), _KINDS if np.ptp(sigma) > 0 else 1) if x.size else []
+        parts = (
+            np.array_split(np.sort(sigma), _NOISE_KINDS if np.ptp(sigma) > 0 else 1)
+            if x.size
+            else []
+        )
         size = np.array([float(part.size) for part in parts if part.size])
         each = np.array([float(part.mean()) for part in parts if part.size])
         points, steps = np.polynomial.legendre.leggauss(_NODES)
@@ -202,18 +207,18 @@ class Series(ABC):
         )  # fmt: skip
 
     def _priors(self) -> None:
-        """Middles and widths of what is known of combinations of parameters beforehand."""
+        """Mean and width of the prior of combinations of parameters."""
         lightest = float(self.masses.min())
         rows: list[tuple[dict[int, float], float, float]] = []
         place = self.parts
         rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
-        rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _UNEQUAL * self.width**2))
-        rows.append(({place + 3: 1.0}, 0.0, _SKEW * self.width))
+        rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _WIDTH_SPREAD * self.width**2))
+        rows.append(({place + 3: 1.0}, 0.0, _TAIL_SPREAD * self.width))
         bends = self.knots.size - 1
-        rows += [({place + 4 + bend: 1.0}, 0.0, _BEND) for bend in range(bends)]
+        rows += [({place + 4 + bend: 1.0}, 0.0, _BACKGROUND_SPREAD) for bend in range(bends)]
         if self.learned:
             at = self.shares - 2
-            rows.append(({at: 1.0}, float(self.first[at]), _LIMIT * lightest))
+            rows.append(({at: 1.0}, float(self.first[at]), _LIMIT_SPREAD * lightest))
             rows.append(({at + 1: 1.0}, _SOFT * self.width, _SOFTNESS * self.width))
         rows += [
             ({self.shares + n: 1.0}, _FIRST_BACKGROUND, _BACKGROUND) for n in range(self.number)
@@ -225,7 +230,7 @@ class Series(ABC):
         self.prior_middle = np.array([middle / width for _, middle, width in rows])
 
     def shared(self, theta: FloatArray) -> Shared:
-        """Give what parameters stand for."""
+        """Convert parameters to masses, widths and the shape of the background."""
         place = self.parts
         mean = self.composition @ theta[:place] + theta[place]
         light, heavy, tail = theta[place + 1 : place + 4]
@@ -249,7 +254,7 @@ class Series(ABC):
         return np.asarray(np.hstack([species, odds]) / (1 + odds))
 
     def value(self, theta: FloatArray, logits: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-likelihood with its priors, its slope, and that in the logits of the species.
+        """Log-likelihood with its priors, its gradient, and that in the logits of the species.
 
         Shapes: `theta` (at least `own`,), `logits` (tables, k), slopes (own,) and (tables, k).
         """
@@ -301,21 +306,25 @@ class Series(ABC):
     def maximum(self, start: FloatArray) -> Minuit:
         """Maximise the height from a start."""
         last = lru_cache(maxsize=1)(lambda theta: self.height(np.frombuffer(theta)))
-        inner = _INSIDE * (self.high - self.low)
+        inner = _LEAST_INSET * (self.high - self.low)
         search = Minuit(
             lambda theta: -last(theta.tobytes())[0],
             np.clip(start, self.low + inner, self.high - inner),
             grad=lambda theta: -last(theta.tobytes())[1],
             name=self.names,
         )
-        search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
+        search.errordef, search.strategy, search.tol = (
+            Minuit.LIKELIHOOD,
+            _MINUIT_STRATEGY,
+            _TOLERANCE,
+        )
         search.limits = list(zip(self.low, self.high, strict=True))
         search.errors = self.scale / math.sqrt(max(self.events, 1))
         return search.migrad()
 
 
 class Free(Series):
-    """A series whose weights are free in every table: their logits follow the other parameters."""
+    """A series whose weights are free in every table."""
 
     def __init__(
         self, tables: Sequence[Events], composition: FloatArray, masses: FloatArray

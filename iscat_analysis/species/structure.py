@@ -30,13 +30,13 @@ LOGIT_REACH = 12.0
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """How the species of one sample follow from the parameters."""
+    """Linear map from parameters to the species of one sample."""
 
     design: FloatArray
     origin: FloatArray
 
     def mixture(self, theta: FloatArray) -> Mixture:
-        """Give the species that parameters stand for.
+        """Make the species of some parameters.
 
         Shapes: `theta` (p,).
         """
@@ -45,7 +45,7 @@ class Structure:
         return Mixture(weight / weight.sum(), mean, np.maximum(variance, 0.0))
 
     def parameters(self, mixture: Mixture) -> FloatArray:
-        """Give the parameters of species that this structure made.
+        """Parameters of species that this structure made.
 
         Shapes: result (p,).
         """
@@ -57,7 +57,7 @@ class Structure:
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Where parameters may lie, and how far they typically move."""
+    """Limits of parameters, and typical steps."""
 
     low: FloatArray
     high: FloatArray
@@ -66,7 +66,7 @@ class Limits:
 
 @dataclass(frozen=True, eq=False)
 class Optimum:
-    """Where the likelihood is largest."""
+    """The maximum of the likelihood."""
 
     theta: FloatArray
     log_likelihood: float
@@ -137,7 +137,7 @@ def maximise(
 
 
 def free_structure(events: Events, k: int) -> tuple[Structure, Limits]:
-    """Let every weight and variance be free, and every mean where the detector tells of it."""
+    """Free weights and variances, and free means where the detector can see the species."""
     unit = max(float(np.median(events.sigma)), 1e-9)
     top = float(events.x.max())
     full = np.eye(3 * k)[:, 1:].reshape(3, k, 3 * k - 1)

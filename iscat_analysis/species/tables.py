@@ -46,13 +46,14 @@ from iscat_analysis.units import count
 UNKNOWN_SIGMA_KDA = 1.0
 """Error of an event whose table has none [kDa]."""
 
-_CLEAR = 3.0  # standard deviations above the threshold, where hardly any is missed
+_CLEAR_SIGMAS = 3.0  # standard deviations above the threshold, where hardly any is missed
 _LEAST_EXTRA = 0.05  # of σ_d: noise of the filter's estimate beyond that of the fit
-_ENOUGH = 10  # events to measure σ_d by
+_FEWEST_EVENTS = 10  # events to measure σ_d by
 _NEAR_EDGE = 10  # values that tell where a distribution begins
-_SHARP = 1e-6  # of a cut: its width
+_CUT_WIDTH = 1e-6  # of a cut: its width
 _OURS = ("fits.parquet", "fits.csv")
-_NEAREST = 0.5  # of the lightest mass, and the heaviest over it, between which an event must lie
+# Of the lightest mass, and the heaviest over it, between which an event must lie
+_LEAST_MASS_RATIO = 0.5
 _LARGEST = 2_000_000_000  # bytes
 _FRAMES, _PIXELS, _RATIOS = (0.0, 2.0**40), (0.0, 1e6), (0.0, 1e9)
 _RANGES = {
@@ -90,7 +91,10 @@ class EventTable:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What the user should know where the edge is taken for the limit of detection."""
+        """Notes for the user, also where the lightest event stands for the limit of detection.
+
+        Notes for the user, with one where the lightest event stands for the limit of detection.
+        """
         if self.edge_kda is None:
             return self.notes
         return (
@@ -108,9 +112,9 @@ def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
 
 
 def refuse_far(tables: Sequence[EventTable], masses_kda: Sequence[float], argument: str) -> None:
-    """Refuse masses of species that no event is near, as those in another unit."""
+    """Refuse masses of species without an event near them, such as masses in another unit."""
     seen = np.abs(np.concatenate([table.mass_kda for table in tables]))
-    low, high = _NEAREST * min(masses_kda), max(masses_kda) / _NEAREST
+    low, high = _LEAST_MASS_RATIO * min(masses_kda), max(masses_kda) / _LEAST_MASS_RATIO
     if not seen.size or ((seen >= low) & (seen <= high)).any():
         return
     middle = float(np.median(seen))
@@ -168,14 +172,14 @@ def event_table(
     edge = None
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
-        efficiency = _sharp(edge * (1 - 10 * _SHARP))
+        efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
     return replace(found, efficiency=efficiency, edge_kda=edge)
 
 
 def filter_efficiency(
     good: pd.DataFrame, threshold_snr: float, searched: float = 1.0
 ) -> Efficiency | None:
-    """Read the matched filter's efficiency, in the share that was searched, off its events."""
+    """Estimate the detection efficiency of the matched filter from its events."""
     mass, snr = (good[name].to_numpy(dtype=float) for name in ("mass_kda", "snr"))
     known = np.isfinite(mass) & (mass != 0) & (snr > 0) & np.isfinite(snr)
     mass, snr = np.abs(mass[known]), snr[known]
@@ -183,8 +187,8 @@ def filter_efficiency(
         return None
     each = mass / snr
     # Near the threshold those are seen whose estimate is too large; they would make σ_d too small.
-    clear = mass > (threshold_snr + _CLEAR) * float(np.median(each))
-    if np.count_nonzero(clear) >= _ENOUGH:
+    clear = mass > (threshold_snr + _CLEAR_SIGMAS) * float(np.median(each))
+    if np.count_nonzero(clear) >= _FEWEST_EVENTS:
         each = each[clear]
     elif "sigma_mass_kda" in good:
         sigma = good["sigma_mass_kda"].to_numpy(dtype=float)[known]
@@ -299,7 +303,7 @@ def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
 
 
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
-    """Take the rows that have a mass and are fit to be used."""
+    """Select rows with a mass and without a disqualifying flag."""
     if "mass_kda" not in table:
         raise DataError(
             f"{name}: has no column mass_kda; give fits.csv, a table of Refeyn's, or name the "
@@ -379,18 +383,18 @@ def _cut(found: EventTable, above_kda: float) -> EventTable:
 
 
 def _edge(values: FloatArray) -> float:
-    """Say where a distribution begins: the least value, less the mean distance of those near it."""
+    """Lower end of a distribution: the smallest value, less the mean distance of values near it."""
     few = np.sort(values)[:_NEAR_EDGE]
     return float(few[0] - (few[-1] - few[0]) / max(few.size - 1, 1))
 
 
 def _sharp(edge_kda: float) -> Efficiency:
-    """Everything above a mass is seen, and nothing below."""
-    return Efficiency(1 / _SHARP, edge_kda * _SHARP)
+    """Efficiency that is 1 above a mass and 0 below."""
+    return Efficiency(1 / _CUT_WIDTH, edge_kda * _CUT_WIDTH)
 
 
 def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
-    """Read threshold and noise of the filter off a table of ours."""
+    """Estimate threshold and noise of the filter from a table of this program."""
     good = table[table["status"] == Status.OK.value] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
     snr = snr[np.isfinite(snr) & (snr > 0)]

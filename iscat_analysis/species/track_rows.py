@@ -1,4 +1,4 @@
-"""Rows of one track, and which of them say what."""
+"""Rows of one track, and selections of them."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from iscat_analysis.records import BoolArray, FloatArray, Status, track_numbers
 NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
 """Of rows that do not say how a particle moves."""
 
-_USELESS = 300.0  # times the median error: such a place says nothing
+_LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
 
 
 @dataclass(frozen=True)
 class TrackRows:
-    """Rows of one track, or some of them, in the order of their frames; columns of ``fits.csv``."""
+    """Some rows of one track, sorted by frame; the columns of ``fits.csv``."""
 
     frame: FloatArray
     x_nm: FloatArray
@@ -36,29 +36,29 @@ class TrackRows:
     status: NDArray[np.object_]
 
     def only(self, kept: BoolArray | NDArray[np.int64]) -> TrackRows:
-        """Give some of the rows."""
+        """Select some of the rows."""
         return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
 
     def massive(self) -> TrackRows:
-        """Give the rows whose mass counts."""
+        """Select rows whose mass can be used."""
         known = np.isfinite(self.sigma_mass_kda) & np.isfinite(self.crb_mass_kda)
         return self.only(known & (self.mass_kda != 0) & (self.status == Status.OK))
 
     def placed(self) -> TrackRows:
-        """Give the rows whose place counts.
+        """Select rows whose position can be used.
 
-        A status that motion itself makes more likely must not choose, or fast steps would be
+        A flag that fast motion itself causes must not exclude a row, or fast steps would be
         missing.
         """
         errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
-        useful = errors <= _USELESS * of_known(np.median, errors)
+        useful = errors <= _LARGEST_ERROR_RATIO * of_known(np.median, errors)
         useful &= np.diff(self.frame, prepend=-1) > 0
         for status in NO_PLACE:
             useful &= self.status != status
         return self.only(useful)
 
     def timed(self, ticks: NDArray[np.int64] | None) -> TrackRows:
-        """Count the camera's intervals instead of frames, some of which are missing.
+        """Replace frame numbers by the count of camera intervals, where frames are missing.
 
         Shapes: `ticks` (t,).
         """
@@ -71,7 +71,7 @@ class TrackRows:
 
 
 def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
-    """Part a table by its tracks."""
+    """Divide a table by its tracks."""
     numbers = track_numbers(fits)
     known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
     rows = TrackRows(
@@ -84,7 +84,7 @@ def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
 
 
 def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
-    """Measure how near each track comes to any other in the same frame."""
+    """Smallest distance of each track to any other in the same frame [nm]."""
     own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
     frame, x, y = (
         np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
@@ -105,6 +105,6 @@ def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
 
 
 def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> float:
-    """Take a statistic of what is known."""
+    """Apply a statistic to the values that are finite."""
     known = values[~np.isnan(values)]
     return float(statistic(known)) if known.size else np.nan

@@ -65,20 +65,21 @@ SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
-_DOUBT = 0.1
+_MOST_DOUBTFUL_SHARE = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
-_LITTLE_TOLD = 0.05  # of the information on a mass is left by the background
-_SEEN = 0.9  # of all frames, in which a particle that hardly moves is seen at least
-_VAGUE = 0.02  # of a mass, which the background makes too uncertain for the error to be trusted
+_LEAST_KNOWN_SHARE = 0.05  # of the information on a mass is left by the background
+_LEAST_SEEN_SHARE = 0.9  # of all frames, in which a particle that hardly moves is seen at least
+# Relative error of a mass beyond which the error of D that it makes is reported.
+_LARGEST_SCALE_ERROR = 0.02
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
-_LOOKS = 3  # at D, on which it depends which displacements tell it
-_UM2 = 1e6  # nm²
+_DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
+_NM2_PER_UM2 = 1e6  # nm²
 
 
 @dataclass(frozen=True)
 class TrackSetup:
-    """What a movie and its configuration say of all tracks."""
+    """What all tracks of a movie share: times, optics, and the errors of the background."""
 
     frame_rate_hz: float | None
     exposure_ms: float | None
@@ -139,7 +140,7 @@ def describe_tracks(
 
 
 def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
-    """Say by how much the masses of all tracks change together."""
+    """Relative change of mass that all tracks share."""
     massive = [rows.massive() for rows in rows_by_track(fits).values()]
     return common_change([(g.frame, g.mass_kda, g.sigma_mass_kda) for g in massive], frames)
 
@@ -155,7 +156,7 @@ def _record(
     correlation: Correlation | None,
     exact: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Describe one track, but for the tests of its motion."""
+    """Make the row of one track, without the tests of its motion."""
     record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
     record |= {
         "track": track,
@@ -177,11 +178,11 @@ def _record(
             "mass_scatter": mass.scatter,
             "p_mass": mass.p_value,
         }
-    told = exact.get("told", 1.0)
+    known_share = exact.get("told", 1.0)
     if all(np.isfinite(value) for value in exact.values()):
         record |= {name: value for name, value in exact.items() if name != "told"}
-    scale = _scale_error(record, told)
-    record["short_way"] = told < _LITTLE_TOLD and scale > 2 * _VAGUE
+    scale = _scale_error(record, known_share)
+    record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
     massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
     each = of_known(np.median, massive.contrast / massive.mass_kda)
     record["contrast"] = record["mass_kda"] * each
@@ -201,7 +202,7 @@ def _record(
     return record | _ends(rows, setup, record["d_um2_s"])
 
 
-def _scale_error(record: Mapping[str, Any], told: float) -> float:
+def _scale_error(record: Mapping[str, Any], known_share: float) -> float:
     """Relative error of D by a background that was learnt with the track.
 
     What the frames of a particle that hardly moves have beyond their mean, which the background
@@ -209,11 +210,11 @@ def _scale_error(record: Mapping[str, Any], told: float) -> float:
     are too small by it, and D, as their square, by twice as much.
     """
     relative = record["sigma_mass_kda"] / (abs(record["mass_kda"]) or math.nan)
-    return 2 * relative * math.sqrt(1 - told) if np.isfinite(relative) else 0.0
+    return 2 * relative * math.sqrt(1 - known_share) if np.isfinite(relative) else 0.0
 
 
 def _wider(found: Diffusion, end: int, scale: float) -> float:
-    """Give an end of the interval of D, with the error of its scale."""
+    """End of the interval of D, with the error of its scale."""
     value, best = found.interval_um2_s[end], found.d_um2_s
     if value <= 0 or best <= 0:
         return value
@@ -230,7 +231,7 @@ def _mass(good: TrackRows, power: float, correlation: Correlation | None) -> Com
 
 
 def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
-    """Fit D to the displacements that begin so far inside that they cannot have left the field."""
+    """Fit D to displacements that begin so far inside that they cannot have left the field."""
     least = max(LEAST_POSITIONS, setup.min_frames)
     if setup.frame_rate_hz is None or len(placed.frame) < least:
         return None
@@ -238,10 +239,10 @@ def _diffusion(placed: TrackRows, setup: TrackSetup) -> Diffusion | None:
     gaps_s = np.diff(placed.frame) / setup.frame_rate_hz
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     inside, positions = np.ones(room.size, dtype=bool), placed.positions()
-    for _ in range(_LOOKS):
+    for _ in range(_DISPLACEMENT_PASSES):
         counted = inside
         d_um2_s, _ = estimate_diffusion(*positions, **times, counted=counted)
-        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _UM2 * gaps_s)
+        inside = room > _STEPS * np.sqrt(2 * d_um2_s * _NM2_PER_UM2 * gaps_s)
         if inside.sum() < least - 1:
             return None
         if np.array_equal(inside, counted):
@@ -291,7 +292,7 @@ def _motions(
     workers: int,
     progress: Progress,
 ) -> dict[int, tuple[Diffusion | None, dict[str, float]]]:
-    """Give D of tracks and the tests of their motion, of some where that is interrupted."""
+    """D of all tracks and the tests of their motion; an interrupt leaves tests out."""
 
     def motion(track: int) -> tuple[Diffusion | None, dict[str, float]]:
         found = _diffusion(places[track], setup)
@@ -311,12 +312,12 @@ def _motions(
 
 
 def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> dict[str, float]:
-    """Ask whether the motion is free, two tests of the first positions of a long track."""
+    """Test whether the motion is free; two of the tests use the first positions of long tracks."""
     whole = placed.positions()
     track = tuple(part[:TESTED_POSITIONS] for part in whole)
     times: Any = {"frame_rate_hz": setup.frame_rate_hz, "exposure_ms": setup.exposure_ms}
     walls = confinement_test(*track, **times, resamples=_FIRST_LOOK, enough=_ENOUGH, rng=rng)
-    if walls.p_value <= _DOUBT:
+    if walls.p_value <= _MOST_DOUBTFUL_SHARE:
         walls = confinement_test(*track, **times, resamples=_FULL_LOOK, rng=rng)
     power = anomalous_test(*track, **times)
     return {
@@ -330,7 +331,7 @@ def _tests(placed: TrackRows, setup: TrackSetup, rng: np.random.Generator) -> di
 
 
 def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
-    """Everything that makes a number of the track less than it seems, worst first."""
+    """List the flags of a track, the worst first."""
     seen = {
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
@@ -346,11 +347,11 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
 
 
 def _is_partly_seen(record: Mapping[str, Any], setup: TrackSetup) -> bool:
-    """Whether a particle that stays where it is all the movie is seen in a part of it."""
+    """Whether a particle that hardly moves is detected in only a part of the movie."""
     frames = setup.frames[1] - setup.frames[0]
-    if setup.frame_rate_hz is None or record["n_frames"] > _SEEN * frames:
+    if setup.frame_rate_hz is None or record["n_frames"] > _LEAST_SEEN_SHARE * frames:
         return False
-    way_nm = math.sqrt(2 * _UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
+    way_nm = math.sqrt(2 * _NM2_PER_UM2 * abs(record["d_um2_s"]) * frames / setup.frame_rate_hz)
     return way_nm < setup.hidden_nm
 
 
@@ -358,13 +359,13 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
     """Say whether the track begins and ends with the movie, at the border, or inside the field."""
     step_nm = 0.0
     if setup.frame_rate_hz is not None and np.isfinite(d_um2_s):
-        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _UM2 / setup.frame_rate_hz))
+        step_nm = 3 * float(np.sqrt(2 * d_um2_s * _NM2_PER_UM2 / setup.frame_rate_hz))
     border, room = setup.near_nm + step_nm, _room(rows, setup)
-    said = {}
+    ends = {}
     for which, at, frame in (("begins", 0, setup.frames[0]), ("ends", -1, setup.frames[1] - 1)):
         where = "border" if room[at] < border else "inside"
-        said[which] = "movie" if rows.frame[at] == frame else where
-    return said
+        ends[which] = "movie" if rows.frame[at] == frame else where
+    return ends
 
 
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:

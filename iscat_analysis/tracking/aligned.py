@@ -31,7 +31,7 @@ from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.common import variances_left
-from iscat_analysis.tracking.moving import Moving
+from iscat_analysis.tracking.moving import TrackedRows
 
 PHASES = 3
 """Parts of a pixel along each axis."""
@@ -64,12 +64,12 @@ class Aligned:
     frames: IntArray
 
     def packed(self) -> dict[str, NDArray[Any]]:
-        """Give the arrays that are kept on disk."""
+        """Give the arrays that are saved."""
         return {f"aligned_{part.name}": getattr(self, part.name) for part in fields(self)}
 
     @classmethod
     def unpacked(cls, data: Mapping[str, NDArray[Any]]) -> Aligned | None:
-        """Read what `packed` gave; None where there is none."""
+        """Make it of saved arrays; None where there are none."""
         names = [f"aligned_{part.name}" for part in fields(cls)]
         return cls(*(data[name] for name in names)) if names[0] in data else None
 
@@ -88,7 +88,7 @@ class Aligned:
         )
 
     def sight(self, context: AnalysisContext, number: int) -> ParticleImage:
-        """Give a picture to those who measure the microscope."""
+        """Give one picture in the form that the measurement of the microscope takes."""
         likelihood = self.likelihood(context, number)
         theta = self.theta[number]
         fit = context.config.fit
@@ -103,8 +103,8 @@ class Aligned:
         )  # fmt: skip
 
 
-def align(context: AnalysisContext, moving: Moving) -> Aligned:
-    """Put the frames of the brightest tracks on top of each other."""
+def align(context: AnalysisContext, moving: TrackedRows) -> Aligned:
+    """Superpose the frames of the brightest tracks."""
     side = _side(context)
     empty = np.zeros((0, side, side))
     nothing = np.zeros(0, dtype=np.int64)
@@ -124,20 +124,20 @@ def align(context: AnalysisContext, moving: Moving) -> Aligned:
 
 
 def _side(context: AnalysisContext) -> int:
-    """Give the largest odd side that the fitted square has, in the middle of which a pixel is."""
+    """Largest odd side within the fitted square, so that a pixel is in the middle."""
     return (context.roi_px - 1) // 2 * 2 + 1
 
 
 def _brightest(track: IntArray, snr: FloatArray, good: BoolArray) -> BoolArray:
-    """Rows of the tracks that say most of all."""
+    """Choose the rows of the tracks with the most information."""
     energy = np.bincount(track, weights=np.where(good, snr**2, 0.0))
     enough = np.bincount(track, weights=good) >= LEAST_FRAMES
     best = np.argsort(-np.where(enough, energy, -1.0), kind="stable")[:MOST_TRACKS]
     return np.asarray(good & np.isin(track, best[enough[best]]))
 
 
-def _single(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
-    """Take frames of their own, from all heights alike."""
+def _single(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
+    """Take single frames, from all heights alike."""
     rows = moving.rows
     ranked = chosen[np.argsort(rows.theta[chosen, 2], kind="stable")]
     some = np.linspace(0, len(ranked) - 1, min(MOST_SINGLE, len(ranked))).round().astype(np.int64)
@@ -156,7 +156,7 @@ def _single(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Align
     return Aligned(rows.track[chosen], counts, light, read, theta, np.ones(len(chosen), np.int64))
 
 
-def _summed(context: AnalysisContext, moving: Moving, chosen: IntArray) -> Aligned:
+def _summed(context: AnalysisContext, moving: TrackedRows, chosen: IntArray) -> Aligned:
     """Add up what is left over of rows, by track and part of the pixel."""
     rows, field, ground = moving.rows, moving.field, moving.ground
     side, pixel = _side(context), context.pixel_nm

@@ -18,18 +18,18 @@ from iscat_analysis.diagnosis.noise import Noise, judge_beside
 from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.aligned import Aligned, align
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.linking import typical_error
-from iscat_analysis.tracking.moving import follow
+from iscat_analysis.tracking.moving import find_rows_and_background
 from iscat_analysis.tracking.moving_table import common_masses, moving_table
 
 
 @dataclass(frozen=True)
 class Block:
-    """What was found in a block of frames."""
+    """The results of a block of frames."""
 
     span: tuple[int, int]
     rows: Localizations
@@ -83,12 +83,12 @@ def analyse_block(
     progress: Progress,
     cautious: bool = False,
 ) -> Block:
-    """Follow the particles of a block of frames."""
+    """Analyse the particles of a block of frames."""
     first, frames = span[0], span[1] - span[0]
     # Nearer to a border than this a track may go on in the next block.
     near = context.config.track.memory_frames + 1
     inner = (near if goes_on[0] else 0, frames - near if goes_on[1] else frames)
-    moving = follow(
+    moving = find_rows_and_background(
         context, movie, camera, span,
         check=check, pool=pool, progress=progress, inner=inner, cautious=cautious,
     )  # fmt: skip
@@ -101,15 +101,17 @@ def analyse_block(
 
     if not goes_on[0]:
         seen = rows.frame + first, rows.theta[:, :2]
-        pictures = beside(align, context, moving)
-        judged = beside(judge_beside, context, movie, camera, span, seen, field.used, without)
+        pictures = start_in_thread(align, context, moving)
+        judged = start_in_thread(
+            judge_beside, context, movie, camera, span, seen, field.used, without
+        )
     table, inside = moving_table(context, moving, first), field.holds(rows.theta)
     masses = common_masses(context, moving)
     best = table.loc[table[inside].groupby("track")["snr"].idxmax()]
     aligned, noise = None, Noise()
     if not goes_on[0]:
         aligned = pictures.result()
-        noise = judged.result().beside(table["chi2_reduced"].to_numpy(float))
+        noise = judged.result().compared_with_fits(table["chi2_reduced"].to_numpy(float))
         smeared = smear_warning(context.config, table, moving.smear_nm)
         if smeared:  # what is left over of pictures, far around them, is not the camera's
             noise = Noise(messages=(smeared,))
@@ -159,7 +161,7 @@ def row_view(
 
 
 class BlockStore(Checkpoint):
-    """Finished blocks of frames on disk."""
+    """Results of blocks on disk."""
 
     def load(self, number: int, span: tuple[int, int]) -> Block | None:
         """Give a finished block, or None."""

@@ -8,7 +8,7 @@ variance ∇Bᵀ V(T) ∇B/B², V the covariance of s within a block.  Of these 
     C(T) = T Σ_ij K_ij V_ij(T),   K_ij = ⟨∂_i B ∂_j B/B⟩ over the pixels,
 
 times the first.  A steady velocity v has V = v² T²/12, so that both are equal, C = 1, where
-T³ = 12/(K v²); blocks are longer by a factor of 1.7, `WORTH_COUNTING`.
+T³ = 12/(K v²); blocks are longer by a factor of 1.7, `MOST_DRIFT_OVER_COUNTING`.
 
 In the noise curve of landing movies, the variance between neighbouring averages of n frames over
 that of the light, the same drift is 1 + K v² n³/2.  But the curve is no measure of it here: where
@@ -43,7 +43,7 @@ SHORTEST = 25
 """Frames of a block at least, where drift makes it short: in fewer, particles hardly leave where
 they are, and are taken for background."""
 
-WORTH_COUNTING = 5.0
+MOST_DRIFT_OVER_COUNTING = 5.0
 """Drift over counting noise, C, that a block may have.  A particle pays more for counting noise
 than a pixel does: it stays at a place for many frames and makes the same error in all of them,
 while the errors that a steady drift makes before and after the middle of a block cancel."""
@@ -80,7 +80,7 @@ class Plan:
         }
 
     def message(self, name: str) -> str:
-        """Say in one line why there are several blocks; empty where nothing needs to be said."""
+        """Say why there are several blocks; empty where that needs no message."""
         if not self.drifts or self.moved_px is None or self.drift_over_counting is None:
             return ""
         y, x = self.moved_px
@@ -88,7 +88,7 @@ class Plan:
             f"{name}: the fixed pattern moves, by {x:+.3f} pixels in x and {y:+.3f} in y in all; "
             f"{len(self.spans)} blocks of {self.frames} frames have backgrounds of their own"
         )
-        if self.drift_over_counting > WORTH_COUNTING:
+        if self.drift_over_counting > MOST_DRIFT_OVER_COUNTING:
             text += (
                 f", which still change by {self.drift_over_counting:.2g} times their counting "
                 "noise: masses scatter more than their errors say; let the stage settle, or record "
@@ -123,19 +123,21 @@ def plan_blocks(
         )
     if given is not None or frames < 2 * SHORTEST or min(movie.shape[1:]) < _SMALLEST_PX:
         return Plan(_spans(first, last, count))
-    way, stiffness = follow_light(movie, camera, (first, last), config, check=check, mapper=mapper)
-    if way is None:
+    motion, stiffness = follow_light(
+        movie, camera, (first, last), config, check=check, mapper=mapper
+    )
+    if motion is None:
         return Plan(_spans(first, last, count))
-    shift = way.at(np.arange(first, last, dtype=float))
+    shift = motion.at(np.arange(first, last, dtype=float))
     moved = (float(shift[-1, 0] - shift[0, 0]), float(shift[-1, 1] - shift[0, 1]))
-    unrest = float(np.sum(stiffness * _unrest(way.shift_px)))
+    unrest = float(np.sum(stiffness * _jitter_covariance(motion.shift_px)))
 
     def cost_of(count: int) -> float:
         whole = drift_over_counting(shift, stiffness, _spans(0, frames, count))
         return max(whole - unrest * frames / count, 0.0)
 
     least, most, cost = count, max(count, frames // SHORTEST), cost_of(count)
-    while cost > WORTH_COUNTING and count < most:
+    while cost > MOST_DRIFT_OVER_COUNTING and count < most:
         count += 1
         cost = cost_of(count)
     return Plan(_spans(first, last, count), moved, cost, count > least)
@@ -164,7 +166,7 @@ def follow_light(
     check: Callable[[NDArray[Any], int], None],
     mapper: Mapper = map,
 ) -> tuple[Trajectory | None, FloatArray]:
-    """Follow the fixed pattern through a movie, and say how much light its motion moves.
+    """Measure how the fixed pattern moves through a movie, and its stiffness per squared pixel.
 
     Shapes: `stiffness` (2, 2).
     """
@@ -194,11 +196,11 @@ def follow_light(
         return None, np.zeros((2, 2))
     power = light * lengths.sum() / light.sum()
     middle = np.array([(low + high - 1) / 2 for low, high in spans])
-    way = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
+    motion = follow_pattern(sums, power, middle, usable, read, mapper=mapper)
     inside = trusted(usable)
-    if way is None or not inside.any() or not np.isfinite(way.shift_px).all():
+    if motion is None or not inside.any() or not np.isfinite(motion.shift_px).all():
         return None, np.zeros((2, 2))
-    return way, _stiffness(sums / lengths[:, None, None], read, inside, lengths)
+    return motion, _stiffness(sums / lengths[:, None, None], read, inside, lengths)
 
 
 def _stiffness(
@@ -214,13 +216,13 @@ def _stiffness(
     return total / len(means_e)
 
 
-def _unrest(shift_px: FloatArray) -> FloatArray:
-    """Covariance (2, 2) of what pulls at single shifts, as bright particles do.
+def _jitter_covariance(shift_px: FloatArray) -> FloatArray:
+    """Covariance (2, 2) of errors of single shifts, such as bright particles make.
 
-    It is that of second differences, over 6, in which a steady drift does not show.
+    It is that of second differences over 6, in which a steady drift does not show.
     """
-    bends = np.diff(shift_px, n=2, axis=0)
-    return bends.T @ bends / (6 * max(len(bends), 1))
+    second_difference = np.diff(shift_px, n=2, axis=0)
+    return second_difference.T @ second_difference / (6 * max(len(second_difference), 1))
 
 
 def _spans(first: int, last: int, count: int) -> tuple[tuple[int, int], ...]:

@@ -1,7 +1,7 @@
-"""What all particles of a movie do at once: none of them moves because another does.
+"""Motion that all particles of a movie share, although none moves because of another.
 
-A stage or a beam that vibrates moves all of them by the same; a frame that is missing makes all of
-them go as far as in two.  Both make D too large, and no single track shows it.
+A vibrating stage or beam moves all of them by the same.  Where a frame is missing, all of them go
+as far as in two frames.  Both make D too large, and no single track shows it.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from iscat_analysis.records import BoolArray, FloatArray, Status
 from iscat_analysis.species.track_rows import NO_PLACE
 
-LEAST_TOGETHER = 3
+FEWEST_PARTICLES = 3
 """Particles in a pair of frames, at least."""
 
-WORTH_SAYING = 0.05
+LEAST_COMMON_SHARE = 0.05
 """Of the square of a particle's step, what is common to all, from which on it is said."""
 
-MANY = 8
+MANY_FRAMES_MISSING = 8
 """Frames missing at once, which are not the run of two or three where single ones are dropped."""
 
 _SOUND = 0.5  # of a track's rows that are ok: others may be two halves of something else
@@ -62,21 +62,21 @@ class _Steps:
 def warnings_of(
     fits: pd.DataFrame, frame_rate_hz: float | None, ticks: IntArray | None = None
 ) -> Iterator[str]:
-    """Say what all particles do at once; `ticks` (t,) tells which frames are missing."""
+    """Warn of motion that all particles share; `ticks` (t,) tells which frames are missing."""
     steps = _steps_of(fits, ticks)
     if steps is None:
         return
-    shaken = _shaking(steps, frame_rate_hz)
+    shaken = _shared_steps(steps, frame_rate_hz)
     if shaken:
         yield shaken
     jumps, dropped = _jumps(steps), _dropped(steps)
-    many = [said for missing, said in jumps if missing >= MANY]
+    many = [text for missing, text in jumps if missing >= MANY_FRAMES_MISSING]
     if many:
         yield from many
     elif dropped and not shaken:
         yield dropped
     else:
-        yield from (said for _, said in jumps)
+        yield from (text for _, text in jumps)
 
 
 def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
@@ -95,22 +95,21 @@ def _steps_of(fits: pd.DataFrame, ticks: IntArray | None) -> _Steps | None:
         mine = track == k
         if mine.sum() >= _LEAST_STEPS:
             variance[mine] = np.median((xy[mine] ** 2).sum(axis=1)) / (2 * math.log(2))
-    told = variance > 0
-    numbers, count = np.unique(frame[told], return_counts=True)
-    numbers = numbers[count >= LEAST_TOGETHER]
-    told &= np.isin(frame, numbers)
+    used = variance > 0
+    numbers, count = np.unique(frame[used], return_counts=True)
+    numbers = numbers[count >= FEWEST_PARTICLES]
+    used &= np.isin(frame, numbers)
     if len(numbers) < _LEAST_PAIRS:
         return None
-    order = np.flatnonzero(told)[np.argsort(frame[told], kind="stable")]
+    order = np.flatnonzero(used)[np.argsort(frame[used], kind="stable")]
     pair = np.searchsorted(numbers, frame[order]).astype(np.int64)
     return _Steps(pair, numbers.astype(np.int64), xy[order], variance[order])
 
 
-def _shaking(steps: _Steps, frame_rate_hz: float | None) -> str:
+def _shared_steps(steps: _Steps, frame_rate_hz: float | None) -> str:
     """Say that all particles move by the same from frame to frame; empty where they do not.
 
-    What two particles have in common is the mean product of their steps, of which the product of
-    a particle's step with itself, and so what one does that is lost, is no part.
+    The variance of the common step is the mean product of the steps of two different particles.
     """
     length = np.hypot(*steps.step.T) / np.sqrt(steps.variance)
     cut = steps.step * np.minimum(1, _LONGEST / np.maximum(length, _LONGEST))[:, None]
@@ -121,7 +120,9 @@ def _shaking(steps: _Steps, frame_rate_hz: float | None) -> str:
     product = both[0] + both[1] - own
     mean, error = product.mean(), product.std() / math.sqrt(len(product))
     common = float(product.sum() / (2 * pairs.sum()))  # variance along each axis
-    if mean < _SIGNIFICANT * error or common < WORTH_SAYING * float(np.median(steps.variance)):
+    if mean < _SIGNIFICANT * error or common < LEAST_COMMON_SHARE * float(
+        np.median(steps.variance)
+    ):
         return ""
     by = ""
     if frame_rate_hz is not None:
@@ -133,15 +134,15 @@ def _shaking(steps: _Steps, frame_rate_hz: float | None) -> str:
     )
 
 
-def _surprise(steps: _Steps) -> tuple[FloatArray, FloatArray]:
-    """|step|²/2v of each step, 1 on average, and how many steps each pair of frames has."""
+def _normalized_squares(steps: _Steps) -> tuple[FloatArray, FloatArray]:
+    """Give |step|²/2v of each step, 1 on average, and the number of steps of each frame pair."""
     square = (steps.step**2).sum(axis=1) / (2 * steps.variance)
     return square, steps.total(np.ones(len(steps.frame)))
 
 
 def _jumps(steps: _Steps) -> list[tuple[int, str]]:
-    """Say where all particles go so far that frames must be missing, and how many."""
-    surprise, particles = _surprise(steps)
+    """Find frames between which all particles go so far that frames must be missing."""
+    surprise, particles = _normalized_squares(steps)
     total = steps.total(surprise)
     largest = np.zeros(len(total))
     np.maximum.at(largest, steps.frame, surprise)
@@ -169,7 +170,7 @@ def _jumps(steps: _Steps) -> list[tuple[int, str]]:
 
 def _dropped(steps: _Steps) -> str:
     """Say that many single frames are missing; empty where they are not."""
-    surprise, particles = _surprise(steps)
+    surprise, particles = _normalized_squares(steps)
     clipped = np.minimum(surprise, _CLIPPED)
     # mean of exp(½ min(e, c)) over e of mean 1: what the clipped odds must be divided by
     norm = 2 - math.exp(-_CLIPPED / 2)

@@ -23,8 +23,9 @@ LEAST_SHARE = 0.5
 """Of its track's mass that it needs beside another: one particle is not two of half the mass."""
 
 _SWEEPS = 6  # fits in turn of particles that overlap
-_MEETING = 1.5  # resolutions λ/NA within which particles are fitted from their predictions
-_SAME = 0.25  # resolutions within which two rows are one particle
+# Resolutions λ/NA within which particles are fitted from their predictions
+_MEETING_RESOLUTIONS = 1.5
+_SAME_RESOLUTIONS = 0.25  # resolutions within which two rows are one particle
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class _End:
 
     track: int
     frame: int
-    way: int
+    direction: int
 
 
 def extended(
@@ -44,7 +45,7 @@ def extended(
     resolution_nm: float,
     reach_nm: float,
 ) -> tuple[Localizations, int]:
-    """Let tracks go on from their ends as far as the movie shows them."""
+    """Continue tracks beyond their ends as long as the movie shows their particles."""
     tracks = int(rows.track.max(initial=-1)) + 1
     if not tracks:
         return rows, 0
@@ -57,11 +58,11 @@ def extended(
         ends += [_End(k, int(rows.frame[mine[-1]]), 1), _End(k, int(rows.frame[mine[0]]), -1)]
     refitted: dict[int, Localizations] = {}
     added = 0
-    meeting, same = _MEETING * resolution_nm, _SAME * resolution_nm
+    meeting, same = _MEETING_RESOLUTIONS * resolution_nm, _SAME_RESOLUTIONS * resolution_nm
     while ends:
         proposed: dict[int, dict[int, _End]] = {}
         for end in ends:
-            t = end.frame + end.way
+            t = end.frame + end.direction
             if not 0 <= t < field.frames or end.track in frames[t]:
                 continue
             here = frames[end.frame][end.track]
@@ -81,24 +82,24 @@ def extended(
             of_frame = np.flatnonzero(fitted.frame == t)
             found = {int(fitted.track[i]): fitted.theta[i] for i in of_frame}
             sure = {int(fitted.track[i]): bool(good[i]) for i in of_frame}
-            kept = []
+            accepted = []
             for k, end in new.items():
                 theta, last = found[k], frames[end.frame][k]
-                beside = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
-                alone = min(beside, default=np.inf) > meeting
+                distances = [np.hypot(*(theta - o)[:2]) for j, o in found.items() if j != k]
+                alone = min(distances, default=np.inf) > meeting
                 heavy = theta[3] > LEAST_SHARE * typical[k]
                 step = np.hypot(*(theta - last)[:2])
-                apart = min(beside, default=np.inf) > same
+                apart = min(distances, default=np.inf) > same
                 if sure[k] and (alone or heavy) and apart and step < reach_nm:
-                    kept.append(end)
-            if not kept:
+                    accepted.append(end)
+            if not accepted:
                 continue
             for k, theta in found.items():
-                if k in frames[t] or k in {end.track for end in kept}:
+                if k in frames[t] or k in {end.track for end in accepted}:
                     frames[t][k] = theta
-            added += len(kept)
+            added += len(accepted)
             refitted[t] = fitted.only(of_frame)
-            ends += [_End(end.track, t, end.way) for end in kept]
+            ends += [_End(end.track, t, end.direction) for end in accepted]
     rows = replace(rows, group=blur[rows.track])
     if not refitted:
         return rows, 0
@@ -113,7 +114,7 @@ def extended(
 
 
 class _Frames(dict[int, dict[int, FloatArray]]):
-    """θ of every particle by frame and track, made where it is asked for."""
+    """Parameters of every particle by frame and track; an entry is made when it is asked for."""
 
     def __init__(self, rows: Localizations, frames: int) -> None:
         super().__init__()
@@ -133,7 +134,7 @@ def _starts(
     blur: np.ndarray,
     meeting_nm: float,
 ) -> Localizations:
-    """Give the rows of the frames in question, those that meet at their predictions."""
+    """Give the starting rows of frames into which tracks are extended, with their neighbours."""
     frame, track, theta = [], [], []
     for t, new in proposed.items():
         rows = {k: value.copy() for k, value in frames[t].items()}

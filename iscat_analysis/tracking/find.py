@@ -22,12 +22,12 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import (
     fixed_height_warning,
     misfit_warning,
+    pattern_jitter_warning,
     pixel_warnings,
-    shaking_warning,
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.checkpoint import GOES_ON, saying
+from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, saying
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import fit_field
@@ -47,20 +47,20 @@ from iscat_analysis.records import (
     make_rows,
 )
 from iscat_analysis.search.sliding import DARK, well_lit
-from iscat_analysis.threads import beside, threads
+from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.tracking.blocks import Plan, plan_blocks
 from iscat_analysis.tracking.frame_search import link
 from iscat_analysis.tracking.frame_subset import keep_frames
 from iscat_analysis.tracking.held_height import held_height_warning
 from iscat_analysis.tracking.joining import join_blocks
-from iscat_analysis.tracking.moving_field import track_scene
-from iscat_analysis.tracking.tracked_optics import Begun, learn_from_tracks
+from iscat_analysis.tracking.moving_field import tracking_context
+from iscat_analysis.tracking.tracked_optics import TrialTracks, learn_from_tracks
 from iscat_analysis.trust.null_field import FrameNoise
 
 _STEPS = 100  # of the progress of a block
 _PATTERN = 6  # places in a frame that are taken for the light's unevenness,
-_NEARLY_ALL = 0.8  # where so many of them are no particles
+_PATTERN_SHARE = 0.8  # where so many of them are no particles
 
 
 def find_moving(ready: Prepared, run: Run) -> DetectionResult:
@@ -74,14 +74,14 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         run.warn(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
-    shaking = beside(shaking_warning, movie, camera, (first, last))
+    jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
     if message := plan.message(movie.name):
         run.warn(message)
-    shaken = shaking.result()
-    if shaken:
-        run.warn(f"{movie.name}: {shaken}")
+    jitter_warning = jitter_future.result()
+    if jitter_warning:
+        run.warn(f"{movie.name}: {jitter_warning}")
     run.clock.lap("background")
     identity = ready.steady.identity if run.partial else ""
     shelves: list[BlockStore] = []
@@ -90,15 +90,15 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         shelves.append(BlockStore(folder, config, identity, ready.shape, (first, last), camera))
         return shelves[-1]
 
-    with _saying_what_is_kept(shelves, plan), threads(config.compute.workers) as pool:
+    with _with_resumption_hint(shelves, plan), threads(config.compute.workers) as pool:
 
-        def begin(config: Config, *, cautious: bool = False) -> Begun:
-            context = track_scene(config, ready.shape, max(last - first, 1), ready.lines)
+        def begin(config: Config, *, cautious: bool = False) -> TrialTracks:
+            context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
             block = _analysed(
                 context, movie, camera, plan, shelf(config, None if cautious else run.partial), 0,
                 check=check, pool=pool, progress=run.progress, cautious=cautious,
             )  # fmt: skip
-            return Begun(config, context, block)
+            return TrialTracks(config, context, block)
 
         begun, learned = learn_from_tracks(
             config, begin, name=movie.name, pool=pool, warn=run.warn, notify=run.notify
@@ -118,12 +118,12 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
             if held:
                 run.warn(held)
     windows = joined.followed.windows
-    for text in () if shaken else blocks[0].noise:
+    for text in () if jitter_warning else blocks[0].noise:
         run.warn(text)
     for text in pixel_warnings(*windows.left_out):
         run.warn(text)
     if not len(joined.fits) and not interrupted:
-        run.warn(f"{movie.name}: {_nothing_found(context, blocks[0])}")
+        run.warn(f"{movie.name}: {_no_particle_message(context, blocks[0])}")
     run.clock.lap("track")
     found = DetectionResult(
         context=replace(context, mode="track", config=config),
@@ -141,13 +141,13 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
 
 
 @contextmanager
-def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
-    """Say in an interrupt whether a block was finished, from which the same command goes on."""
+def _with_resumption_hint(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[None]:
+    """Add to an interrupt whether a block was finished, from which the same command resumes."""
     try:
         yield
     except KeyboardInterrupt as stop:
         if any(shelf.kept for shelf in shelves):
-            raise saying(stop, GOES_ON) from None
+            raise saying(stop, RESUMPTION_HINT) from None
         parts = f"in {len(plan.spans)} of them, of which the first is not"
         if len(plan.spans) == 1:
             parts = f"in one of {plan.frames} frames, which is not"
@@ -158,17 +158,17 @@ def _saying_what_is_kept(shelves: Sequence[BlockStore], plan: Plan) -> Iterator[
         raise saying(stop, nothing) from None
 
 
-def _nothing_found(context: AnalysisContext, block: Block) -> str:
-    """Say why a movie may show no particle: how far one stands out of a frame's noise."""
+def _no_particle_message(context: AnalysisContext, block: Block) -> str:
+    """Say why a movie may show no particle: compare its signal with the noise of a frame."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     light, mass = float(block.level[block.used].mean()), model.material.mass_kda
     signal = model.image(grid, 0.0, 0.0, model.height_nm, mass)
     height = math.sqrt(light * float(np.sum(signal**2)))
     return (
-        f"no particle was found: over {light:.3g} e per pixel and frame one of particle.mass_kda = "
-        f"{mass:.4g} stands out of the noise of a frame by {height:.2g} standard deviations, and "
-        f"{context.templates.threshold:.2g} are needed; if there are particles, record with more "
-        "light, or longer exposures"
+        f"no particle was found: with {light:.3g} e per pixel and frame, a particle of "
+        f"particle.mass_kda = {mass:.4g} has a signal-to-noise ratio of {height:.2g} in a frame, "
+        f"and the threshold is {context.templates.threshold:.2g}; if there are particles, record "
+        "with more light, or longer exposures"
     )
 
 
@@ -216,30 +216,30 @@ def _analysed(
     progress: Progress,
     cautious: bool = False,
 ) -> Block:
-    """Give a block of a movie, kept or analysed now."""
+    """Load a finished block, or analyse it."""
     count, span = len(plan.spans), plan.spans[number]
-    told = progress if count == 1 else _part_of(progress, number, count)
+    block_progress = progress if count == 1 else _part_of(progress, number, count)
     block = store.load(number, span)
     if block is not None:
-        told("track", 1, 1)
+        block_progress("track", 1, 1)
         return block
     block = analyse_block(
         context, movie, camera, span,
         goes_on=(number > 0, number + 1 < count),
-        check=check, pool=pool, progress=told, cautious=cautious,
+        check=check, pool=pool, progress=block_progress, cautious=cautious,
     )  # fmt: skip
     store.save(number, block)
     return block
 
 
 def _part_of(progress: Progress, number: int, count: int) -> Progress:
-    """Tell the progress of one block as that of all; reading is no stage of its own."""
+    """Report the progress of one block as progress of all blocks."""
 
-    def told(stage: str, done: int, total: int) -> None:
+    def of_all(stage: str, done: int, total: int) -> None:
         if stage == "track":
             progress(stage, round(_STEPS * (number + done / total)), _STEPS * count)
 
-    return told
+    return of_all
 
 
 def track_frames(
@@ -312,9 +312,9 @@ def track_frames(
 
 
 def _refuse_pattern(doubt: str, frame: int, events: Sequence[Event]) -> None:
-    """Refuse to follow what is fixed, where it is that which is found in a frame."""
+    """Refuse a movie in which the fixed pattern was found instead of particles."""
     poor = sum(Status.POOR_FIT in event.flags for event in events)
-    if len(events) >= _PATTERN and poor >= _NEARLY_ALL * len(events):
+    if len(events) >= _PATTERN and poor >= _PATTERN_SHARE * len(events):
         raise DataError(
             f"of {len(events)} places in frame {frame} that look like particles {poor} do not look "
             f"like the model's picture, and would be followed through all frames: {doubt}"

@@ -94,9 +94,9 @@ class FrameFilter:
         """
         parts: list[FloatArray] = []
         threshold = self._templates.threshold
-        together = max(_FIELDS // len(self._layers), 1)
-        for start in range(0, len(residual_e), together):
-            stop = start + together
+        fields_at_once = max(_FIELDS // len(self._layers), 1)
+        for start in range(0, len(residual_e), fields_at_once):
+            stop = start + fields_at_once
             snr = self._snr(residual_e[start:stop], power[start:stop])
             best = snr.max(axis=1)
             at = maxima(best, SAMPLED * threshold, (0, 1, 1))
@@ -128,9 +128,10 @@ class FrameFilter:
         y: FloatArray,
         known: list[FloatArray],
     ) -> BoolArray:
-        """Tell which peaks, the highest of each frame first, are no side lobes nor left over.
+        """Tell which peaks are neither side lobes nor residues.
 
-        In each round the first of every frame that remains is taken, and its side lobes go.
+        The highest peaks of each frame come first.  In each round the highest remaining peak of
+        every frame is accepted and its side lobes are removed.
         """
         kept = np.zeros(len(frame), dtype=bool)
         sure = ~self._are_left_over(frame.astype(np.int64), height, x, y, known)
@@ -147,12 +148,12 @@ class FrameFilter:
     def _is_lobe(
         self, height: FloatArray, x: FloatArray, y: FloatArray, one: IntArray, other: IntArray
     ) -> BoolArray:
-        """Whether peaks may be side lobes of others, which are higher."""
+        """Tell which peaks may be side lobes of higher ones."""
         apart_x, apart_y = x[one] - x[other], y[one] - y[other]
-        beside = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
-        lobe = height[one] < height[other] * np.where(beside, self._lobe, FAR_LOBE)
+        within_region = np.maximum(np.abs(apart_x), np.abs(apart_y)) < self._roi_px
+        lobe = height[one] < height[other] * np.where(within_region, self._lobe, FAR_LOBE)
         lobe |= np.hypot(apart_x, apart_y) < NEAR * self._roi_px
-        return np.asarray(lobe | beside if self._cautious else lobe)
+        return np.asarray(lobe | within_region if self._cautious else lobe)
 
     def _are_left_over(
         self,
@@ -162,7 +163,7 @@ class FrameFilter:
         y: FloatArray,
         known: list[FloatArray],
     ) -> BoolArray:
-        """Tell which peaks may be what the model leaves over of particles that are known."""
+        """Tell which peaks may be residues of particles that were fitted already."""
         places = np.full((len(known), max(map(len, known)), 3), np.nan)
         for row, there in zip(places, known, strict=True):
             row[: len(there)] = there
@@ -180,7 +181,7 @@ class FrameFilter:
         return np.asarray(self._cut(spectrum * self._duals) / noise)
 
     def _cut(self, spectrum: NDArray[Any]) -> NDArray[Any]:
-        """Transform back and keep the pixels of the field."""
+        """Transform back and crop to the field."""
         (rows, columns), half = self._share.shape, self._half
         full = irfft2(spectrum, self._padded)
         return np.asarray(full[..., half : half + rows, half : half + columns])
@@ -231,7 +232,7 @@ def link(frame: IntArray, places_nm: FloatArray, *, reach_nm: float, memory: int
 
 
 def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
-    """Say which of the old places each new one follows, -1 where it follows none."""
+    """Give the old position that trackpy links to each new one, -1 where there is none."""
     trackpy = load_linker()
     try:
         (_, one), (_, two) = trackpy.link_iter(iter([(0, old), (1, new)]), search_range=reach_nm)
@@ -247,9 +248,9 @@ def _chosen(old: FloatArray, new: FloatArray, reach_nm: float) -> IntArray:
 
 @cache
 def load_linker() -> Any:
-    """Import trackpy, silenced, which reports every frame.
+    """Import trackpy without its log messages.
 
-    That takes a second or so, which is better taken beside something else.
+    The import takes about a second, so that it is worth starting it in a thread.
     """
     import trackpy
 
@@ -258,7 +259,7 @@ def load_linker() -> Any:
 
 
 def gaps(frame: IntArray, track: IntArray) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Give the frames inside tracks in which the particle was missed.
+    """Give the frames inside tracks in which the particle was not found.
 
     Shapes: `frame, track` (n,), `missed` (m,), `before, after` (m,), `share` (m,).
     """

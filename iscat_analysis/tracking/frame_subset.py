@@ -30,8 +30,8 @@ IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Kept:
-    """What is left of a movie."""
+class FrameSubset:
+    """The frames of a movie that are analysed."""
 
     movie: Stack
     span: tuple[int, int]
@@ -39,7 +39,7 @@ class Kept:
     message: str = ""
 
     def put_back(self, found: DetectionResult) -> DetectionResult:
-        """Give frames the numbers that they have in the movie."""
+        """Give frames their numbers in the movie."""
         if self.numbers is None or found.followed is None:
             return found
         numbers, followed = self.numbers, found.followed
@@ -60,12 +60,12 @@ class Kept:
 
 def keep_frames(
     movie: Stack, camera: Camera, span: tuple[int, int], *, additive: bool = False
-) -> Kept:
-    """Leave out frames that show nothing new."""
+) -> FrameSubset:
+    """Leave out frames that repeat others or have no light."""
     dark, repeats = _odd(movie, camera, span, additive=additive)
     good = ~(dark | repeats)
     if good.all() or not good.any():
-        return Kept(movie, span)
+        return FrameSubset(movie, span)
     numbers = span[0] + np.flatnonzero(good)
     seen = movie.seen_as(StackFrames(movie, numbers))
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
@@ -80,7 +80,7 @@ def keep_frames(
             f"; {share:.0%} of the frames: if the file holds each of the camera's several times, D "
             "is too small by as much; export it with each once, at the camera's own rate"
         )
-    return Kept(seen, (0, len(numbers)), numbers, message)
+    return FrameSubset(seen, (0, len(numbers)), numbers, message)
 
 
 def _odd(
@@ -98,7 +98,7 @@ def _odd(
 
 
 def _renumbered(windows: Windows, numbers: IntArray) -> Windows:
-    """Give a range of kept frames its numbers in the movie, without light in those left out."""
+    """Give a range of kept frames its numbers in the movie; frames left out get no light."""
     first, last = windows.frames_after
     kept = numbers[first:last]
     span = int(kept[0]), int(kept[-1]) + 1

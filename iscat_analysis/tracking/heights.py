@@ -29,7 +29,7 @@ def decide_heights(
     fringe_nm: float,
     z_range_nm: tuple[float, float],
 ) -> Localizations:
-    """Put every row into the fringe that its track says."""
+    """Choose the interference fringe of every row by the likelihood of its whole track."""
     if not len(rows.frame):
         return rows
     starts = rows.starts(field.frames)
@@ -37,17 +37,17 @@ def decide_heights(
     ladders = []
     for turn in range(int(rank.max()) + 1):  # one particle of each frame climbs at a time
         ladders.append(_ladder(field, ground, rows, rank == turn, fringe_nm, z_range_nm))
-    steps = max(places.shape[1] for places, _ in ladders)
-    places = np.repeat(rows.theta[:, None], steps, axis=1)
+    steps = max(candidates.shape[1] for candidates, _ in ladders)
+    candidates = np.repeat(rows.theta[:, None], steps, axis=1)
     values = np.full((len(rows.frame), steps), -np.inf)
     for turn, (heights, gains) in enumerate(ladders):
-        places[rank == turn, : heights.shape[1]] = heights
+        candidates[rank == turn, : heights.shape[1]] = heights
         values[rank == turn, : gains.shape[1]] = gains
     # Where no fit converged, the other rows of the track decide.
     values[~np.isfinite(values).any(axis=1)] = 0.0
     out = rows.theta.copy()
     single = np.flatnonzero(rows.track < 0)
-    out[single] = places[single, values[single].argmax(axis=1)]
+    out[single] = candidates[single, values[single].argmax(axis=1)]
     for k in np.unique(rows.track[rows.track >= 0]):
         mine = np.flatnonzero(rows.track == k)
         steps = np.diff(rows.theta[mine, :2], axis=0)
@@ -57,8 +57,8 @@ def decide_heights(
             float(np.median(square)) / 0.6931 if len(square) else 0.0,
             (_LEAST_STEP * fringe_nm) ** 2,
         )
-        path = _best_path(places[mine, :, 2], values[mine], per_frame * apart)
-        out[mine] = places[mine, path]
+        path = _best_path(candidates[mine, :, 2], values[mine], per_frame * apart)
+        out[mine] = candidates[mine, path]
     return replace(rows, theta=out)
 
 
@@ -70,7 +70,10 @@ def _ladder(
     fringe_nm: float,
     z_range_nm: tuple[float, float],
 ) -> tuple[FloatArray, FloatArray]:
-    """Fit some rows in every fringe, one rung from the next, with the others of their frames.
+    """Fit some rows in every fringe, each fit starting from the one in the fringe before.
+
+    The other rows of their frames stay as they are.  Returns the fits, shape (n, rungs, 5), and
+    their log-likelihoods, (n, rungs).
 
     Returns what was fitted, shape (n, rungs, 5), and its log-likelihood, (n, rungs).
     """
@@ -82,12 +85,12 @@ def _ladder(
     usual = typical(rows).theta[:, 3]
     gain = _values(field, ground, rows)
     thetas, gains = [rows.theta[mine]], [gain[mine]]
-    for way in (1, -1):
+    for direction in (1, -1):
         here = rows.theta.copy()
         # A fit that has reached zero mass in a wrong fringe would stay there.
         here[mine, 3] = usual[mine]
         while True:
-            here[mine, 2] += way * fringe_nm
+            here[mine, 2] += direction * fringe_nm
             inside = (here[:, 2] > low - fringe_nm / 2) & (here[:, 2] < high + fringe_nm / 2) & mine
             if not inside.any():
                 break
@@ -119,7 +122,7 @@ def _values(field: MovingField, ground: BackgroundEstimate, rows: Localizations)
 
 
 def _best_path(heights: FloatArray, gains: FloatArray, variances: FloatArray) -> np.ndarray:
-    """Give the state of every frame, (n,), of the likeliest sequence of states (n, states)."""
+    """Find the likeliest sequence of states by the Viterbi algorithm, shape (n,)."""
     score = gains[0]
     back = np.zeros(heights.shape, dtype=np.int64)
     for t in range(1, len(heights)):

@@ -22,8 +22,8 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, CountSource, Status, silent
-from iscat_analysis.tracking.moving import follow
-from iscat_analysis.tracking.moving_field import track_scene
+from iscat_analysis.tracking.moving import find_rows_and_background
+from iscat_analysis.tracking.moving_field import tracking_context
 from iscat_analysis.tracking.moving_table import moving_table
 
 MOST_REJECTED = 0.5
@@ -47,7 +47,7 @@ def held_height_warning(
     check: Callable[[NDArray[Any], int], None],
     pool: ThreadPoolExecutor,
 ) -> str:
-    """Say that particles seem to stay at one height, where free heights lead nowhere."""
+    """Say that particles seem to stay at one height, where fits with free heights fail."""
     if config.track.free != "joint" or not len(fits):
         return ""
     first, last = span[0], min(span[1], span[0] + _LOOKED_AT)
@@ -56,9 +56,9 @@ def held_height_warning(
         return ""
     track = config.track.model_copy(update={"free": "mass"})
     config, (_, tall, wide) = config.model_copy(update={"track": track}), movie.shape
-    context = track_scene(config, (tall, wide), last - first)
+    context = tracking_context(config, (tall, wide), last - first)
     try:
-        moving = follow(
+        moving = find_rows_and_background(
             context, movie, camera, (first, last), check=check, pool=pool, progress=silent
         )  # fmt: skip
     except DataError:  # nothing can be followed at one height
@@ -75,5 +75,5 @@ def held_height_warning(
 
 
 def _rejected(rows: pd.DataFrame) -> BoolArray:
-    """Tell which rows are not described."""
+    """Tell which rows the model does not describe."""
     return np.asarray(rows["flags"].fillna("").str.contains(_REJECTED), dtype=np.bool_)

@@ -44,7 +44,7 @@ MERGED_FRAMES = 100
 
 _APART_FRAMES = 5  # in which two must be apart before they meet again
 _NEIGHBOURS_FRAMES = 300  # who stay beside each other for longer are met by others one by one
-_NEVER = -1e9  # in log-likelihood
+_LOG_ZERO = -1e9  # in log-likelihood
 _MASS_ERROR = 0.02  # of what neighbours do to all frames of a part, relative
 
 IntArray = NDArray[np.int64]
@@ -60,9 +60,11 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
     for k, met in enumerate(meetings):
         later = met_rows[number > k]
         labels = np.unique(track[met.rows])
-        sides = [_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0]
-        for path in _paths(sides, typical):
-            _follow(rows, track, path, met)
+        sides = [
+            _track_side(rows, track, int(one), met, later, typical) for one in labels if one >= 0
+        ]
+        for path in _chains(sides, typical):
+            _continue_chain(rows, track, path, met)
     kept = track >= 0
     group = _groups(rows, track)
     return Localizations.of(rows.frame[kept], track[kept], rows.theta[kept], group[kept])
@@ -70,7 +72,7 @@ def identified(rows: Localizations, *, near_nm: float, error: float) -> Localiza
 
 @dataclass(frozen=True)
 class _Part:
-    """What a track did for a while."""
+    """Steps, mass and positions of a track before or after a meeting."""
 
     steps: float
     square: float
@@ -82,7 +84,7 @@ class _Part:
 
 @dataclass(frozen=True)
 class _Typical:
-    """What is expected of a particle of which nothing is known."""
+    """Prior of a particle: step, mass and its variance, from all particles of the movie."""
 
     step_nm2: float
     mass: float
@@ -92,7 +94,7 @@ class _Typical:
 
     @classmethod
     def of(cls, rows: Localizations, near_nm: float, error: float) -> _Typical:
-        """Gather it from all rows."""
+        """Estimate it from all rows."""
         order = np.lexsort((rows.frame, rows.track))
         next_ = (np.diff(rows.track[order]) == 0) & (np.diff(rows.frame[order]) == 1)
         step = _step_nm2(np.diff(rows.theta[order, :2], axis=0)[next_])
@@ -101,7 +103,7 @@ class _Typical:
         return cls(max(step, least), float(np.median(mass)), float(mass.var()), near_nm, error)
 
     def part(self, rows: Localizations, mine: IntArray) -> _Part | None:
-        """Gather what some of the rows say; None if there are none."""
+        """Summarise some rows of a track; None where there are none."""
         if not mine.size:
             return None
         theta, frame = rows.theta[mine], rows.frame[mine]
@@ -113,15 +115,17 @@ class _Typical:
         return _Part(steps, square, mass, variance, frame[[0, -1]], theta[[0, -1], :2])
 
     def evidence(self, before: _Part | None, after: _Part | None) -> float:
-        """Logarithm of the Bayes factor that both are one particle; 0 where one is not known."""
+        """Log Bayes factor that two parts are of one particle; 0 where a part is missing."""
         if before is None or after is None:
             return 0.0
         took = int(after.frames[0] - before.frames[1])
         if took <= 0:
             return -math.inf  # one particle is not twice in a frame
-        way = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
+        distance_squared = float(((after.places[0] - before.places[1]) ** 2).sum()) / (2 * took)
         moved = (
-            self._marginal(before.steps + after.steps + 1, before.square + after.square + way)
+            self._marginal(
+                before.steps + after.steps + 1, before.square + after.square + distance_squared
+            )
             - self._marginal(before.steps, before.square)
             - self._marginal(after.steps, after.square)
             + math.log(self.near_nm**2 / (2 * took))
@@ -149,7 +153,7 @@ def _normal(off: float, variance: float) -> float:
 
 
 class _Meeting(NamedTuple):
-    """When tracks were within reach of one another."""
+    """Rows of the tracks that met, and their pairs, the closest first."""
 
     rows: IntArray
     pairs: IntArray
@@ -157,7 +161,7 @@ class _Meeting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Side:
-    """A track in a meeting."""
+    """A track in a meeting: its parts before and after, and whether it begins or ends there."""
 
     track: int
     first: int
@@ -168,7 +172,7 @@ class _Side:
     ends: bool
 
 
-def _side(
+def _track_side(
     rows: Localizations,
     track: IntArray,
     one: int,
@@ -176,7 +180,7 @@ def _side(
     later: IntArray,
     typical: _Typical,
 ) -> _Side:
-    """Gather what a track does; `later` are the rows of the meetings to come."""
+    """Summarise one track of a meeting; `later` are the rows of the meetings that follow."""
     mine = np.flatnonzero(track == one)
     frame = rows.frame[mine]
     first, last = rows.frame[met.rows[track[met.rows] == one]][[0, -1]].tolist()
@@ -188,8 +192,13 @@ def _side(
     return _Side(one, first, last, before, after, bool(begins), bool(ends))
 
 
-def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
-    """Give those of which each goes on as the next one did; a cycle ends with its first."""
+def _chains(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
+    """Find tracks whose continuations are exchanged, by the assignment with the most evidence.
+
+    In a chain each track is continued by the rows that the next track has after the meeting.  Where
+    tracks are exchanged in a cycle, as when two are swapped, the first track stands at the end
+    again.
+    """
     come = [side for side in sides if not side.begins]
     go = [side for side in sides if not side.ends]
     if not come or not go:
@@ -197,7 +206,7 @@ def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
     gain = LEAST_GAIN + np.array([[typical.evidence(a.before, b.after) for b in go] for a in come])
     linked = np.array([[a is b for b in go] for a in come])
     # what fits nothing may end or begin here if it does, and else goes on all the same
-    least = np.array([[0.0 if a.ends or b.begins else _NEVER for b in go] for a in come])
+    least = np.array([[0.0 if a.ends or b.begins else _LOG_ZERO for b in go] for a in come])
     worth = np.maximum(gain, least) + LEAST_GAIN / 2 * linked
     moves: dict[_Side, _Side] = {}
     for i, j in zip(*scipy.optimize.linear_sum_assignment(worth, maximize=True), strict=True):
@@ -211,8 +220,11 @@ def _paths(sides: list[_Side], typical: _Typical) -> Iterator[list[_Side]]:
         yield path
 
 
-def _follow(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
-    """Let each of a path go on as the next one did, all from one frame on."""
+def _continue_chain(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeting) -> None:
+    """Give each track of a chain the rows that the next one has after the meeting.
+
+    All are cut at one frame, that in which the tracks were closest.
+    """
     numbers = [side.track for side in path]
     mine = [np.flatnonzero(track == k) for k in numbers]
     low, high = max(side.first for side in path), min(side.last for side in path)
@@ -235,7 +247,7 @@ def _follow(rows: Localizations, track: IntArray, path: list[_Side], met: _Meeti
 
 
 class _Pair(NamedTuple):
-    """When two tracks were within reach of each other: frames, tracks and pairs of rows."""
+    """A time during which two tracks were close: its frames, the tracks and their pairs of rows."""
 
     first: int
     last: int
@@ -244,7 +256,7 @@ class _Pair(NamedTuple):
 
 
 def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
-    """Give the meetings in order."""
+    """Join close pairs into meetings, sorted by frame."""
     pairs = sorted(_pairs(rows, near_nm))
     number = np.arange(len(pairs))
     for one, two in _of_one(rows, pairs):
@@ -258,9 +270,10 @@ def _meetings(rows: Localizations, near_nm: float) -> list[_Meeting]:
 
 
 def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]]:
-    """Give those that are of one meeting: a track is in both, at once or soon after one another.
+    """Find pairs of tracks that belong to one meeting.
 
-    What ends beside another meets it until, beside that, something begins.
+    Two pairs do if they share a track, at once or shortly after one another.  A track that ends
+    close to another one is taken to be merged with it until a new track begins close to that one.
     """
     numbers, firsts = np.unique(rows.track, return_index=True)
     begins = dict(zip(numbers.tolist(), rows.frame[firsts].tolist(), strict=True))
@@ -290,7 +303,7 @@ def _of_one(rows: Localizations, pairs: list[_Pair]) -> Iterator[tuple[int, int]
 
 
 def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
-    """Give the meetings of every pair of tracks."""
+    """Find the times during which two tracks are closer than `near_nm`."""
     one, two = rows.pairs_within(near_nm).T
     swapped = rows.track[one] > rows.track[two]
     one, two = np.where(swapped, two, one), np.where(swapped, one, two)
@@ -298,15 +311,15 @@ def _pairs(rows: Localizations, near_nm: float) -> Iterator[_Pair]:
     one, two = one[order], two[order]
     frame, tracks = rows.frame[one], np.stack([rows.track[one], rows.track[two]], axis=1)
     others = (np.diff(tracks, axis=0) != 0).any(axis=1) | (np.diff(frame) > _APART_FRAMES)
-    for together in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
-        if together.size:
-            first, last = frame[together[[0, -1]]].tolist()
-            of = int(tracks[together[0], 0]), int(tracks[together[0], 1])
-            yield _Pair(first, last, of, np.stack([one[together], two[together]], axis=1))
+    for run in np.split(np.arange(len(one)), np.flatnonzero(others) + 1):
+        if run.size:
+            first, last = frame[run[[0, -1]]].tolist()
+            of = int(tracks[run[0], 0]), int(tracks[run[0], 1])
+            yield _Pair(first, last, of, np.stack([one[run], two[run]], axis=1))
 
 
 def _groups(rows: Localizations, track: IntArray) -> IntArray:
-    """Give every row the blur that most rows of its track have."""
+    """Give each row the blur that most rows of its new track have."""
     group = rows.group.copy()
     for k in np.unique(track[track != rows.track]):
         mine = track == k

@@ -34,7 +34,7 @@ _MASS = ["mass_kda", "sigma_mass_kda", "crb_mass_kda", "told"]
 
 @dataclass(frozen=True)
 class Joined:
-    """What was followed through the blocks of a movie."""
+    """The tracks and backgrounds of all blocks of a movie."""
 
     fits: pd.DataFrame
     views: tuple[EventView, ...]
@@ -87,7 +87,7 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
 
 
 def _met(config: Config, one: Block, two: Block) -> list[tuple[int, int]]:
-    """Pairs of tracks, the second of which goes on where the first ended."""
+    """Find pairs of tracks of two blocks, where the second continues the first."""
     border, memory = two.span[0], config.track.memory_frames
     ends, begins = _ends(one.rows, -1), _ends(two.rows, 0)
     ends = ends.only(ends.frame >= border - 1 - memory)
@@ -143,7 +143,7 @@ def combine_masses(
 def _views(
     table: pd.DataFrame, blocks: Sequence[Block], numbers: Sequence[IntArray]
 ) -> tuple[EventView, ...]:
-    """Give the clearest view of each track."""
+    """Choose the clearest view of each track."""
     if not len(table):
         return ()
     best = table.loc[table.groupby("track")["snr"].idxmax()]
@@ -160,7 +160,7 @@ def _views(
 
 
 def _together(blocks: Sequence[Block], parts: Sequence[Windows]) -> Windows:
-    """Sum the backgrounds, and the frames, of all blocks."""
+    """Sum the backgrounds and the frames of all blocks."""
     if len(parts) == 1:
         return parts[0]
     frames, span = sum(b.frames for b in blocks), (blocks[0].span[0], blocks[-1].span[1])

@@ -1,4 +1,4 @@
-"""From rows to tracks: which rows are one particle, and which tracks are particles."""
+"""Linking of rows to tracks, and the rejection of tracks that are no particles."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ OUTLYING = 5.0
 AS_FOUND = 0.9
 """Of the threshold, that a fit must keep to have found its particle."""
 
-_STEP = 0.1  # of the farthest that a particle goes: what an error of the mass counts in linking
-_UNSURE = 0.25  # of the mass, where z is free
-_BESIDE = 0.75  # resolutions λ/NA within which two rows may be one particle
+# Of the farthest that a particle goes: what an error of the mass counts in linking
+_MASS_STEP_SHARE = 0.1
+_MASS_ERROR_FREE_Z = 0.25  # of the mass, where z is free
+_NEAR_RESOLUTIONS = 0.75  # resolutions λ/NA within which two rows may be one particle
 _BRIDGE_FRAMES = 100  # that a slow particle may hide
 _MEETING = 5  # frames before and after two were crowded, in which one of them may be hidden
 
@@ -41,7 +42,7 @@ def linked(
     bridged: bool = False,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
-    """Link, drop what is too short, and fill gaps; tracks are numbered by first frame and place.
+    """Link rows, drop tracks that are too short, and fill gaps; tracks are numbered in time order.
 
     Shapes: `places` (n, axes).
     """
@@ -66,7 +67,7 @@ def linked(
 
 
 def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -> IntArray:
-    """Frames that each track must have: one that may go on elsewhere, no more than it has here."""
+    """Frames that each track must have; one that may continue in another block needs fewer."""
     counts = np.bincount(rows.track, minlength=1)
     least = np.full(counts.size, config.track.min_frames)
     if inner is not None:
@@ -77,10 +78,10 @@ def _least(config: Config, rows: Localizations, inner: tuple[int, int] | None) -
 
 
 def mass_places(config: Config, rows: Localizations) -> FloatArray:
-    """Places by which rows are linked: x, y, and the mass as a length.
+    """Positions for linking: x, y, and the mass expressed as a length.
 
-    A step of the mass by its own error counts as much as one of `_STEP` of the farthest that a
-    particle goes, so that particles of unlike mass keep their numbers where they cross.
+    A change of the mass by its own error counts as `_MASS_STEP_SHARE` of the largest step, so that
+    particles of different mass keep their identities where they cross.
 
     Shapes: result (n, 3).
     """
@@ -90,18 +91,18 @@ def mass_places(config: Config, rows: Localizations) -> FloatArray:
 
 
 def with_mass(config: Config, rows: Localizations, error: float) -> FloatArray:
-    """Add the mass to the places, as a length.
+    """Append the mass, as a length, to positions.
 
     Shapes: result (n, 3).
     """
-    length = _STEP * config.track.max_step_nm / mass_error(config, rows, error)
+    length = _MASS_STEP_SHARE * config.track.max_step_nm / mass_error(config, rows, error)
     return np.column_stack([rows.theta[:, :2], rows.theta[:, 3] * length])
 
 
 def mass_error(config: Config, rows: Localizations, error: float) -> float:
-    """Say by how much the amplitude of one particle may change from frame to frame."""
+    """Give the error of the mass that linking assumes between frames."""
     if config.track.free == "joint" and len(rows.frame):
-        return max(error, _UNSURE * float(np.median(rows.theta[:, 3])))
+        return max(error, _MASS_ERROR_FREE_Z * float(np.median(rows.theta[:, 3])))
     return error
 
 
@@ -128,19 +129,19 @@ def alone(
     *,
     inner: tuple[int, int] | None = None,
 ) -> Localizations:
-    """Leave out tracks that are hardly ever alone, or seen: they may be parts of neighbours."""
+    """Leave out tracks that are rarely isolated or rarely seen: they may be parts of neighbours."""
     config = context.config
     if not len(rows.frame):
         return rows
-    near = crowded(rows, _BESIDE * config.optics.wavelength_nm / config.optics.na)
+    near = crowded(rows, _NEAR_RESOLUTIONS * config.optics.wavelength_nm / config.optics.na)
     tracks = int(rows.track.max(initial=0)) + 1
     free = np.bincount(rows.track[~near], minlength=tracks)
-    kept = (free >= _least(config, rows, inner)) & seen(context, rows)
-    return numbered(rows.only(kept[rows.track]))
+    keep = (free >= _least(config, rows, inner)) & seen(context, rows)
+    return numbered(rows.only(keep[rows.track]))
 
 
 def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
-    """Tell which tracks are seen in most of the frames in which they are fitted.
+    """Tell which tracks are detected in most of the frames in which they are fitted.
 
     Shapes: result (tracks,).
     """
@@ -148,12 +149,14 @@ def seen(context: AnalysisContext, rows: Localizations) -> BoolArray:
     snr = np.where(fitted.theta[:, 3] > 0, fitted.snr, 0.0)
     plain = snr > AS_FOUND * context.templates.threshold
     tracks = int(rows.track.max(initial=-1)) + 1
-    fits, sights = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
-    return np.asarray(2 * sights > fits)
+    fits, detections = (np.bincount(fitted.track, w, minlength=tracks) for w in (None, plain))
+    return np.asarray(2 * detections > fits)
 
 
-def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Localizations, int]:
-    """Let slow particles stay where they were before and after they were seen, to be tried."""
+def extrapolated(
+    config: Config, field: MovingField, rows: Localizations
+) -> tuple[Localizations, int]:
+    """Add trial rows where slow particles were not detected, at their last and next positions."""
     reach = config.optics.wavelength_nm / config.optics.na
     frame, track, theta, group = [], [], [], []
     for k in np.unique(rows.track):
@@ -161,10 +164,12 @@ def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Local
         if _step_nm2(rows, mine) * _BRIDGE_FRAMES > reach**2:
             continue
         middle = float(np.median(rows.theta[mine, 3]))
-        for end, way in ((mine[0], -1), (mine[-1], 1)):
+        for end, direction in ((mine[0], -1), (mine[-1], 1)):
             first = int(rows.frame[end])
-            held = np.clip(first + way * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1)
-            for t in np.unique(held[held != first]):
+            extrapolated = np.clip(
+                first + direction * np.arange(1, _BRIDGE_FRAMES + 1), 0, field.frames - 1
+            )
+            for t in np.unique(extrapolated[extrapolated != first]):
                 frame.append(int(t))
                 track.append(int(k))
                 theta.append(np.append(rows.theta[end, :3], [middle, 0.0]))
@@ -176,27 +181,27 @@ def held(config: Config, field: MovingField, rows: Localizations) -> tuple[Local
 
 
 def trimmed(rows: Localizations) -> Localizations:
-    """Cut tracks where they begin and end with frames that hold too little of their mass."""
-    kept = np.ones(len(rows.frame), dtype=bool)
+    """Cut frames with too little mass off both ends of tracks."""
+    keep = np.ones(len(rows.frame), dtype=bool)
     for k in np.unique(rows.track):
         mine = np.flatnonzero(rows.track == k)
         amplitude = rows.theta[mine, 3]
         full = np.flatnonzero(amplitude > LEAST_SHARE * np.median(amplitude))
         if len(full):
-            kept[mine[: full[0]]] = kept[mine[full[-1] + 1 :]] = False
-    return rows.only(kept)
+            keep[mine[: full[0]]] = keep[mine[full[-1] + 1 :]] = False
+    return rows.only(keep)
 
 
 def shares_mass(rows: Localizations, judged: Judged) -> BoolArray:
-    """Tell which rows differ so much from their track's mass that they hold part of another's.
+    """Tell which rows hold a part of the mass of another track.
 
     Shapes: result (n,).
     """
     error = 1 / np.sqrt(np.maximum(judged.fisher[:, 3, 3], 1e-300))
-    return unlike(rows.track, rows.theta[:, 3], error)
+    return has_other_mass(rows.track, rows.theta[:, 3], error)
 
 
-def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
+def has_other_mass(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
     """Tell which rows have a mass that is not that of their track.
 
     Shapes: `track` (n,), `mass, error` (n,), result (n,).
@@ -211,7 +216,7 @@ def unlike(track: IntArray, mass: FloatArray, error: FloatArray) -> BoolArray:
 
 
 def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
-    """Tell which rows have another particle of their frame nearer than a limit.
+    """Tell which rows have another row of their frame within a distance.
 
     Shapes: result (n,).
     """
@@ -223,7 +228,7 @@ def crowded(rows: Localizations, limit_nm: float) -> BoolArray:
 def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
     """Tell which rows are of particles that meet: crowded, or shortly before or after that.
 
-    While two are so near that one fit takes the light of both, the other has no row beside it.
+    While one fit takes the light of two close particles, the other particle has no row.
 
     Shapes: result (n,).
     """
@@ -240,9 +245,9 @@ def meeting(rows: Localizations, limit_nm: float) -> BoolArray:
 
 
 def bridge(config: Config, rows: Localizations) -> IntArray:
-    """Join tracks of a particle that hardly moved while it was not seen.
+    """Join tracks of a particle that hardly moved while it was not detected.
 
-    What moves slowly hides in the first background, which is that of most of the frames; it is seen
+    A slow particle is a part of the first background, the median of the frames, and is detected
     again near where it was.  In the gap it must not have gone farther than a resolution.
 
     Shapes: result (n,).
@@ -273,7 +278,7 @@ def _step_nm2(rows: Localizations, mine: IntArray) -> float:
 
 
 def mean_square(steps: FloatArray) -> float:
-    """Give the mean square of normal steps, from its median, to which stray ones do little.
+    """Mean square of normal steps from their median, which is robust against outliers.
 
     Shapes: `steps` (n, 2).
     """
@@ -281,7 +286,7 @@ def mean_square(steps: FloatArray) -> float:
 
 
 def numbered(rows: Localizations) -> Localizations:
-    """Give tracks numbers by their first frame and place."""
+    """Give tracks numbers by first frame and position."""
     _, first = np.unique(rows.track, return_index=True)
     numbers = np.full(int(rows.track.max(initial=0)) + 1, -1)
     order = np.lexsort((rows.theta[first, 0], rows.theta[first, 1], rows.frame[first]))

@@ -21,7 +21,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import path_variance_nm2
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Progress
 from iscat_analysis.species.diffusion import estimate_diffusion
-from iscat_analysis.threads import beside
+from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.extension import extended
 from iscat_analysis.tracking.frame_search import FrameCandidates, load_linker
 from iscat_analysis.tracking.heights import decide_heights
@@ -39,7 +39,7 @@ from iscat_analysis.tracking.linking import (
     AS_FOUND,
     alone,
     crowded,
-    held,
+    extrapolated,
     linked,
     mass_error,
     mass_places,
@@ -53,9 +53,9 @@ from iscat_analysis.tracking.linking import (
 )
 from iscat_analysis.tracking.moving_field import (
     exposure_of,
-    give_back,
+    initial_background,
     load_field,
-    opening_ground,
+    restore_particle_light,
     search_frames,
 )
 from iscat_analysis.tracking.outlier_positions import without_outliers
@@ -67,13 +67,13 @@ _FIRST_TURNS = 2  # of background and particles after each of the first `_FULL` 
 # turn what hardly moves would be lost
 _NEXT_TURNS = 2  # between two extensions of the tracks
 _LEAST_POSITIONS = 4  # of a track whose D is fitted
-_USELESS = 300.0  # times the median error of a track: such a place says nothing
+_LARGEST_ERROR_RATIO = 300.0  # times the median error of a track: such a place says nothing
 _FINEST_NM2 = 6.0  # difference of blurs that is one: 0.05 % of the mass
 _BLUR_STEP = 0.03  # the same, relative
 _FEW = 0.01  # of all rows: a search that adds no more is the last, and an extension
 _FEW_TRIED = 5e-3  # the same, of one with places that are only tried, which the next one judges
-_SEVERAL = 1.5  # rows in a frame, from which some will be linked by trackpy
-_FLOOD = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
+_LINKER_ROWS_PER_FRAME = 1.5  # rows in a frame, from which some will be linked by trackpy
+_MOST_ROWS_PER_AREA = 0.15  # rows in an area of (λ/NA)², beyond which they are no particles
 _FULL = 2  # searches of all frames, after which some of them tell whether to go on
 _FIRST_HEIGHTS = 1  # searches after which every row is put into its fringe
 _HELD_ROUNDS = 2  # in which slow particles are tried where they were not seen
@@ -82,8 +82,8 @@ IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Moving:
-    """What was found in a movie."""
+class TrackedRows:
+    """All that was found in a movie of moving particles."""
 
     rows: Localizations
     ground: BackgroundEstimate
@@ -102,7 +102,7 @@ class Moving:
         return np.asarray(np.sqrt(self.variances_nm2)[self.rows.group])
 
 
-def follow(
+def find_rows_and_background(
     context: AnalysisContext,
     movie: CountSource,
     camera: Camera,
@@ -113,13 +113,13 @@ def follow(
     progress: Progress,
     inner: tuple[int, int] | None = None,
     cautious: bool = False,
-) -> Moving:
+) -> TrackedRows:
     """Find and fit every particle in every frame."""
     config = context.config
     field = load_field(context, movie, camera, span, check, pool, progress)
     follow_power = config.background.power_normalization
     follow_level = config.background.method == "tracks"
-    ground = opening_ground(config, field)
+    ground = initial_background(config, field)
     nothing = np.zeros(0, dtype=np.int64)
     rows = Localizations.of(nothing, nothing, np.zeros((0, 5)))
     total = ROUNDS + 3
@@ -133,8 +133,10 @@ def follow(
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(context, rows, found)
-        if len(rows.frame) > _SEVERAL * len(np.unique(rows.frame)):  # there will be a choice
-            beside(load_linker)
+        if len(rows.frame) > _LINKER_ROWS_PER_FRAME * len(
+            np.unique(rows.frame)
+        ):  # there will be a choice
+            start_in_thread(load_linker)
         rows, ground, done = fit_jointly(
             field,
             ground,
@@ -145,14 +147,14 @@ def follow(
             coarse=True,
         )
         if context.mode == "joint" and number < _FIRST_HEIGHTS:
-            rows = _in_their_fringes(context, field, ground, rows)
+            rows = _with_fringes_decided(context, field, ground, rows)
             rows, _, done = field.fit(ground, rows, coarse=True)
         rows = _credible(context, field, rows, done)
         if (
             context.mode == "joint" and number == 0
         ):  # sharp pictures leave over of gold what is seen
             rows = linked(config, rows, mass_places(config, rows))
-            rows, variances, _ = _moved(config, field, rows)
+            rows, variances, _ = _with_blurs(config, field, rows)
             field.set_blurs(variances)
             rows, ground, done = fit_jointly(
                 field, ground, rows, follow_power=follow_power, follow_level=follow_level,
@@ -178,25 +180,25 @@ def follow(
         rows = linked(config, rows, mass_places(config, rows), bridged=True, inner=inner)
         rows = alone(context, rows, inner=inner)
         if number < _HELD_ROUNDS and follow_level and not cautious:
-            rows, tried = held(config, field, rows)
+            rows, tried = extrapolated(config, field, rows)
             added += tried
         # the background that is told of all frames, before these are fitted over it
         _, found_ground, _ = field.fit(ground, typical(rows), sweeps=0, coarse=True)
         ground = replace(ground, level=found_ground.level) if follow_level else ground
         if added <= (_FEW_TRIED if number < _HELD_ROUNDS else _FEW) * len(rows.frame):
             break
-    rows = _told_apart(config, trimmed(rows))
+    rows = _with_identities(config, trimmed(rows))
     for stage in range(2):
-        give_back(context, field, movie, camera, span[0], ground, rows)
+        restore_particle_light(context, field, movie, camera, span[0], ground, rows)
         if context.mode == "joint":
-            rows = _in_their_fringes(context, field, ground, rows)
+            rows = _with_fringes_decided(context, field, ground, rows)
         rows, ground, done = fit_jointly(
             field, ground, without_outliers(rows), follow_power=follow_power,
             follow_level=follow_level, turns=MOST_TURNS if stage else 1, coarse=not stage,
         )  # fmt: skip
         progress("track", ROUNDS + 1 + stage, total)
         if stage == 0:
-            rows, variances, diffusion = _moved(config, field, rows)
+            rows, variances, diffusion = _with_blurs(config, field, rows)
             field.set_blurs(variances)
     there = seen(context, rows)  # the rings of others, drawn far out, may explain a track
     if not there.all():
@@ -216,16 +218,18 @@ def follow(
     counted = done & field.holds(rows.theta) & ~near & ~unlike
     common = common_amplitudes(field, ground, rows, judged, counted)
     progress("track", total, total)
-    return Moving(rows, ground, judged, done, close, variances, diffusion, field, shared, common)
+    return TrackedRows(
+        rows, ground, judged, done, close, variances, diffusion, field, shared, common
+    )
 
 
 def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> None:
-    """Refuse a frame with more rows than particles that could be told apart."""
+    """Refuse a frame with more rows than particles that could be resolved."""
     side_um = field.pixel_nm / 1e3
     area = side_um**2 * float(field.used.sum())
     resolution = config.optics.wavelength_nm / config.optics.na / 1e3
     each = len(rows.frame) / field.frames
-    if each > _FLOOD * area / resolution**2:
+    if each > _MOST_ROWS_PER_AREA * area / resolution**2:
         raise DataError(
             f"{each:.0f} places in every frame of {area:.0f} um2 look like particles, more than "
             "can be told apart: the light changes from frame to frame, as where the stage drifts "
@@ -234,28 +238,28 @@ def _refuse_flood(config: Config, field: MovingField, rows: Localizations) -> No
         )
 
 
-def _in_their_fringes(
+def _with_fringes_decided(
     context: AnalysisContext, field: MovingField, ground: BackgroundEstimate, rows: Localizations
 ) -> Localizations:
-    """Put every row into the fringe that its track says."""
+    """Choose the interference fringe of every row by its track."""
     return decide_heights(
         field, ground, rows,
         fringe_nm=context.model.fringe_nm, z_range_nm=context.config.fit.z_range_nm,
     )  # fmt: skip
 
 
-def _told_apart(config: Config, rows: Localizations) -> Localizations:
-    """Give particles that met their own numbers again."""
+def _with_identities(config: Config, rows: Localizations) -> Localizations:
+    """Exchange the identities of particles after meetings, where that is more likely."""
     if not len(rows.frame):
         return rows
     error = mass_error(config, rows, typical_error(rows.fisher))
     resolution = config.optics.wavelength_nm / config.optics.na
-    told = identified(rows, near_nm=resolution, error=error)
-    return numbered(told)
+    rows_identified = identified(rows, near_nm=resolution, error=error)
+    return numbered(rows_identified)
 
 
 def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidates) -> Localizations:
-    """Add candidates to the rows."""
+    """Add candidates to the rows as starting points of fits."""
     n = len(found.frame)
     pixel = context.pixel_nm
     theta = np.column_stack([
@@ -269,7 +273,7 @@ def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidate
 def _credible(
     context: AnalysisContext, field: MovingField, rows: Localizations, done: BoolArray
 ) -> Localizations:
-    """Keep the rows that a particle explains, each particle once."""
+    """Keep rows that are bright enough to be particles, and each particle once."""
     # of light that is no picture a fit may be lost
     known = np.asarray(np.isfinite(rows.theta).all(axis=1), dtype=np.bool_)
     rows, done = rows.only(known), done[known]
@@ -286,19 +290,19 @@ def _credible(
     return rows.only(kept)
 
 
-def _moved(
+def _with_blurs(
     config: Config, field: MovingField, rows: Localizations
 ) -> tuple[Localizations, FloatArray, FloatArray]:
-    """Give tracks their blurs, with the variances that these number and the D they are made of."""
+    """Give tracks their blurs, with the variances and the D that these come from."""
     diffusion = diffusion_of(config, field.free, rows)
     _, exposure = exposure_of(config)
     return *blurred_rows(rows, diffusion, exposure), diffusion
 
 
 def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatArray:
-    """Fit D to the places of every track, where it is alone.
+    """Fit D to each track where its particle is isolated.
 
-    Places in a meeting are off by more than their errors say, and would count as steps.
+    Positions during a meeting have larger errors than stated, and would count as steps.
 
     Shapes: `free` (5,), result (tracks, 2).
     """
@@ -312,7 +316,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
         mine = apart & (rows.track == k)
         error = sigma[:, axes].max(axis=1)
         if mine.any():
-            mine &= error < _USELESS * np.nanmedian(error[mine])
+            mine &= error < _LARGEST_ERROR_RATIO * np.nanmedian(error[mine])
         if mine.sum() < _LEAST_POSITIONS:
             continue
         out[k] = estimate_diffusion(
@@ -326,7 +330,7 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
 def blurred_rows(
     rows: Localizations, diffusion: FloatArray, exposure_s: float
 ) -> tuple[Localizations, FloatArray]:
-    """Give the blurs of tracks numbers, those that hardly differ the same.
+    """Give the blurs of tracks numbers; those that hardly differ get the same one.
 
     Shapes: `diffusion` (tracks, 1 or more), `variances_nm2` (groups,).
     """

@@ -49,7 +49,7 @@ def exposure_of(config: Config) -> tuple[float, float]:
     return rate, 1 / rate if exposure is None else exposure / 1e3
 
 
-def track_scene(
+def tracking_context(
     config: Config, field_px: tuple[int, int], frames: int, lines: Lines | None = None
 ) -> AnalysisContext:
     """Make models and matched filter for single frames."""
@@ -58,8 +58,8 @@ def track_scene(
     return make_context(tracked, field_px, searches=frames, lines=lines)
 
 
-def opening_ground(config: Config, field: MovingField) -> BackgroundEstimate:
-    """Give the background before there are tracks; of all frames together, it remains so."""
+def initial_background(config: Config, field: MovingField) -> BackgroundEstimate:
+    """Give the background before there are tracks: the median of the frames."""
     ground = first_background(field, follow_power=config.background.power_normalization)
     if config.background.method == "fixed":
         ground = replace(ground, level=np.maximum(field.total_e / ground.power.sum(), 1e-3))
@@ -75,7 +75,7 @@ def load_field(
     pool: ThreadPoolExecutor,
     progress: Progress,
 ) -> MovingField:
-    """Read the frames, which stay as they are stored where that takes less memory."""
+    """Read the frames; they stay integers where that takes less memory."""
     first, last = span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
     if frames < LEAST_FRAMES:
@@ -116,7 +116,7 @@ def load_field(
     )  # fmt: skip
 
 
-def give_back(
+def restore_particle_light(
     context: AnalysisContext,
     field: MovingField,
     movie: CountSource,
@@ -125,10 +125,10 @@ def give_back(
     ground: BackgroundEstimate,
     rows: Localizations,
 ) -> None:
-    """Give frames back what of particles was divided out with the light.
+    """Undo what dividing frames by their unsteady light took from the particles.
 
-    A particle is part of the light of its lines, and of whatever else each frame was divided by.
-    Where it is known, that light is known without it.
+    A particle adds to the light of its rows and columns, and of whatever else a frame was divided
+    by.  Where its signal is known, that light is known without it.
     """
     lines = context.lines
     if lines is None or not len(rows.frame):
@@ -143,7 +143,7 @@ def give_back(
 
 
 def _room_for(shape: tuple[int, int, int], stored: np.dtype[Any], camera: Camera) -> Exposures:
-    """Make room for frames, of the stored numbers where these are small and one gain is theirs."""
+    """Allocate the frames, as stored integers where these are small and share one gain."""
     gain, offset = camera.gain_e_per_adu, camera.offset_adu
     if np.can_cast(stored, np.uint16) and isinstance(gain, float) and isinstance(offset, float):
         return Exposures(np.empty(shape, dtype=np.uint16), gain, offset)
@@ -183,7 +183,7 @@ def search_frames(
     enough: int = 0,
     cautious: bool = False,
 ) -> FrameCandidates:
-    """Find candidates in what the rows leave over."""
+    """Find candidates in the residual of the rows so far."""
     side = context.roi_px
     if context.mode == "joint":
         side += round(2 * RING_SLOPE * context.config.fit.z_range_nm[1] / field.pixel_nm)

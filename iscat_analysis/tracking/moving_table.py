@@ -1,4 +1,4 @@
-"""From the fits of particles that move to the table, one row for each particle and frame."""
+"""The table of moving particles: one row for each particle and frame."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.records import PARAMETERS, BoolArray, FloatArray, Status, make_rows, verdict
 from iscat_analysis.tracking.joint.common import variances_left
-from iscat_analysis.tracking.linking import unlike
-from iscat_analysis.tracking.moving import Moving
+from iscat_analysis.tracking.linking import has_other_mass
+from iscat_analysis.tracking.moving import TrackedRows
 from iscat_analysis.tracking.paths import path_covariances
 
 LARGEST_LOSS = 0.2
@@ -31,7 +31,7 @@ _TESTS = 2
 _APART = 0.05  # relative step of a blur
 
 
-def moving_table(context: AnalysisContext, moving: Moving, first_frame: int) -> pd.DataFrame:
+def moving_table(context: AnalysisContext, moving: TrackedRows, first_frame: int) -> pd.DataFrame:
     """Make a line of ``fits.csv`` for every row, without its number and its verdict.
 
     Notes
@@ -85,7 +85,7 @@ def table_of_tracks(
     *,
     parted: bool,
 ) -> pd.DataFrame:
-    """Judge the lines of a movie, number them, and keep those of tracks seen long enough.
+    """Give the tracks of a movie numbers, drop short ones, and add verdicts to their rows.
 
     Shapes: `track` (n,), `inside` (n,).
     """
@@ -96,22 +96,22 @@ def table_of_tracks(
     off = np.zeros(len(table), dtype=np.bool_)
     if parted:
         names = ("track", "mass_kda", "crb_mass_kda")
-        off = unlike(*(table[name].to_numpy() for name in names))
+        off = has_other_mass(*(table[name].to_numpy() for name in names))
     numbers, texts = pd.factorize(table["flags"])
     judged = [_verdict(text, shared) for text in texts for shared in (False, True)]
     status = [str(status) for status, _ in judged]
     flags = [";".join(map(str, flags)) for _, flags in judged]
-    status, flags = (np.array(said, dtype=object)[2 * numbers + off] for said in (status, flags))
+    status, flags = (np.array(each, dtype=object)[2 * numbers + off] for each in (status, flags))
     return make_rows(table, {"status": status, "flags": flags})
 
 
 def _verdict(flags: str, shared: bool) -> tuple[Status, tuple[Status, ...]]:
-    """Judge the remarks on a row, one of which may be that its mass is shared."""
+    """Derive status and flags of rows; one flag may be that the mass is shared."""
     own = [Status(flag) for flag in flags.split(";") if flag]
     return verdict([*own, Status.TOO_CLOSE] if shared else own)
 
 
-def common_masses(context: AnalysisContext, moving: Moving) -> pd.DataFrame:
+def common_masses(context: AnalysisContext, moving: TrackedRows) -> pd.DataFrame:
     """Give the mass of each track that the exact likelihood of all its frames has."""
     common, scale = moving.common, context.model.scale
     known = np.isfinite(common.amplitude)
@@ -138,7 +138,7 @@ def common_masses(context: AnalysisContext, moving: Moving) -> pd.DataFrame:
     return table.set_index(pd.Index(tracks, name="track"))
 
 
-def losses_to_blur(context: AnalysisContext, moving: Moving) -> FloatArray:
+def losses_to_blur(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
     """Share of the mass that the blur of each group takes, to first order: −d ln m / d ln q.
 
     Shapes: result (groups,).
@@ -158,7 +158,7 @@ def losses_to_blur(context: AnalysisContext, moving: Moving) -> FloatArray:
     return np.abs(np.array(out, dtype=np.float64))
 
 
-def _path_errors(context: AnalysisContext, moving: Moving, losses: FloatArray) -> FloatArray:
+def _path_errors(context: AnalysisContext, moving: TrackedRows, losses: FloatArray) -> FloatArray:
     """Errors of (x, y, z, a) of each row that the unknown path of its exposure makes, (n, 4)."""
     out = np.zeros((len(losses), 4))
     if moving.field.free[2]:
@@ -178,8 +178,8 @@ def _p_values(
     return np.asarray(-np.expm1(_TESTS * np.log1p(-least)))
 
 
-def _off_line(context: AnalysisContext, moving: Moving, sigma_kda: FloatArray) -> BoolArray:
-    """Tell whose masses a calibration does not tell: by that of the track where it is known."""
+def _off_line(context: AnalysisContext, moving: TrackedRows, sigma_kda: FloatArray) -> BoolArray:
+    """Tell which masses the calibration cannot determine, by the mass of the track where known."""
     track, common, scale = moving.rows.track, moving.common, context.model.scale
     own, shared = moving.rows.theta[:, 3], common.amplitude[track]
     known = np.isfinite(shared)
@@ -190,12 +190,12 @@ def _off_line(context: AnalysisContext, moving: Moving, sigma_kda: FloatArray) -
 
 def _flags(
     context: AnalysisContext,
-    moving: Moving,
+    moving: TrackedRows,
     sigma: FloatArray,
     p_value: FloatArray,
     losses: FloatArray,
 ) -> NDArray[np.object_]:
-    """Join what is to be remarked on each row with semicolons."""
+    """Join the flags of each row with semicolons."""
     rows, free = moving.rows, np.flatnonzero(moving.field.free[:4])
     lost = ~moving.converged | ~np.isfinite(sigma[:, free]).all(axis=1)
     poor = (p_value < POOR_FIT_P) | (losses > LARGEST_LOSS)
@@ -215,7 +215,7 @@ def _flags(
     texts = [""]  # of every set of remarks; in the number of one, each remark has its bit
     for _, mark in marks:
         texts += [f"{text};{mark}".lstrip(";") for text in texts]
-    numbers = sum(told.astype(np.int64) << bit for bit, (told, _) in enumerate(marks))
+    numbers = sum(applies.astype(np.int64) << bit for bit, (applies, _) in enumerate(marks))
     return np.asarray(np.array(texts, dtype=object)[numbers])
 
 

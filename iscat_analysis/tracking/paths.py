@@ -18,7 +18,7 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import blurred
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.records import FloatArray
-from iscat_analysis.tracking.moving import Moving
+from iscat_analysis.tracking.moving import TrackedRows
 
 ALONG = math.sqrt(4 / 5)
 """Standard deviation over its mean of a path's variance along one axis."""
@@ -34,7 +34,7 @@ _PER_FRINGE = 8  # heights at which errors are computed; linear in between
 _STEP_NM = 2.0  # along z, of differences
 
 
-def path_covariances(context: AnalysisContext, moving: Moving) -> FloatArray:
+def path_covariances(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
     """Give the errors of rows that the unknown paths of their exposures make.
 
     Shapes: result (n, 4, 4).

@@ -19,7 +19,7 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.run import unheard
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.cause import PIXEL, Cause, likely_cause
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.instrument.learner import (
@@ -38,7 +38,7 @@ from iscat_analysis.instrument.unknown_heights import learn_with_heights
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block
-from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.tracking.iterated_optics import Round, Rounds
 from iscat_analysis.trust.systematic import MASS_SHARE, REJECTED_SHARE
 from iscat_analysis.units import count
 
@@ -50,14 +50,14 @@ ROUNDS = 8
 """Of optics learned from tracks, and tracks followed with them, at most.  What is learned from
 tracks that were followed with wrong optics is only near the truth, as `settling_optics` says."""
 
-_ROUGH_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
+_MOST_FAILED_ROUNDS = 4  # in which optics that describe the tracks at all are found, or never
 _NOISE = "the noise is not what the camera's numbers predict, and may be what is left over"
 _LOOKED_AT = 24  # pictures in which the cause is looked for
 
 
 @dataclass(frozen=True)
-class LeftOver:
-    """What the model leaves over of all pictures of tracks together."""
+class Misfit:
+    """What the model does not explain in all pictures of tracks together."""
 
     share: float
     clear: bool
@@ -70,7 +70,7 @@ class LeftOver:
 
     @property
     def verdict(self) -> str:
-        """Say so."""
+        """Say so in one line."""
         if not self.rejected:
             return "the optics cannot be learned from this movie"
         return (
@@ -80,17 +80,17 @@ class LeftOver:
 
 
 @dataclass(frozen=True)
-class Begun:
-    """The first frames of a movie, followed with some optics."""
+class TrialTracks:
+    """The first frames of a movie, tracked with some optics."""
 
     config: Config
     context: AnalysisContext
     block: Block
 
     @cached_property
-    def left(self) -> LeftOver | None:
-        """What the model leaves over of all pictures; None where there is none."""
-        return _left_over(self.block, self.context)
+    def left(self) -> Misfit | None:
+        """The misfit of all pictures; None where there is none."""
+        return _misfit(self.block, self.context)
 
     @property
     def described(self) -> bool:
@@ -98,27 +98,28 @@ class Begun:
         return self.left is not None and not self.left.rejected
 
 
-class Begin(Protocol):
-    """Follows the first frames of a movie."""
+class TrackFirstFrames(Protocol):
+    """Tracks the first frames of a movie with given optics."""
 
-    def __call__(self, config: Config, *, cautious: bool = False) -> Begun:
-        """Follow them with some optics; `cautious` as in `follow`."""
+    def __call__(self, config: Config, *, cautious: bool = False) -> TrialTracks:
+        """Track them; `cautious` as in `find_rows_and_background`."""
         ...
 
 
 def learn_from_tracks(
     config: Config,
-    begin: Begin,
+    begin: TrackFirstFrames,
     *,
     name: str,
     pool: ThreadPoolExecutor,
     warn: Callable[[str], None],
-    notify: Callable[[str], None] = unheard,
-) -> tuple[Begun, dict[str, Any]]:
-    """Follow the first frames, test the optics on them, and learn better ones where they fail.
+    notify: Callable[[str], None] = notify_nobody,
+) -> tuple[TrialTracks, dict[str, Any]]:
+    """Track the first frames, test the optics on them, and learn better ones where they fail.
 
-    Through optics that are very wrong a particle leaves rings which are taken for others, until
-    nothing can be linked or learned.  Then only what stands alone is followed, and learned from.
+    Through very wrong optics the rings of a particle are taken for other particles, until nothing
+    can be linked or learned.  Then only isolated particles are tracked, and the optics learned from
+    them.
     """
     optics = config.optics
     suited = optics.convention == "exact" and optics.psf == "model"
@@ -136,18 +137,18 @@ def learn_from_tracks(
     if noisy and cause is None and optics.calibrate != "always":
         return begun, tested | {"calibrated": False, "reason": _NOISE}
 
-    def as_configured(said: str, reason: str) -> tuple[Begun, dict[str, Any]]:
+    def as_configured(message: str, reason: str) -> tuple[TrialTracks, dict[str, Any]]:
         if trouble is not None and cause is None:
             raise trouble
         if trouble is not None:
-            raise DataError(f"{said}; nothing can be followed with them: {trouble}") from trouble
-        warn(said)
+            raise DataError(f"{message}; nothing can be followed with them: {trouble}") from trouble
+        warn(message)
         return begun, tested | {"calibrated": False, "reason": reason}
 
     learns = optics.calibrate == "always" or (optics.calibrate == "auto" and optics.file is None)
     if not learns or (cause is not None and cause.name == PIXEL):
-        said = _said(left, cause, learns=learns)
-        return as_configured(said, said)
+        message = _message(left, cause, learns=learns)
+        return as_configured(message, message)
     reason = ""
     notify("learning the optics from the tracks of the movie, which may take minutes…")
     # with free heights rings are taken for many particles, each with its own: that takes long
@@ -157,27 +158,27 @@ def learn_from_tracks(
             trial = begin(config, cautious=True) if cautious and trouble is None else begun
             found, near, why = _described(trial, begin, config, cause, name=name, pool=pool)
             if found is not None:
-                learned, told = taken(
+                learned, optics_summary = taken(
                     found, config, tested, left.verdict, pictures_of="pictures of tracks", warn=warn
                 )
-                return begin(learned), told
+                return begin(learned), optics_summary
             if trouble is not None and near is not None:
                 warn(f"{left.verdict}; others are used that describe them better, but: {why}")
                 rest = near.left.share if near.left is not None else 0.0
-                told = {"calibrated": True, "reason": why, "left_over_then": rest}
-                return near, tested | told
+                optics_summary = {"calibrated": True, "reason": why, "left_over_then": rest}
+                return near, tested | optics_summary
         except (DataError, ConfigError) as error:  # or what was learned asks for too much memory
             why = str(error)
         reason = reason or why
     if left.rejected:
-        said = f"{_said(left, cause, learns=True)} (other optics were not learned: {reason})"
+        message = f"{_message(left, cause, learns=True)} (other optics were not learned: {reason})"
     else:
-        said = f"{left.verdict}: {reason}; the analysis goes on as configured"
-    return as_configured(said, reason)
+        message = f"{left.verdict}: {reason}; the analysis goes on as configured"
+    return as_configured(message, reason)
 
 
-def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
-    """Follow the first frames, cautiously where there is trouble, which is given then."""
+def _first(config: Config, begin: TrackFirstFrames) -> tuple[TrialTracks, DataError | None]:
+    """Track the first frames, cautiously where that fails; the error is returned as well."""
     try:
         return begin(config), None
     except DataError as error:
@@ -188,24 +189,24 @@ def _first(config: Config, begin: Begin) -> tuple[Begun, DataError | None]:
 
 
 def _described(
-    trial: Begun,
-    begin: Begin,
+    trial: TrialTracks,
+    begin: TrackFirstFrames,
     config: Config,
     cause: Cause | None,
     *,
     name: str,
     pool: ThreadPoolExecutor,
-) -> tuple[OpticsCalibration | None, Begun | None, str]:
-    """Measure optics from tracks that were followed with optics that describe them.
+) -> tuple[OpticsCalibration | None, TrialTracks | None, str]:
+    """Measure optics from tracks that these very optics describe.
 
-    Where none are good enough: what was followed last, if it is described, and why.
+    Where none describe them: the last trial, if its tracks are described, and why.
     """
     reason = "what was learned does not describe them either"
     near = trial if trial.described else None
-    best: tuple[Round, Begun] | None = None
+    best: tuple[Round, TrialTracks] | None = None
     rounds = Rounds()
     for number in range(ROUNDS):
-        if number == _ROUGH_ROUNDS and near is None and best is None:
+        if number == _MOST_FAILED_ROUNDS and near is None and best is None:
             break
         known = None
         if number:
@@ -231,7 +232,7 @@ def _described(
 
 
 def mass_error(summary: Mapping[str, Any]) -> float:
-    """Say how wrong masses may be, as a share of them, with optics that do not describe tracks."""
+    """Relative error of masses with optics that do not describe the tracks."""
     if "left_over_then" in summary:
         return MASS_SHARE * float(summary["left_over_then"])
     share = float(summary.get("left_over", 0.0))
@@ -239,14 +240,14 @@ def mass_error(summary: Mapping[str, Any]) -> float:
     return MASS_SHARE * share if rejected else 0.0
 
 
-def _left_over(block: Block, context: AnalysisContext) -> LeftOver | None:
-    """Add up what the model leaves over of all pictures; None where there is none."""
+def _misfit(block: Block, context: AnalysisContext) -> Misfit | None:
+    """Sum the misfit over all pictures; None where there are none."""
     aligned = block.aligned
     if aligned is None or not len(aligned.track):
         return None
     tracks = len(np.unique(aligned.track))
     if context.mode == "joint":
-        return _left_over_singly(aligned, context, tracks)
+        return _misfit_of_single_pictures(aligned, context, tracks)
     rest, signal, variance = (np.zeros(aligned.light_e.shape[1:]) for _ in range(3))
     for number, theta in enumerate(aligned.theta):
         likelihood = aligned.likelihood(context, number)
@@ -259,11 +260,13 @@ def _left_over(block: Block, context: AnalysisContext) -> LeftOver | None:
     square = rest[used] ** 2 / variance[used] / usual
     power = float(np.sum(signal[used] ** 2 / variance[used])) / usual
     share = _share(float(np.sum(square - 1)), power)
-    return LeftOver(share, float(square.mean()) > REJECTED_CHI2, tracks)
+    return Misfit(share, float(square.mean()) > REJECTED_CHI2, tracks)
 
 
-def _left_over_singly(aligned: Aligned, context: AnalysisContext, tracks: int) -> LeftOver | None:
-    """Say the same of pictures that no two have in common, as of particles at other heights."""
+def _misfit_of_single_pictures(
+    aligned: Aligned, context: AnalysisContext, tracks: int
+) -> Misfit | None:
+    """Sum the misfit where each picture is a single frame, as of particles at many heights."""
     excess, power, p_values = 0.0, 0.0, []
     for number, theta in enumerate(aligned.theta):
         likelihood = aligned.likelihood(context, number)
@@ -272,28 +275,28 @@ def _left_over_singly(aligned: Aligned, context: AnalysisContext, tracks: int) -
         excess += (chi2 - 1) * likelihood.n_pixels
         power += float(np.sum(signal**2 * likelihood.signal_information(signal)))
         p_values.append(p_value)
-    return LeftOver(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
+    return Misfit(_share(excess, power), float(np.median(p_values)) < REJECTED_P, tracks)
 
 
 def _share(excess: float, power: float) -> float:
-    """Root of the share of a signal's power."""
+    """Root of the ratio of two powers."""
     return math.sqrt(max(excess, 0.0) / power) if power > 0 else 0.0
 
 
 def _free(context: AnalysisContext) -> BoolArray:
-    """Tell what is fitted of a picture, as `Likelihood` has it."""
+    """Tell which parameters of a picture are fitted, as `Likelihood` has it."""
     return np.array([True, True, context.mode == "joint", True, False])
 
 
 def _brightest(aligned: Aligned, most: int) -> list[int]:
-    """Numbers of the pictures that say most, the brightest first."""
+    """Numbers of the pictures with the most information, the brightest first."""
     energy = aligned.frames * aligned.theta[:, 3] ** 2 * aligned.light_e.mean(axis=(1, 2))
     order: list[int] = np.argsort(-energy, kind="stable")[:most].tolist()
     return order
 
 
-def _cause(begun: Begun) -> Cause | None:
-    """Name the part of the microscope that what is left over looks most like."""
+def _cause(begun: TrialTracks) -> Cause | None:
+    """Name the part of the microscope whose change resembles the misfit most."""
     aligned, context = begun.block.aligned, begun.context
     if aligned is None:
         return None
@@ -302,8 +305,8 @@ def _cause(begun: Begun) -> Cause | None:
     return likely_cause(context.config, fits)
 
 
-def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
-    """Say what is wrong, and what to do."""
+def _message(left: Misfit, cause: Cause | None, *, learns: bool) -> str:
+    """Say what is wrong, and what to do about it."""
     if cause is None:
         return (
             f"the model does not describe the particles: of the pictures of "
@@ -319,7 +322,7 @@ def _said(left: LeftOver, cause: Cause | None, *, learns: bool) -> str:
 
 
 def _start(config: Config, cause: Cause | None) -> Config:
-    """Where the search begins: the aperture is not found across the critical angle."""
+    """Choose where the search starts: it does not find the aperture across the critical angle."""
     if cause is None or cause.name != "numerical aperture" or cause.step is None:
         return config
     most = min(config.optics.n_immersion, config.optics.n_glass)
@@ -328,7 +331,7 @@ def _start(config: Config, cause: Cause | None) -> Config:
 
 
 def _measured(
-    begun: Begun,
+    begun: TrialTracks,
     start: Config,
     name: str,
     pool: ThreadPoolExecutor,

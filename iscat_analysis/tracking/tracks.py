@@ -1,4 +1,4 @@
-"""From the fits of mode ``track`` to its tracks: their table, what is said of them, their films."""
+"""Tables, messages and films of the tracks of mode ``track``."""
 
 from __future__ import annotations
 
@@ -52,11 +52,11 @@ _ROUNDING = 1e-9  # an exposure that is the whole interval may exceed it by this
 _NAMED = 3  # of pairs of tracks that met, in a message
 _TRUNCATED = 0.01  # of D, that is lost with the steps that are too long to be linked
 _ENOUGH = 5.0  # steps of one axis: 4 in 10⁶ in the plane are longer
-_ABSORBS = 1e-6  # of a permittivity, where a refractive index says it all no more
+_LEAST_ABSORPTION = 1e-6  # of a permittivity, where a refractive index says it all no more
 
 
 def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
-    """Say what frame rate, exposure and length of a movie leave unknown of its tracks."""
+    """Say what the frame rate, exposure and length of a movie leave unknown about its tracks."""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
         yield (
@@ -119,7 +119,7 @@ def tracks_of(
     if setup.change:
         warn(
             f"the masses of all tracks change together, by {100 * setup.change:.2g} % in these "
-            "frames, as where the focus drifts: tracks that this puts off by more than their "
+            "frames, as where the focus drifts: tracks whose masses it changes by more than their "
             "errors are flagged mass_varies; hold the focus, or analyse fewer frames (fit.frames)"
         )
     met = tracks[tracks["nearest_nm"] < setup.near_nm]
@@ -137,7 +137,7 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
     rows, columns = windows.after_e.shape
     matter = material(config.particle, config.optics.wavelength_nm)
     resolution_nm = config.optics.wavelength_nm / config.optics.na
-    absorbs = abs(matter.permittivity.imag) > _ABSORBS or matter.permittivity.real <= 0
+    absorbs = abs(matter.permittivity.imag) > _LEAST_ABSORPTION or matter.permittivity.real <= 0
     return TrackSetup(
         frame_rate_hz=config.camera.frame_rate_hz,
         exposure_ms=config.camera.exposure_ms,
@@ -196,7 +196,7 @@ def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlatio
 
 
 def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
-    """Say which tracks came near each other."""
+    """List pairs of tracks that came close to each other."""
     return (
         f"tracks {listed(met['track'], _NAMED)} come nearer than {setup.near_nm:g} nm to another "
         f"(to {met['nearest_nm'].min():.0f} nm), where masses are shared and numbers may be "
@@ -205,10 +205,10 @@ def _crossings(met: pd.DataFrame, setup: TrackSetup) -> str:
 
 
 def cut_steps(tracks: pd.DataFrame, setup: TrackSetup, reach_nm: float) -> str:
-    """Say where steps are left out that make D too small; empty where hardly any are.
+    """Say where D is too small because long steps cannot be linked; empty where it hardly is.
 
-    Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²), and without
-    these their mean square is less by R²/2s² p/(1 − p) of itself.
+    Steps in the plane of variance s² along each axis exceed R with p = exp(−R²/2s²).  Without these
+    their mean square is less by the share R²/2s² p/(1 − p).
     """
     d = tracks.loc[tracks["status"] == TrackStatus.OK, "d_um2_s"].max()
     if setup.frame_rate_hz is None or not d > 0:
@@ -281,7 +281,7 @@ def make_films(
 
 
 def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
-    """Give each track the model that it was fitted with: blurred by its own motion, or sharp."""
+    """Make the model of each track, sharp or blurred by its motion, as it was fitted."""
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
     if background_mode(context.config) != "tracks":
         known[:] = 0.0
@@ -294,7 +294,7 @@ def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, Forward
 
 
 def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
-    """Choose tracks: the longest that are ok, and those with the worst remarks."""
+    """Choose the tracks to show: the longest that are ok, and those with the most serious flags."""
     good = tracks[tracks["status"] == TrackStatus.OK].sort_values(
         ["n_frames", "mass_scatter"], ascending=[False, True]
     )
@@ -314,7 +314,7 @@ def _chosen(tracks: pd.DataFrame) -> Iterator[tuple[int, str, bool]]:
 
 
 def _shown(rows: pd.DataFrame, worst: bool) -> pd.DataFrame:
-    """Take the first frames of a track, or of a bad one those around its worst fit."""
+    """Choose the frames to show: the first ones, or those around the worst fit of a bad track."""
     if len(rows) < 2:  # not enough for a film
         return rows[:0]
     start = 0
@@ -370,7 +370,7 @@ def _single(
     windows: Sequence[Windows],
     frame: int,
 ) -> Windows:
-    """Give a frame over its background, at its power: as learnt with the tracks, or as it says."""
+    """Give one frame and its background, scaled to the power of the frame."""
     here = next((w for w in windows if w.frames_after[0] <= frame < w.frames_after[1]), windows[0])
     single = add_frames(here, camera, movie.read(frame, frame + 1), frame)
     if not context.config.background.power_normalization:
@@ -382,7 +382,7 @@ def _single(
 
 
 def _square(context: AnalysisContext, windows: Windows, rows: pd.DataFrame) -> Region:
-    """Place a square in the field around the middle of the places."""
+    """Choose a square of the field around the median of the positions."""
     spans = []
     for name, size in zip(("y_px", "x_px"), windows.after_e.shape, strict=True):
         side = min(context.roi_px, size)

@@ -54,7 +54,7 @@ INPUTS = (
 
 
 def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
-    """Give what the uncertainty of one input makes of the masses of a movie."""
+    """Error of the masses of a movie that the uncertainty of one input makes."""
     sigma = float(getattr(config.uncertainty, key))
     line, optics = config.calibration, config.optics
     suited = optics.scheme != "darkfield" and optics.convention == "exact"
@@ -80,7 +80,7 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
 
 
 def _alike(here: Config, there: Config) -> bool:
-    """Tell whether standards were seen as the particles are, so that all shifts are equal."""
+    """Tell whether standards were measured like the particles, so that all shifts are equal."""
     return (
         here.optics.model_copy(update={"file": None, "calibrate": "auto"})
         == there.optics.model_copy(update={"file": None, "calibrate": "auto"})

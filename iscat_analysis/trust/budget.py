@@ -1,4 +1,4 @@
-"""The budget of a movie: what the error of a mass is made of, source by source."""
+"""The error budget of the masses of a movie, source by source."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.trust.systematic import Contribution
 
-_NARROW = 0.25  # of σ: a width beneath it is not worth a line
-_CLEAR = 3.0  # standard errors by which noise is more than σ says
+_LEAST_WIDTH = 0.25  # of σ: a width beneath it is not worth a line
+_CLEAR_SIGMAS = 3.0  # standard errors by which noise is more than σ says
 
 
 def budget_of(
@@ -38,7 +38,12 @@ def budget_of(
     remedy = "more light, or more frames of each particle"
     budget = [_entry("photon noise", "measured", noise, mass, remedy, common=False)]
     spread = achieved.get("mass_kda")
-    if spread is not None and not scaled and spread.significance > _CLEAR and spread.over_crb > 1:
+    if (
+        spread is not None
+        and not scaled
+        and spread.significance > _CLEAR_SIGMAS
+        and spread.over_crb > 1
+    ):
         excess = noise * math.sqrt(spread.over_crb**2 - 1)
         remedy = 'steadier light or stage; fit.sigma = "measured" puts it into sigma'
         budget.append(
@@ -92,7 +97,7 @@ def _median(values: FloatArray) -> float | None:
 
 
 def explained_kda(budget: Sequence[Mapping[str, Any]]) -> float:
-    """Give the width that the budget gives a species beyond σ: what differs from row to row."""
+    """Width of a species that the budget explains beyond σ: errors that differ between rows."""
     own = [one for one in budget if not one["common"] and one["name"] != "photon noise"]
     return math.sqrt(sum((one["sigma_mass_kda"] or 0.0) ** 2 for one in own))
 
@@ -105,7 +110,7 @@ def width_warning(across: Sequence[Mapping[str, Any]], *, calibrated: bool) -> s
         if low is None or width is None or not math.isfinite(low):
             continue
         sigma = width / math.sqrt(max(one["spread_over_sigma"] ** 2 - 1, 1e-12))
-        if low > max(one["explained_kda"], _NARROW * sigma):
+        if low > max(one["explained_kda"], _LEAST_WIDTH * sigma):
             wide.append((one, width, low))
     if not wide:
         return ""

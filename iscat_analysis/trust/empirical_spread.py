@@ -1,4 +1,4 @@
-"""The measured spread of an analysis: that of each event, and the pooled ratio to the bound."""
+"""The measured spread: of each event, and pooled as a ratio to the bound."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _SHARE = 0.3  # of an excess that is worth naming
 def measure_spread(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray], empty: EmptySpread | None
 ) -> dict[str, EmpiricalSpread]:
-    """Pool the repeats of all events that are ok or whose only fault is a poor fit."""
+    """Pool the spread of all events that are ok, or flagged as a poor fit only."""
     kept = [
         repeat
         for repeat, status, flags in zip(repeats, table["status"], table["flags"], strict=True)
@@ -50,7 +50,7 @@ def measure_spread(
 def repeat_columns(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray]
 ) -> dict[str, FloatArray]:
-    """Give the columns ``repeat_*``: the error of each event as its own frames show it."""
+    """Make the columns ``repeat_*``: the error of each event from parts of its own frames."""
     columns = {name: np.full(len(table), np.nan) for name in REPEAT_COLUMNS}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
         squares, counts = (np.array([r[0, i] for r in repeats], dtype=float) for i in (k, -1))
@@ -61,7 +61,7 @@ def repeat_columns(
 
 
 def measured_scale(found: Mapping[str, EmpiricalSpread]) -> dict[str, float]:
-    """Give what σ is multiplied by with ``fit.sigma = "measured"``: the spread over the bound."""
+    """Factor of σ with ``fit.sigma = "measured"``: the spread over the bound."""
     return {f"sigma_{name}": max(a.over_crb, 1.0) for name, a in found.items()}
 
 
@@ -73,7 +73,7 @@ def spread_verdict(
     rejected: bool = False,
     sliding: bool = True,
 ) -> dict[str, Any]:
-    """Say whether σ is too small, by what factor, and what the noise suggests."""
+    """Say whether σ is too small, by what factor, and the likely kind of noise."""
     high = {name: a for name, a in found.items() if a.exceeds}
     low = {name: a for name, a in found.items() if a.falls_short}
     if not high:
@@ -116,23 +116,23 @@ def likely_noise(
     """
     excess = found.over_crb**2 - 1
     single = found.fast2
-    said, doubt = [], ""
+    causes, doubt = [], ""
     if single - 1 > _SHARE * excess:
         over_shot = [v for v in noise.get("noise_variance_over_shot", ()) if v is not None]
         pixels = over_shot[0] if over_shot else single
         if abs(pixels - 1) > _SHARE * (single - 1):
-            said.append(
+            causes.append(
                 f"single frames have {single:.3g} times the variance that the camera's numbers "
                 "give: a wrong camera.gain_e_per_adu, or a source or camera with noise of its own"
             )
         else:
-            said.append(
+            causes.append(
                 "the noise of single pixels is as expected but that of an image is not: "
                 "neighbouring pixels are correlated, by crosstalk or a filter in the camera"
             )
     if found.empty:
         if found.slow2 > _SHARE * excess:
-            said.append(_slow(found, sliding))
+            causes.append(_slow(found, sliding))
             if rejected:
                 doubt = (
                     "it may be what a wrong model of the image leaves over of other particles: "
@@ -140,10 +140,10 @@ def likely_noise(
                 )
         own = found.over_crb**2 - found.empty[-1] ** 2
         if own > _SHARE * excess:
-            said.append(
+            causes.append(
                 "it is larger at the particles than elsewhere: they move or change in the light"
             )
-    return doubt + ("; ".join(said) or "its kind is not clear")
+    return doubt + ("; ".join(causes) or "its kind is not clear")
 
 
 def _slow(found: EmpiricalSpread, sliding: bool) -> str:

@@ -27,10 +27,11 @@ FEWEST = 6
 """Events without which nothing is said of a spread that all particles have."""
 
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it,
-_DOUBTFUL = 2.5  # and beyond which systematic errors have it
+_SYSTEMATIC_SIGMAS = 2.5  # and beyond which systematic errors have it
 _CHANCE = 1e-5  # of one event that is flagged with no spread, and of pictures of all that are long
-_MATTERS = 0.5  # of σ, by which a mass is too small before its row is flagged for that of all
-_OUTLYING = 4.0  # standard errors beyond which an event is not one of many
+# Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
+_LEAST_SHIFT_SIGMAS = 0.5
+_OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
 
@@ -57,18 +58,18 @@ class Extension:
     def of(
         cls,
         table: pd.DataFrame,
-        told: Evidence,
+        evidence: Evidence,
         in_time: Mapping[str, EmpiricalSpread],
         wiggle_nm: float = 0.0,
     ) -> Extension | None:
-        """Judge the evidence of rows, beyond a wiggle that is known; None where none has any."""
-        said = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
-        q, se = told.spread_nm2, told.sigma_spread_nm2
-        known = np.isfinite(q) & np.isfinite(se) & np.isfinite(told.sigma_across_nm2)
+        """Estimate the extension from all rows, beyond a known wiggle; None where there is none."""
+        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
+        q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
+        known = np.isfinite(q) & np.isfinite(se) & np.isfinite(evidence.sigma_across_nm2)
         if not known.any():
             return None
-        own = known & (q > 0) & (np.nan_to_num(told.chi2_spread) > chdtri(3, _CHANCE))
+        own = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         many = good & known
         mean, error = math.nan, math.nan
         shift = np.zeros(len(table))
@@ -76,25 +77,27 @@ class Extension:
             mean, error = max(
                 (
                     _mean(q[many], se[many]),
-                    _length(*(part[many] for part in told[7:10])),
+                    _length(*(part[many] for part in evidence[7:10])),
                     _wiggle(table[many], in_time, wiggle_nm),
                 ),
                 key=lambda found: found[0] / found[1],
             )
-        if mean > _DOUBTFUL * error:
-            shift = np.abs(np.nan_to_num(told.mass_per_spread)) * mean
+        if mean > _SYSTEMATIC_SIGMAS * error:
+            shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * mean
         if mean > _SIGNIFICANT * error:
-            own = own | (known & (shift > _MATTERS * table["sigma_mass_kda"].to_numpy(float)))
+            own = own | (
+                known & (shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float))
+            )
         return cls(mean, error, own, shift)
 
     @property
     def is_common(self) -> bool:
-        """Whether all particles have it."""
+        """Whether all particles are extended."""
         return bool(self.variance_nm2 > _SIGNIFICANT * self.variance_se_nm2)
 
     @property
     def message(self) -> str:
-        """What the user should know; empty where pictures are as wide as the model's."""
+        """Message for the user; empty where pictures are as wide as the model's."""
         if not self.is_common:
             return ""
         wide = math.sqrt(self.variance_nm2)
@@ -123,7 +126,7 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     """
     away = np.abs(q - np.median(q))
     wide = np.sqrt((1.48 * np.median(away)) ** 2 + se**2)
-    kept = away <= _OUTLYING * wide
+    kept = away <= _OUTLIER_SIGMAS * wide
     weight = se[kept] ** -2.0
     mean = float(np.average(q[kept], weights=weight))
     chi2_reduced = float(np.sum(weight * (q[kept] - mean) ** 2)) / max(int(kept.sum()) - 1, 1)
@@ -131,15 +134,16 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
 
 
 def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Least mean variance that pictures which are long, each its own way, tell of; and its error.
+    """Least mean variance that elongated pictures show, and its error.
 
-    What all have in common is of the optics.
+    Each particle has its own direction of elongation; what all have in common belongs to the
+    optics.
 
     Shapes: `across, along, sigma` (n,).
     """
     parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
     squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-    squares = squares[squares < np.median(squares) * _OUTLYING**2]
+    squares = squares[squares < np.median(squares) * _OUTLIER_SIGMAS**2]
     n = squares.size
     if n < FEWEST or chdtrc(2 * n - 2, squares.sum()) > _CHANCE:
         return 0.0, 1.0
@@ -153,9 +157,9 @@ def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[f
 def _wiggle(
     table: pd.DataFrame, in_time: Mapping[str, EmpiricalSpread], known_nm: float
 ) -> tuple[float, float]:
-    """Variance by which positions scatter from frame to frame beyond the noise, and its error.
+    """Variance of positions from frame to frame beyond the noise, and its error.
 
-    Half of the frames that are compared have no particle, whose wiggle then is twice the mean.
+    Half of the frames that are compared hold no particle; its wiggle is twice the mean.
     """
     before, after = table["n_before"].to_numpy(float), table["n_after"].to_numpy(float)
     frames = before * after / np.maximum(before + after, 1.0)

@@ -72,18 +72,18 @@ class Fluctuation:
         there = np.where(mass > 0, after, before)
         one = crb**2 * before * after / (before + after)  # variance of a single frame
         strength = there / (before + after) * mass**2 / one
-        said = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in said], dtype=bool)
+        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         good &= np.isfinite(strength)
         if good.sum() < FEWEST:
             return None
         own = np.stack([repeat for repeat, kept in zip(repeats, good, strict=True) if kept])[:, 1:]
         squares, counts = own[:, :, FREE_PARAMETERS[mode].index("mass_kda")], own[:, :, -1]
-        told = counts.sum(axis=0) >= 2
-        lengths = np.array(LENGTHS, dtype=float)[told]
+        enough = counts.sum(axis=0) >= 2
+        lengths = np.array(LENGTHS, dtype=float)[enough]
         if lengths.size < _LEAST_LENGTHS:
             return None
-        squares, counts, strength = squares[:, told], counts[:, told], strength[good]
+        squares, counts, strength = squares[:, enough], counts[:, enough], strength[good]
         total = counts.sum(axis=0)
         excess = squares.sum(axis=0) / total - _without(pooled, lengths, float(np.median(there)))
         left = squares - counts * (squares.sum(axis=0) / total)
@@ -108,7 +108,7 @@ class Fluctuation:
 
     @property
     def message(self) -> str:
-        """What the user should know."""
+        """Message for the user."""
         return (
             f"contrasts fluctuate by {100 * self.relative:.2g} ± {100 * self.relative_se:.1g} % "
             f"while particles are there, over some {self.frames:.2g} frames: sigma_mass_kda has "

@@ -1,4 +1,4 @@
-"""What a movie says of the heights of its particles, and what holding them does to masses."""
+"""Spread of the heights of particles, and the mass error of holding them at one height."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 
 @dataclass(frozen=True)
 class Heights:
-    """What all events say of their heights, and what follows from it."""
+    """Heights that the light of all events shows, and the mass shifts that follow."""
 
     spread: HeightSpread
     held: bool
@@ -31,30 +31,30 @@ class Heights:
 
     @classmethod
     def of(
-        cls, config: Config, table: pd.DataFrame, told: Evidence, *, learned_optics: bool
+        cls, config: Config, table: pd.DataFrame, evidence: Evidence, *, learned_optics: bool
     ) -> Heights | None:
-        """Judge the evidence of every row; None where there is too little."""
+        """Estimate the heights from all rows; None where there are too few."""
         held = not has_prior(config)
         kinds = _DESCRIBED if held else {Status.OK.value}
-        said = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in said])
-        spread = spread_of_heights(told.z_nm[good], told.sigma_z_nm[good])
+        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in marks])
+        spread = spread_of_heights(evidence.z_nm[good], evidence.sigma_z_nm[good])
         if spread is None:
             return None
         shift = np.zeros(len(table))
         if held and spread.is_spread:
             off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
-            shift = np.abs(np.nan_to_num(told.mass_per_z)) * off
+            shift = np.abs(np.nan_to_num(evidence.mass_per_z)) * off
         return cls(spread, held, shift, learned_optics)
 
     @property
     def are_wrong(self) -> bool:
-        """Whether one height is held for particles that are not equally high."""
+        """Whether one height is held although the particles have different heights."""
         return self.held and self.spread.is_spread
 
     @property
     def message(self) -> str:
-        """What the user should know; empty where heights and errors agree."""
+        """Message for the user; empty where heights and errors agree."""
         if not self.are_wrong:
             return ""
         return (

@@ -1,7 +1,7 @@
-"""Where a field is empty: the estimator at the places that no particle reaches.
+"""Estimates at places without a particle, which show the noise.
 
-Windows of frames are compared there by `landing.split_frame_estimates`, and single frames with
-their background by `FrameNoise`, for tracks.
+`landing.split_frame_estimates` compares windows of frames there; `FrameNoise` compares single
+frames with their background, for tracks.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from iscat_analysis.search.empty import CONTRASTS, EmptyField, EmptySpread
 MOST_DISTANCES = 6
 """Distances between a frame and its background at which the noise is told apart."""
 
-_NEAR, _NEAR_POOR = 1 / 3, 1 / 2  # of the square's side; a poor fit leaves its rings over
-_OUTSHONE = 0.1
+# Of the square's side; a poor fit leaves its rings over
+_NEAR_SHARE, _NEAR_SHARE_POOR = 1 / 3, 1 / 2
+_LARGEST_SIGNAL_SHARE = 0.1
 _EXACTLY = 1e-12  # variance of a background that is given, over that of one frame
 _WHOLE = CONTRASTS.index("whole")
 
@@ -41,13 +42,13 @@ _WHOLE = CONTRASTS.index("whole")
 def taken_places(
     context: AnalysisContext, shape: tuple[int, int], places: Sequence[tuple[float, float, bool]]
 ) -> BoolArray:
-    """Give the pixels so near to a particle that its fit, and not the noise, is seen.
+    """Mark pixels near a particle, in which the estimate would show its fit and not the noise.
 
     Shapes: result (y, x).
     """
     taken = np.zeros(shape, dtype=np.bool_)
     for x, y, described in places:
-        reach = context.roi_px * (_NEAR if described else _NEAR_POOR)
+        reach = context.roi_px * (_NEAR_SHARE if described else _NEAR_SHARE_POOR)
         top, left = max(math.ceil(y - reach), 0), max(math.ceil(x - reach), 0)
         box = taken[
             top : max(math.floor(y + reach) + 1, 0), left : max(math.floor(x + reach) + 1, 0)
@@ -60,7 +61,7 @@ def taken_places(
 def taken_by(
     context: AnalysisContext, windows: Windows, events: Sequence[Event], signal: FloatArray
 ) -> BoolArray:
-    """Give the pixels that fitted particles take.
+    """Mark pixels near fitted particles.
 
     Shapes: `signal` (y, x), result (y, x).
     """
@@ -70,7 +71,10 @@ def taken_by(
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
     )  # fmt: skip
     if context.additive:
-        taken |= photons_scale(context, windows) * signal > _OUTSHONE * windows.after_e.mean()
+        taken |= (
+            photons_scale(context, windows) * signal
+            > _LARGEST_SIGNAL_SHARE * windows.after_e.mean()
+        )
     return taken
 
 
@@ -83,7 +87,7 @@ def empty_field(
     *,
     level: bool,
 ) -> EmptyField:
-    """Make the estimator of particles such as were fitted.
+    """Make the linear estimator for windows, with the typical height and noise of the fits.
 
     Shapes: `mean_e` (y, x), `read` (y, x), `used` (y, x).
     """
@@ -111,7 +115,7 @@ def background_field(
     read: FloatArray,
     fits: Sequence[FitResult],
 ) -> EmptyField:
-    """Make the estimator for frames against a background.
+    """Make the linear estimator for single frames against a background.
 
     Shapes: `read` (y, x).
     """
@@ -122,7 +126,7 @@ def background_field(
 
 
 class FrameNoise:
-    """What single frames make of nothing, each against the background, as tracks are fitted."""
+    """Estimates in single frames at places without a particle."""
 
     def __init__(
         self,
@@ -152,7 +156,7 @@ class FrameNoise:
         self._last: tuple[int, float, FloatArray, BoolArray, FloatArray] | None = None
 
     def look(self, here: Windows, events: Sequence[Event]) -> FloatArray:
-        """Look at one frame, where no particle was fitted in it.
+        """Add one frame.
 
         Shapes: result (1 + len(LENGTHS).
         """
@@ -190,7 +194,7 @@ class FrameNoise:
 
     @property
     def spread(self) -> EmptySpread:
-        """What all frames say, each as often as particles were fitted in it."""
+        """Spread over all frames, each weighted with the number of particles fitted in it."""
         seen = self._counts[2:].any(axis=1)
         kept = np.concatenate([[True, True], seen])
         total, frames = self._distances[:, seen]

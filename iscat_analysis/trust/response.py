@@ -1,4 +1,4 @@
-"""How the estimates of a particle answer to a microscope that is not the one assumed."""
+"""Response of the estimates to optics that differ from the assumed ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _UNDETERMINED = 1e-7  # of the information, below which pictures do not tell a p
 
 @dataclass(frozen=True)
 class Response:
-    """How the estimates of a particle at the centre of a region move with the optics."""
+    """Derivatives of the estimates of a particle with respect to the optics."""
 
     model: ForwardModel  # with masses that are amplitudes
     grid: PixelGrid
@@ -44,7 +44,7 @@ class Response:
     contrast: bool
 
     def expected(self, theta: FloatArray) -> Likelihood:
-        """Likelihood of the counts that are expected of a particle.
+        """Likelihood of the expected counts of a particle.
 
         Shapes: `theta` (5,).
         """
@@ -85,7 +85,7 @@ class Response:
 
     @property
     def faint_amplitude(self) -> float:
-        """Amplitude of a particle whose scattered light alone is nothing."""
+        """Amplitude of a particle whose scattered light alone is negligible."""
         return _FAINT / peak_per_amplitude(self.model)
 
     def to_input(self, derivative: FloatArray, amplitude: float) -> tuple[float, FloatArray]:

@@ -48,9 +48,10 @@ _FEWEST_PICTURES = 8  # that tell what is left over of them
 _SPREAD = 2.0  # ratio of squared SNR, over which noise and misfit can be told apart
 _MISFIT_SIGMAS = 5.0  # by which something is left over
 _MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
-_BENT = 0.02  # of a mass; beneath, lines of standards that scatter by a per cent are as wrong
-_BENT_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
-_TOLD = 0.5  # of σ, beyond which it is told of every row
+# Of a mass; beneath, lines of standards that scatter by a per cent are as wrong
+_LEAST_NONLINEAR_SHARE = 0.02
+_NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
+_LEAST_SIGMAS = 0.5  # of σ, beyond which it is told of every row
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 _NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
 
@@ -205,7 +206,7 @@ def _of_heavy_particles(
     if not _fits_masses(config):
         return {}
     off, sigma = _off_the_line(scale, table)
-    return {"mass_kda": off} if (off > _TOLD * sigma).any() else {}
+    return {"mass_kda": off} if (off > _LEAST_SIGMAS * sigma).any() else {}
 
 
 def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
@@ -216,7 +217,9 @@ def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:
     off, sigma = _off_the_line(scale, table)
     share = off / np.maximum(np.abs(table["mass_kda"].to_numpy(float)), 1e-300)
     return np.asarray(
-        (off > _BENT_SIGMAS * sigma) | ((share > _BENT) & (off > _TOLD * sigma)), dtype=np.bool_
+        (off > _NONLINEAR_SIGMAS * sigma)
+        | ((share > _LEAST_NONLINEAR_SHARE) & (off > _LEAST_SIGMAS * sigma)),
+        dtype=np.bool_,
     )
 
 
@@ -254,11 +257,11 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
     covariance = np.array(errors.matrix)
     variance = np.einsum("eik,kl,eil->ei", shifts, covariance, shifts)
     sigma = np.sqrt(np.maximum(variance, 0.0))
-    told = [
+    reported = [
         *FREE_PARAMETERS[config.fit.mode],
         *(["contrast"] if _is_about_contrast(config) else []),
     ]
-    return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in told}
+    return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in reported}
 
 
 def _is_about_contrast(config: Config) -> bool:

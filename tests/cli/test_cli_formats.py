@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import tifffile
 
-from iscat_analysis.movie import beside
+from iscat_analysis.movie import path_beside
 from iscat_cli import main
 
 pytestmark = pytest.mark.usefixtures("sketched")
@@ -43,7 +43,7 @@ def test_every_file_gives_the_same_fits(
     for movie, options in jobs:
         config = ["--config", str(sample_configs["mass"]), "--no-posterior", "--quiet"]
         assert main(["fit", str(movie), *options, *config]) == 0
-        tables.append(pd.read_csv(beside(movie, ".iscat") / "fits.csv"))
+        tables.append(pd.read_csv(path_beside(movie, ".iscat") / "fits.csv"))
     assert len(tables[0]) == 1
     for table in tables[1:]:
         pd.testing.assert_frame_equal(table, tables[0])

@@ -119,7 +119,7 @@ def test_every_example_runs(
             raise KeyboardInterrupt
 
         Path("movies").mkdir()
-        monkeypatch.setattr("iscat_analysis.day.watch._Folder.look", interrupt)
+        monkeypatch.setattr("iscat_analysis.day.watch._Folder.check", interrupt)
     if "samples.csv" in arguments:
         sketch_figures(monkeypatch)
         Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")

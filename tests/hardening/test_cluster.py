@@ -194,9 +194,9 @@ def test_chunks_of_a_movie_give_the_same_bytes_when_a_worker_is_killed(
 ) -> None:
     cluster.add(2)
     out, config, told = tmp_path / "far.iscat", ia.configure(LANDING), []
-    with one_killed(cluster), places.open_executor(scheduler_file=cluster.file) as place:
+    with one_killed(cluster), places.open_executor(scheduler_file=cluster.file) as executor:
         fit_stack(
-            landing, config, out=out, command="iscat-fit", place=place,
+            landing, config, out=out, command="iscat-fit", executor=executor,
             progress=lambda *step: told.append(step),
         )  # fmt: skip
     chunks = json.loads((here / "summary.json").read_text())["landing"]["chunks"]
@@ -215,11 +215,11 @@ def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
         if stage == "landing" and done < total:
             raise KeyboardInterrupt
 
-    with places.open_executor(scheduler_file=cluster.file) as place:
+    with places.open_executor(scheduler_file=cluster.file) as executor:
         with pytest.raises(KeyboardInterrupt):
-            fit_stack(landing, config, out=out, progress=stop, place=place)
+            fit_stack(landing, config, out=out, progress=stop, executor=executor)
         with pytest.raises(SchedulerError, match="the work was stopped"):
-            place.call(print)
+            executor.call(print)
     assert json.loads((out / "summary.json").read_text())["interrupted"]
     assert list(partial_folder(out).glob("*.npz"))
     wait_until(cluster.idle)
@@ -251,8 +251,11 @@ def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, mo
 def test_a_worker_does_one_job_at_a_time_with_all_its_threads(cluster: Workers) -> None:
     """Its memory is that of one job, even where others ask it for more at the same time."""
     cluster.add(2)
-    with places.open_executor(scheduler_file=cluster.file) as place, ThreadPoolExecutor(5) as pool:
-        done = list(pool.map(lambda _: place.call(busy, 0.1), range(5)))
+    with (
+        places.open_executor(scheduler_file=cluster.file) as executor,
+        ThreadPoolExecutor(5) as pool,
+    ):
+        done = list(pool.map(lambda _: executor.call(busy, 0.1), range(5)))
     assert {count for _, count, _, _ in done} == {2}
     for one, other in combinations(done, 2):
         apart = one[3] <= other[2] or other[3] <= one[2]

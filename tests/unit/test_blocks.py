@@ -24,14 +24,14 @@ from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.checkpoint import GOES_ON, partial_folder
+from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import Block
 from iscat_analysis.tracking.blocks import (
+    MOST_DRIFT_OVER_COUNTING,
     SHORTEST,
-    WORTH_COUNTING,
     Plan,
     drift_over_counting,
     follow_light,
@@ -39,9 +39,9 @@ from iscat_analysis.tracking.blocks import (
 )
 from iscat_analysis.tracking.joining import combine_masses, join_tracks
 from iscat_analysis.tracking.joint.localizations import Localizations
-from iscat_analysis.tracking.linking import unlike
-from iscat_analysis.tracking.moving import follow
-from iscat_analysis.tracking.moving_field import load_field, track_scene
+from iscat_analysis.tracking.linking import has_other_mass
+from iscat_analysis.tracking.moving import find_rows_and_background
+from iscat_analysis.tracking.moving_field import load_field, tracking_context
 from iscat_analysis.tracking.moving_table import common_masses, moving_table, table_of_tracks
 
 pytestmark = pytest.mark.usefixtures("sketched")
@@ -114,14 +114,14 @@ def test_a_block_ends_where_drift_costs_more_than_counting() -> None:
     """Of a pattern of width s and roughness r K = B r²/(2 s²), and C = K v² T³/12."""
     frames, velocity = 600, 4e-4
     stiffness = LEVEL_E * ROUGH**2 / (2 * LENGTH_PX**2)
-    expected = (12 * WORTH_COUNTING / (stiffness * velocity**2)) ** (1 / 3)
+    expected = (12 * MOST_DRIFT_OVER_COUNTING / (stiffness * velocity**2)) ** (1 / 3)
     plan = _plan(_drifting(frames, velocity))
     assert plan.moved_px == pytest.approx((0.0, velocity * (frames - 1)), abs=2e-3)
     assert 0.8 * expected < plan.frames < 1.1 * expected  # blocks are whole parts of a movie
     assert plan.drifts
     assert plan.drift_over_counting is not None
-    assert plan.drift_over_counting <= WORTH_COUNTING
-    share = WORTH_COUNTING * (plan.frames / expected) ** 3
+    assert plan.drift_over_counting <= MOST_DRIFT_OVER_COUNTING
+    share = MOST_DRIFT_OVER_COUNTING * (plan.frames / expected) ** 3
     assert plan.drift_over_counting == pytest.approx(share, rel=0.15)
     assert [a for a, _ in plan.spans[1:]] == [b for _, b in plan.spans[:-1]]
     assert (plan.spans[0][0], plan.spans[-1][1]) == (0, frames)
@@ -292,7 +292,9 @@ def test_a_part_that_is_no_part_of_its_track_does_not_count() -> None:
     found = combine_masses(parts, [np.zeros(1, dtype=np.int64)] * 3, table)
     assert found.loc[0, "mass_kda"] == pytest.approx(403.0)
     rng = np.random.default_rng(1)
-    off = unlike(np.zeros(110, dtype=np.int64), mass + rng.normal(0, 20, 110), np.full(110, 20.0))
+    off = has_other_mass(
+        np.zeros(110, dtype=np.int64), mass + rng.normal(0, 20, 110), np.full(110, 20.0)
+    )
     assert np.array_equal(off, mass < 0)
 
 
@@ -302,9 +304,9 @@ def test_a_part_that_is_no_part_of_its_track_does_not_count() -> None:
 def _whole(counts: np.ndarray, config: Config) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Give the rows and masses of a movie that is followed as one."""
     stack, camera = Stack(counts), Camera(gain_e_per_adu=GAIN)
-    context = track_scene(config, (counts.shape[1], counts.shape[2]), len(counts))
+    context = tracking_context(config, (counts.shape[1], counts.shape[2]), len(counts))
     with threads(2) as pool:
-        moving = follow(
+        moving = find_rows_and_background(
             context, stack, camera, (0, len(counts)),
             check=_unchecked, pool=pool, progress=lambda *_: None,
         )  # fmt: skip
@@ -331,7 +333,7 @@ def test_frames_are_kept_as_they_are_stored_where_one_gain_is_theirs(
 ) -> None:
     counts = np.random.default_rng(1).integers(90, 110, (30, 24, 24)).astype(stored)
     camera = Camera(gain_e_per_adu=GAIN, offset_adu=offset)
-    context = track_scene(_config(), (24, 24), len(counts))
+    context = tracking_context(_config(), (24, 24), len(counts))
     electrons = camera.to_electrons(counts[4:])
     with threads(2) as pool:
         field = load_field(context, Stack(counts), camera, (4, 30), _unchecked, pool, _untold)
@@ -490,7 +492,7 @@ def test_tracks_are_kept_where_their_report_is_interrupted(
         patch.setattr(*where, stop)
         with pytest.raises(KeyboardInterrupt) as stopped:
             fit_stack(movie, config, out=out)
-    assert str(stopped.value) == f"SIGTERM was received; {GOES_ON}"
+    assert str(stopped.value) == f"SIGTERM was received; {RESUMPTION_HINT}"
     assert not out.exists()
     monkeypatch.setattr(tracking_module, "analyse_block", stop)  # which is not needed again
     assert len(fit_stack(movie, config, out=out).table)

@@ -19,7 +19,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.learned import LearnedCamera, learn_camera
 from iscat_analysis.camera.response import read_response
 from iscat_analysis.config import CameraConfig
-from iscat_analysis.diagnosis.camera_numbers import law_said
+from iscat_analysis.diagnosis.camera_numbers import law_messages
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import StackMetadata
 
@@ -93,7 +93,7 @@ def test_eight_bits_have_no_offset_under_a_steady_laser() -> None:
         read = known.numbers["read_noise_e"]
         assert read.source == "rounding"
         assert read.value == pytest.approx(700 / 12**0.5, rel=0.02)
-        assert not law_said(known)
+        assert not law_messages(known)
 
 
 def test_gain_and_offset_are_learned_with_their_errors() -> None:
@@ -174,7 +174,7 @@ def test_averaged_frames_have_the_gain_of_their_averages() -> None:
 def test_a_steady_laser_does_not_tell_gamma_from_saturation() -> None:
     known = _learned(record(1, gamma(0.8), flicker=0.0))
     assert known.response is None
-    (said,) = law_said(known)
+    (said,) = law_messages(known)
     assert "does not tell" in said
     assert "camera.response" not in said
 

@@ -179,7 +179,7 @@ def test_shared_errors_are_those_of_all_pixels(
         return float(np.abs(np.linalg.eigvalsh(off)).max())
 
     assert error() < 1e-3
-    monkeypatch.setattr(common, "_LEFT", math.inf)
+    monkeypatch.setattr(common, "_MOST_VARIANCE_LEFT_OUT", math.inf)
     assert error() > 3e-3 or kind == "short"  # whose rows hardly feel one another
     found = common_amplitudes(field, ground, rows, judged, np.ones(frames, dtype=bool))
     weights = np.linalg.solve(amplitudes, np.ones(frames))

@@ -19,7 +19,7 @@ from iscat_analysis.fitting.regions import field_likelihood, noise_cumulants, se
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, Windows
 from iscat_analysis.search.templates import (
-    FLOOD,
+    MOST_CANDIDATES,
     ExcessNoise,
     find_particles,
     refuse_flood,
@@ -135,12 +135,12 @@ def test_places_that_noise_makes_end_a_search_and_others_do_not() -> None:
     """However many they are: particles and their rings pass the threshold as well."""
     templates = make_context(make_config(), (256, 256)).templates
     wild, mild = ExcessNoise(8.0, "wild"), ExcessNoise(1.5, "mild")
-    many = 2 * FLOOD
+    many = 2 * MOST_CANDIDATES
     with pytest.raises(FloodError, match=f"^{many} places in frames 0:9 pass .*: wild$"):
         refuse_flood(many, templates, wild, images=20, frames=" in frames 0:9")
     refuse_flood(many, templates, mild, images=20)
     refuse_flood(many, templates, None, images=20)
-    refuse_flood(FLOOD, templates, wild, images=20)
+    refuse_flood(MOST_CANDIDATES, templates, wild, images=20)
 
 
 def test_noise_passes_the_threshold_as_often_as_predicted() -> None:

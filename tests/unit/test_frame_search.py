@@ -9,7 +9,7 @@ from scenes import PIXEL_NM, make_config
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.tracking.frame_search import FrameCandidates, FrameFilter
-from iscat_analysis.tracking.moving_field import track_scene
+from iscat_analysis.tracking.moving_field import tracking_context
 
 SIDE, ROI, LEVEL_E = 96, 32, 4e5
 
@@ -29,8 +29,8 @@ def _found(
     config: Config, particles: list[tuple[float, float, float]], *, seen_through: Config
 ) -> FrameCandidates:
     """Search a frame with particles (x, y [pixels], mass), made through some optics."""
-    context = track_scene(config, (SIDE, SIDE), 1000)
-    picture = track_scene(seen_through, (SIDE, SIDE), 1000).wide
+    context = tracking_context(config, (SIDE, SIDE), 1000)
+    picture = tracking_context(seen_through, (SIDE, SIDE), 1000).wide
     grid = PixelGrid.region((0, SIDE), (0, SIDE), PIXEL_NM)
     signal = sum(
         picture.image(grid, x * PIXEL_NM, y * PIXEL_NM, picture.height_nm, mass)

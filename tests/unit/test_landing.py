@@ -25,7 +25,7 @@ from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.landing import chunk_work, merging
 from iscat_analysis.landing import find as landing_module
 from iscat_analysis.landing.find import analyse_landings
-from iscat_analysis.landing.merging import Done, Merged
+from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
@@ -408,7 +408,7 @@ def test_lines_of_chunks_have_no_numbers(
     monkeypatch.setattr(chunks_module, "_MEMORY_SHARE", 0.005)
     real, lines = landing_module.analyse_chunk, []
 
-    def looked_at(*arguments: Any) -> Done:
+    def looked_at(*arguments: Any) -> FinishedChunk:
         done = real(*arguments)
         lines.append(done.lines)
         return done
@@ -452,9 +452,9 @@ def test_a_brightness_jump_is_divided_out_and_named(counts: np.ndarray) -> None:
 def test_a_moving_pattern_is_named(shift: int, named: bool) -> None:
     image = Movie(_config(), 3).background_e
     nothing = np.zeros((SIDE, SIDE), dtype=bool)
-    merged = Merged((SIDE, SIDE))
+    merged = MergedChunks((SIDE, SIDE))
     merged.add(
-        Done(
+        FinishedChunk(
             core=(0, 400),
             lines=pd.DataFrame(),
             repeats=np.empty(0),

@@ -115,7 +115,7 @@ def test_parts_of_a_camera_are_told_by_their_seams(
     light = [(_light() * gains(), _light() * gains()) for _ in range(2 * PAIRS)]
     found = find_surface(_pairs(light, 9), Camera(), WINDOW)
     assert found is not None
-    assert found.seams == seams
+    assert found.amplifier_boundaries == seams
     factor = gains()
     factor /= np.average(factor, weights=found.light_e)
     np.testing.assert_allclose(found.factors(found.light_e * factor), factor, atol=1e-9)
@@ -130,7 +130,7 @@ def test_seams_and_fringes_hide_nothing_from_each_other() -> None:
 
     found = find_surface(_pairs([(light(), light()) for _ in range(PAIRS)], 10), Camera(), WINDOW)
     assert found is not None
-    assert found.seams == ((48,), ())
+    assert found.amplifier_boundaries == ((48,), ())
     assert found.fringes.periods_px == pytest.approx([25.0], rel=0.01)
 
 
@@ -165,7 +165,7 @@ def test_what_is_added_to_all_pixels_is_taken_off() -> None:
     found = find_surface(_pairs(light, 12), Camera(), WINDOW)
     assert found is not None
     assert found.degree == 0
-    assert found.haze == pytest.approx(0.02, rel=0.15)
+    assert found.stray_light == pytest.approx(0.02, rel=0.15)
     frame = found.light_e + added
     even = frame / found.factors(frame) / found.light_e
     assert np.std(even) < 1e-9 < np.std(frame / found.light_e)

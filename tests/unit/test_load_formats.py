@@ -13,7 +13,7 @@ import zarr
 from tiff_files import write_ome_set
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import beside, open_stack
+from iscat_analysis.movie import open_stack, path_beside
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.mapped_frames import MappedFrames
 
@@ -362,13 +362,13 @@ def test_parts_of_another_kind_or_elsewhere_are_refused(tmp_path: Path) -> None:
 
 
 def test_results_lie_beside_the_movie(tmp_path: Path) -> None:
-    assert beside(Path("a/movie.tif"), ".iscat") == Path("a/movie.iscat")
-    assert beside(Path("a/day.h5::/run 3/movie"), ".iscat") == Path("a/day.run 3.movie.iscat")
-    assert beside(Path("a/movie.bin::6x5,uint16"), ".iscat") == Path("a/movie.iscat")
+    assert path_beside(Path("a/movie.tif"), ".iscat") == Path("a/movie.iscat")
+    assert path_beside(Path("a/day.h5::/run 3/movie"), ".iscat") == Path("a/day.run 3.movie.iscat")
+    assert path_beside(Path("a/movie.bin::6x5,uint16"), ".iscat") == Path("a/movie.iscat")
     odd = tmp_path / "a::b.tif"
     odd.touch()
     assert split_address(odd) == (odd, "")
-    assert beside(odd, ".iscat") == tmp_path / "a::b.iscat"
+    assert path_beside(odd, ".iscat") == tmp_path / "a::b.iscat"
 
 
 def test_parts_of_one_file_are_different_movies(tmp_path: Path) -> None:

@@ -174,7 +174,7 @@ def test_particles_that_hardly_move_end_at_the_maximum(
     assert min(ends) > log_likelihood(field, ground, truth)
     rows, found, _ = ascend(field, ground, truth, follow_power=True)
     assert abs(log_likelihood(field, found, rows) - ends[1]) < 2
-    monkeypatch.setattr(settling, "AMPLIFIED", np.inf)
+    monkeypatch.setattr(settling, "MOST_STEP_RATIO", np.inf)
     assert min(height(by) for by in starts) < min(ends) - 5
 
 
@@ -289,7 +289,7 @@ def test_rows_that_plain_steps_do_not_fit_are_fitted(
         asked.append(given)
         return search(*given)
 
-    monkeypatch.setattr(frame_fits, "_climb", climbed)
+    monkeypatch.setattr(frame_fits, "_fit_with_search", climbed)
     near, _, done = field.fit(ground, truth, sweeps=4)
     assert done.all()
     assert not asked

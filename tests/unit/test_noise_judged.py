@@ -19,7 +19,7 @@ from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pieces.regions import SATURATION_NM
-from iscat_analysis.pipeline import analyse, bound
+from iscat_analysis.pipeline import analyse, before_after
 from iscat_analysis.records import Analysis
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.tracking import block_store
@@ -123,7 +123,7 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
     said = "set camera.gain_e_per_adu = 12.9"
     rings = Noise((said,), True, ExcessNoise(1.55, said))
     learnt = way == "track"
-    module = block_store if learnt else bound
+    module = block_store if learnt else before_after
     monkeypatch.setattr(module, "judge_beside", lambda *_: rings)
     counts = wandering if learnt else _movie(moves=True)
     assert not _gains(_analysed(counts, _learnt(GAIN) if learnt else _known("track", GAIN)))
@@ -132,12 +132,12 @@ def test_noise_that_fits_do_not_have_is_not_blamed_on_the_gain(
 def test_noise_that_all_fits_have_is_told() -> None:
     noise = Noise(("set camera.gain_e_per_adu = 12.9",), True, ExcessNoise(1.55, ""))
     spread = np.linspace(-0.1, 0.1, 50)
-    assert noise.beside(1.55 + spread) is noise
-    assert noise.beside(3.0 + spread) is noise  # of a wrong microscope as well
-    assert not noise.beside(np.append(3.0 + spread, [1.1] * 10)).messages
-    assert noise.beside(np.full(5, 1.0)) is noise  # too few to tell
+    assert noise.compared_with_fits(1.55 + spread) is noise
+    assert noise.compared_with_fits(3.0 + spread) is noise  # of a wrong microscope as well
+    assert not noise.compared_with_fits(np.append(3.0 + spread, [1.1] * 10)).messages
+    assert noise.compared_with_fits(np.full(5, 1.0)) is noise  # too few to tell
     less = Noise(("set camera.gain_e_per_adu = 30",), True)
-    assert less.beside(1.0 + spread) is less
+    assert less.compared_with_fits(1.0 + spread) is less
 
 
 def test_tracks_near_saturated_pixels_are_flagged() -> None:

@@ -19,7 +19,7 @@ from iscat_analysis.inference.split_frames import Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
 from iscat_analysis.search.sliding import Patch, locate_step
-from iscat_analysis.trust.course import at_a_shared_place, may_rise
+from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 

@@ -402,7 +402,7 @@ def test_read_noise_that_is_reported_is_not_selected(monkeypatch: pytest.MonkeyP
         return regression._read_variance((*line[0], line[1]), Estimate(given, 0.0)).adu2
 
     monkeypatch.setattr(regression, "_half", whole)
-    monkeypatch.setattr(regression, "_SEEN", 5.0)
+    monkeypatch.setattr(regression, "_READ_NOISE_SIGMAS", 5.0)
     monkeypatch.setattr(regression, "_unselected", lambda read, *_: read.e2)
     with pytest.raises(AssertionError):
         check_unselected(reported_read_noise(truth_e, 300), truth_e)

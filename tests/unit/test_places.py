@@ -31,7 +31,7 @@ def test_here_is_one_after_the_other() -> None:
         assert isinstance(place, LocalExecutor)
         assert not place.distant
         assert list(place.each(lambda n: place.call(_job, n), [3, 4])) == [(0, 6), (1, 8)]
-        assert place.remarks(1000) == []
+        assert place.warnings(1000) == []
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from iscat_analysis.camera.counts import Camera, camera_from_config
 from iscat_analysis.diagnosis.changes import Changes, find_changes, spot_of
 from iscat_analysis.diagnosis.recognise import (
     BLOCK,
-    DOUBT,
+    LARGEST_CHANCE,
     LEAST_MOVING,
     MOST_MOVING,
     MOST_STAYING,
@@ -195,7 +195,7 @@ def test_an_empty_movie_shows_neither(seed: int) -> None:
 
 
 def test_few_changes_say_nothing() -> None:
-    assert max(MOST_STAYING, MOST_MOVING) ** 2 < DOUBT < min(MOST_STAYING, MOST_MOVING)
+    assert max(MOST_STAYING, MOST_MOVING) ** 2 < LARGEST_CHANCE < min(MOST_STAYING, MOST_MOVING)
     assert as_landing(Changes(1, 1.0, 0.0), "movie.tif") == ""
     assert as_landing(Changes(2, 1.0, 0.0), "movie.tif") != ""
     assert as_moving(Changes(1, 0.0, 1.0), "movie.tif") == ""

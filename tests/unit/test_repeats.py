@@ -26,7 +26,7 @@ from iscat_analysis.inference.split_frames import (
 )
 from iscat_analysis.landing.split_frame_estimates import _most_windows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.summary import _across
+from iscat_analysis.pipeline.summary import _species_width
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
 from iscat_analysis.report.headline import headline
@@ -409,11 +409,11 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
     poor = {"status": "poor_fit", "flags": "poor_fit", "p_value": 1e-9}
     table = table.assign(mass_kda=mass, sigma_mass_kda=2.0, **poor)
     context = SimpleNamespace(config=SimpleNamespace(compute=SimpleNamespace(seed=1)))
-    (one,) = _across(context, table, {"species": []})  # type: ignore[arg-type]
+    (one,) = _species_width(context, table, {"species": []})  # type: ignore[arg-type]
     assert one["width_low"] < 7.5 < one["width_high"]
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
     fine = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
-    assert _across(context, fine, {"species": []}) == []  # type: ignore[arg-type]
+    assert _species_width(context, fine, {"species": []}) == []  # type: ignore[arg-type]
 
 
 def test_a_long_movie_is_looked_at_in_as_many_windows_as_tell_its_noise() -> None:

@@ -167,7 +167,7 @@ def test_particles_keep_what_is_divided_out_with_rows_that_flicker(
 
     wanted, error = mass(steady)
     assert abs(mass(flickering)[0] - wanted) < 0.5 * error  # of the same noise
-    monkeypatch.setattr("iscat_analysis.tracking.moving.give_back", lambda *_: None)
+    monkeypatch.setattr("iscat_analysis.tracking.moving.restore_particle_light", lambda *_: None)
     assert wanted - mass(flickering)[0] > 4 * error  # control
 
 

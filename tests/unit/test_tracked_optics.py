@@ -19,12 +19,12 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.learner.estimate import _excess
 from iscat_analysis.instrument.learner.settings import settings_of, with_settings
 from iscat_analysis.tracking import tracked_optics
-from iscat_analysis.tracking.settling_optics import Round, Rounds
+from iscat_analysis.tracking.iterated_optics import Round, Rounds
 from iscat_analysis.tracking.tracked_optics import (
     MASS_SHARE,
     REJECTED_SHARE,
-    LeftOver,
-    _said,
+    Misfit,
+    _message,
     learn_from_tracks,
     mass_error,
 )
@@ -80,7 +80,7 @@ def test_what_is_wrong_is_named(movie: Wanderers, wrong: dict[str, Any], named: 
 
 def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() -> None:
     """As where the light under the particles changes slowly: learning optics would not help."""
-    said = _said(LeftOver(0.15, True, 10), None, learns=False)
+    said = _message(Misfit(0.15, True, 10), None, learns=False)
     assert "15%" in said
     assert "no part of the microscope" in said
     assert "optics.calibrate" not in said
@@ -206,7 +206,7 @@ def test_rounds_end_where_the_first_four_describe_nothing(
 
     def begin(config: Config, **_: bool) -> Any:
         described = described_from is not None and len(measured) % rounds >= described_from
-        left = LeftOver(share=0.0 if described else 0.2, clear=True, tracks=3)
+        left = Misfit(share=0.0 if described else 0.2, clear=True, tracks=3)
         block = SimpleNamespace(noise_differs=False)
         return SimpleNamespace(config=config, block=block, left=left, described=described)
 

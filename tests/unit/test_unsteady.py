@@ -15,7 +15,7 @@ from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.unsteady import find_unsteady, unsteady_said
+from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
 from iscat_analysis.diagnosis.changes import least_beside
 from iscat_analysis.study.simulate import Movie
 
@@ -58,7 +58,8 @@ def test_a_noisy_column_is_named(excess: float) -> None:
     assert odd is not None
     assert odd[:, 40].all()
     assert odd.sum() == SHAPE[0]
-    assert unsteady_said(odd).startswith("48 pixels (column 40) have noise that is not the light's")
+    message = unsteady_message(odd)
+    assert message.startswith("48 pixels (column 40) have noise that is not the light's")
 
 
 def test_a_border_that_is_always_the_same() -> None:

@@ -21,7 +21,7 @@ from tiff_files import write_ome_set
 import iscat_analysis as ia
 import iscat_analysis.day as day_module
 from iscat_analysis.day import run
-from iscat_analysis.day.watch import PATIENCE, Look, _Folder
+from iscat_analysis.day.watch import MOST_CHECKS, Ready, _Folder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
 
@@ -40,7 +40,7 @@ def folder(tmp_path: Path) -> Path:
     return place
 
 
-def _names(look: Look | None) -> list[str] | None:
+def _names(look: Ready | None) -> list[str] | None:
     return None if look is None else [row.path.name for row in look[0].rows]
 
 
@@ -54,16 +54,16 @@ def _looks(folder: Path, told: list[str] | None = None) -> _Folder:
 def test_a_movie_is_taken_once_it_rests(folder: Path) -> None:
     told: list[str] = []
     seen = _looks(folder, told)
-    assert seen.look() is None
+    assert seen.check() is None
     np.save(folder / "a.npy", COUNTS)
     whole = (folder / "a.npy").read_bytes()
     for size in (200, 300):
         (folder / "a.npy").write_bytes(whole[:size])
-        assert seen.look() is None
+        assert seen.check() is None
     (folder / "a.npy").write_bytes(whole)
-    assert seen.look() is None
-    assert _names(seen.look()) == ["a.npy"]
-    assert seen.look() == seen.look()
+    assert seen.check() is None
+    assert _names(seen.check()) == ["a.npy"]
+    assert seen.check() == seen.check()
     assert told == ["a.npy: is being written, and waited for"]
 
 
@@ -71,25 +71,25 @@ def test_a_movie_that_rests_but_cannot_be_read_is_waited_for_a_while(folder: Pat
     seen = _looks(folder)
     np.save(folder / "a.npy", COUNTS)
     (folder / "a.npy").write_bytes((folder / "a.npy").read_bytes()[:-10])
-    assert [_names(seen.look()) for _ in range(PATIENCE)] == [None] * PATIENCE
-    assert _names(seen.look()) == ["a.npy"]
+    assert [_names(seen.check()) for _ in range(MOST_CHECKS)] == [None] * MOST_CHECKS
+    assert _names(seen.check()) == ["a.npy"]
 
 
 def test_nothing_is_done_while_a_movie_that_was_taken_changes_or_is_gone(folder: Path) -> None:
     seen = _looks(folder)
     for name in "ab":
         np.save(folder / f"{name}.npy", COUNTS)
-    seen.look()
-    first = seen.look()
+    seen.check()
+    first = seen.check()
     assert _names(first) == ["a.npy", "b.npy"]
     np.save(folder / "b.npy", COUNTS[:3])
-    assert seen.look() is None
-    again = seen.look()
+    assert seen.check() is None
+    again = seen.check()
     assert _names(again) == ["a.npy", "b.npy"]
     assert again != first
     (folder / "b.npy").unlink()
-    assert [_names(seen.look()) for _ in range(PATIENCE)] == [None] * PATIENCE
-    assert _names(seen.look()) == ["a.npy"]
+    assert [_names(seen.check()) for _ in range(MOST_CHECKS)] == [None] * MOST_CHECKS
+    assert _names(seen.check()) == ["a.npy"]
 
 
 def test_the_table_says_what_movies_are_and_may_grow(folder: Path) -> None:
@@ -98,20 +98,20 @@ def test_the_table_says_what_movies_are_and_may_grow(folder: Path) -> None:
     (folder / "samples.csv").write_text("path,sample,role\na.npy,buffer,blank\nz.npy,later,\n")
     for name in "ab":
         np.save(folder / f"{name}.npy", COUNTS)
-    seen.look()
-    look = seen.look()
+    seen.check()
+    look = seen.check()
     assert look is not None
     assert [(r.path.name, r.sample, r.role) for r in look[0].rows] == [
         ("a.npy", "buffer", "blank"), ("b.npy", "b", "sample"),
     ]  # fmt: skip
     assert told == ["z.npy: is in the table, and waited for"]
     (folder / "samples.csv").write_text("path,sample,role\na.npy,buffer,smaple\n")
-    assert (seen.look(), seen.look(), seen.look()) == (None, None, None)
+    assert (seen.check(), seen.check(), seen.check()) == (None, None, None)
     (wrong,) = told[1:]
     assert "did you mean sample?" in wrong
     (folder / "samples.csv").write_text("path,sample\na.npy,BSA\n")
-    assert seen.look() is None  # it may not be written to its end
-    look = seen.look()
+    assert seen.check() is None  # it may not be written to its end
+    look = seen.check()
     assert look is not None
     assert [row.sample for row in look[0].rows] == ["BSA", "b"]
 
@@ -121,11 +121,11 @@ def test_a_set_is_waited_for_until_all_its_files_are_there(folder: Path, tmp_pat
     first, *others = write_ome_set(tmp_path / "set", SET)
     seen = _looks(folder)
     shutil.copy(first, folder)
-    assert (seen.look(), seen.look()) == (None, None)
+    assert (seen.check(), seen.check()) == (None, None)
     for path in others:
         shutil.copy(path, folder)
-    assert seen.look() is None
-    assert _names(seen.look()) == [first.name]
+    assert seen.check() is None
+    assert _names(seen.check()) == [first.name]
 
 
 def test_results_in_the_folder_are_no_movies(folder: Path) -> None:
@@ -134,22 +134,22 @@ def test_results_in_the_folder_are_no_movies(folder: Path) -> None:
     (folder / "a.iscat").mkdir()
     np.save(folder / "a.npy", COUNTS)
     seen = _Folder(folder, out, [].append)
-    seen.look()
-    assert _names(seen.look()) == ["a.npy"]
+    seen.check()
+    assert _names(seen.check()) == ["a.npy"]
 
 
 def test_a_folder_that_cannot_be_read_is_waited_for(folder: Path) -> None:
     told: list[str] = []
     seen = _looks(folder, told)
     np.save(folder / "a.npy", COUNTS)
-    seen.look()
+    seen.check()
     folder.rename(folder.with_name("away"))
-    assert (seen.look(), seen.look()) == (None, None)
+    assert (seen.check(), seen.check()) == (None, None)
     assert len(told) == 1
     assert "cannot be read" in told[0]
     folder.with_name("away").rename(folder)
-    seen.look()
-    assert _names(seen.look()) == ["a.npy"]
+    seen.check()
+    assert _names(seen.check()) == ["a.npy"]
 
 
 # ---- analyses --------------------------------------------------------------------------------
@@ -297,7 +297,7 @@ def test_without_movies_too_one_object_is_printed(folder: Path, monkeypatch, cap
     def interrupt(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_Folder, "look", interrupt)
+    monkeypatch.setattr(_Folder, "check", interrupt)
     assert main(["watch", str(folder), "--json", "--quiet"]) == 0
     printed = json.loads(capsys.readouterr().out)
     assert printed["out"] == str(folder / "batch")

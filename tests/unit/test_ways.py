@@ -20,15 +20,15 @@ from iscat_analysis.fitting.background_mode import (
     describe_background_mode,
 )
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.events import Event, remarks, standing_out
+from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline import FIND, analyse
+from iscat_analysis.pipeline import FINDERS, analyse
 from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
 from iscat_analysis.study.simulate import Movie
-from iscat_analysis.tracking.moving_field import load_field, opening_ground, track_scene
+from iscat_analysis.tracking.moving_field import initial_background, load_field, tracking_context
 
 SIDE = 48
 PLACES = ((14.3, 15.7), (33.2, 31.6))
@@ -73,7 +73,7 @@ def analyses(tmp_path_factory: pytest.TempPathFactory) -> dict[BackgroundMode, A
 
 
 def test_every_way_is_found() -> None:
-    assert set(FIND) == set(get_args(BackgroundMode)) == set(MOVIES)
+    assert set(FINDERS) == set(get_args(BackgroundMode)) == set(MOVIES)
     assert [background_mode(_config(way)) for way in MOVIES] == list(MOVIES)
 
 
@@ -153,7 +153,7 @@ def test_remarks_on_surroundings_are_put_in_order() -> None:
         saturated = np.zeros(event.region.shape, dtype=bool)
         saturated[row + away - top, column - left] = True
         windows = replace(event.windows, saturated=saturated)
-        said = remarks(context, event, windows, sidelobe=True, too_close=True)
+        said = fit_flags(context, event, windows, sidelobe=True, too_close=True)
         assert said[0] == Status.SIDELOBE
         assert Status.TOO_CLOSE in said
         assert (Status.SATURATED in said) is spoiled
@@ -211,13 +211,13 @@ def test_a_background_of_all_frames_is_their_mean_or_their_median(method: str) -
     assert len(found.tracks) == len(PLACES)
     assert (found.tracks["mass_kda"] < 480).all()  # of which a part is in the background
     camera = camera_from_config(config.camera, counts.shape[1:], counts.dtype)
-    context = track_scene(config, counts.shape[1:], len(counts))
+    context = tracking_context(config, counts.shape[1:], len(counts))
     with ThreadPoolExecutor(1) as pool:
         span = (0, len(counts))
         field = load_field(
             context, Stack(counts), camera, span, lambda *_: None, pool, lambda *_: None
         )
-        ground = opening_ground(config, field)
+        ground = initial_background(config, field)
     light = counts * 8.0 / ground.power[:, None, None]
     middle = {"fixed": np.mean, "median": np.median}[method](light, axis=0)
     np.testing.assert_allclose(ground.level, middle, rtol=3e-4)

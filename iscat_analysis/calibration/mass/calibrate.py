@@ -137,20 +137,20 @@ def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str
     if low <= abs(slope) <= high:
         return
     shown = ",".join(f"{m:g}" for m in masses)
-    said = (
+    problem = (
         f"{name}: the line through the standards has a contrast of {abs(slope):.2g} per kDa, where "
         f"microscopes have {low:g} to {high:g}: "
     )
     if abs(slope) < low:
         raise DataError(
-            f"{said}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
+            f"{problem}`standards_kda` = {shown} seem to be in Da; give them in kDa, as 66,146,480"
         )
     if masses.max() < _LIGHT_KDA:
         raise DataError(
-            f"{said}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
+            f"{problem}`standards_kda` = {shown} seem to be in MDa; give them in kDa, as 66,146,480"
         )
     raise DataError(
-        f"{said}contrasts, of up to {largest:.3g}, seem to be in per cent; divide them by 100"
+        f"{problem}contrasts, of up to {largest:.3g}, seem to be in per cent; divide them by 100"
     )
 
 

@@ -17,7 +17,7 @@ from iscat_analysis.records import FloatArray
 
 _PROMINENCE_SIGMAS = 3.0
 _MOST_PEAKS = 10
-_CORE = 2.5  # standard deviations of a peak that are fitted: its tails are other things
+_CORE_SIGMAS = 2.5  # standard deviations of a peak that are fitted: its tails are other things
 _WINDOWS = 8
 _LEAST_IN_PEAK = 5
 _GRID = 4096
@@ -88,7 +88,7 @@ def _settled_peak(
     peak = None
     noise = float(np.sqrt(np.mean(sigma**2)))
     for _ in range(_WINDOWS):
-        reach = _CORE * math.hypot(width, noise)
+        reach = _CORE_SIGMAS * math.hypot(width, noise)
         window = max(limits[0], centre - reach), min(limits[1], centre + reach)
         inside = (x > window[0]) & (x < window[1])
         if np.count_nonzero(inside) < _LEAST_IN_PEAK or not window[0] < centre < window[1]:

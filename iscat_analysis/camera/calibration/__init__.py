@@ -24,7 +24,7 @@ analysed.
 
 from __future__ import annotations
 
-from iscat_analysis.camera.calibration.averaging import EXCESS
+from iscat_analysis.camera.calibration.averaging import LEAST_EXCESS_VARIANCE
 from iscat_analysis.camera.calibration.measure import (
     LEAST_FRAMES,
     LEAST_FRAMES_FOR_MAPS,
@@ -34,7 +34,7 @@ from iscat_analysis.camera.calibration.result import CameraCalibration, Estimate
 from iscat_analysis.camera.calibration.zero import LightZero, find_zero
 
 __all__ = [
-    "EXCESS",
+    "LEAST_EXCESS_VARIANCE",
     "LEAST_FRAMES",
     "LEAST_FRAMES_FOR_MAPS",
     "CameraCalibration",

@@ -1,4 +1,4 @@
-"""Noise against averaging: how far longer averages go on following shot noise."""
+"""Noise of averages, and up to which length it follows shot noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from iscat_analysis.camera.calibration.moments import Moments, blocks, robust_si
 from iscat_analysis.camera.calibration.regression import Solution
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Progress
 
-EXCESS = 0.10
+LEAST_EXCESS_VARIANCE = 0.10
 """Noise variance above shot noise by more than this, and three standard errors, is a limit."""
 
 NOISE_COLUMNS = (
@@ -28,7 +28,7 @@ _MEDIAN_VARIANCE = 2.333  # relative standard error of a variance from a median,
 def noise_curve(
     stack: FrameSource, found: Moments, used: BoolArray, result: Solution, progress: Progress
 ) -> pd.DataFrame:
-    """Set contrast noise between successive averages of 1, 2, 4 … frames against shot noise.
+    """Compare the noise between successive averages of 1, 2, 4 … frames with shot noise.
 
     Notes
     -----
@@ -87,7 +87,7 @@ def noise_curve(
 
 def verdict_of(noise: pd.DataFrame) -> tuple[int, str]:
     """Say up to which average the noise is shot noise."""
-    within = noise["excess"] <= 1 + EXCESS + _SIGMAS * noise["excess_se"]
+    within = noise["excess"] <= 1 + LEAST_EXCESS_VARIANCE + _SIGMAS * noise["excess_se"]
     first = noise.iloc[0]
     if not within.iloc[0]:
         return 0, (

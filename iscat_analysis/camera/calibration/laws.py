@@ -56,9 +56,10 @@ TOLERANCE = 0.01
 SIGMAS = 4.0
 """And the excess over the tolerance that chance must not explain."""
 
-_BETTER = 16.0  # of χ², by which a law with one number more must describe the pixels better
-_BOTH = 20.0  # the same, where an offset is wrong besides
-_ALIKE = 6.0  # of χ², within which another law is as good
+# Of χ², by which a law with one number more must describe the pixels better
+_LEAST_CHI2_GAIN = 16.0
+_LEAST_CHI2_GAIN_OFFSET = 20.0  # the same, where an offset is wrong besides
+_MOST_CHI2_LOSS = 6.0  # of χ², within which another law is as good
 _RARE = {"noisy light": 6.0, "other light": 2.0}  # of χ², by which these must be better still
 _STEP, _SETTLED, _STUCK = 1e-6, 1e-4, 1e6  # of numbers of laws, of χ², and damping
 _MOST_FILLED = 0.98  # of full scale, up to which the light follows from the counts
@@ -66,10 +67,10 @@ _MOST_FILLED = 0.98  # of full scale, up to which the light follows from the cou
 
 @dataclass(frozen=True)
 class Law:
-    """A law and its number.
+    """A law of the counts and its number.
 
-    `value` is γ, N/F at the mean light, or the share s of the mean light; `offset` is the share
-    that an offset is wrong by besides; `contrast` is that measured over the true one, of a faint
+    `value` is γ, N/F at the mean light, or the share s of the mean light; `offset` is the share by
+    which the offset is wrong besides; `contrast` is the measured over the true contrast of a faint
     particle in the mean light.
     """
 
@@ -85,25 +86,25 @@ class Law:
 
     @property
     def bent(self) -> bool:
-        """Whether counts are no line in light, so that no offset makes masses right."""
+        """Whether counts are not linear in light, so that no offset makes masses right."""
         # that it is no chance is known already: a line describes the pixels clearly worse
         return self.kind in BENT and abs(1 - self.contrast) > TOLERANCE
 
     @property
     def dilutes(self) -> bool:
-        """Whether masses are wrong by an offset, or by light that no particle changes."""
+        """Whether an offset, or light that no particle changes, makes masses wrong."""
         wrong = abs(1 - self.contrast) > TOLERANCE + SIGMAS * self.contrast_se
         return self.kind in ("offset", "other light") and wrong
 
     @property
     def certain(self) -> bool:
-        """Whether it is known by how much masses are wrong: no other kind of law is as good."""
+        """Whether the error of masses is known, because no other kind of law fits as well."""
         return self.flickers or not self.alike
 
 
 @dataclass(frozen=True)
 class _Family:
-    """Laws of one kind: curves of light over its mean for a number, where it starts and ends."""
+    """Laws of one kind: their curve, and start and limits of their number."""
 
     kind: Kind
     curves: Callable[[FloatArray, float], Curves]
@@ -159,18 +160,18 @@ def find_law(found: Transfer, *, most_read: float = 0.0, least_offset: float = -
         if found.flicker is not None and family.kind in BENT
     ]
     both = min(pairs, key=lambda law: law.chi2, default=best)
-    if best.chi2 - both.chi2 > _BOTH:
+    if best.chi2 - both.chi2 > _LEAST_CHI2_GAIN_OFFSET:
         return both
-    if linear - best.chi2 < _BETTER:
+    if linear - best.chi2 < _LEAST_CHI2_GAIN:
         zero = next(law for law in laws if law.kind == "offset")
         se = math.hypot(zero.value, zero.se)  # of zero, which is kept
         flickers = found.flicker is not None
         return Law("linear", 0.0, se, 1.0, se, chi2=linear, flickers=flickers)
-    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _ALIKE])
+    return _among(best, [law for law in laws if law.chi2 - best.chi2 < _MOST_CHI2_LOSS])
 
 
 def _among(best: Law, alike: list[Law]) -> Law:
-    """Widen the error of a law by what others that are as good say of the contrast."""
+    """Widen the error of a law by the contrasts of other laws that fit as well."""
     kinds = tuple(law.kind for law in alike if law.kind != best.kind)
     if best.kind in BENT:
         alike = [law for law in alike if law.kind in BENT]
@@ -182,7 +183,7 @@ def _among(best: Law, alike: list[Law]) -> Law:
 
 
 def _residuals(found: Transfer, curves: Curves) -> FloatArray:
-    """Give what the best multiples of two curves leave over, in standard errors."""
+    """Residuals of the best multiples of two curves, in standard errors."""
     rest = []
     for seen, se, curve in (
         (found.variance, found.variance_se, curves[0]),
@@ -194,7 +195,7 @@ def _residuals(found: Transfer, curves: Curves) -> FloatArray:
 
 
 def _fitted(found: Transfer, u: FloatArray, family: _Family, offset: FloatArray) -> Law:
-    """Fit a law's number, and with an `offset` of one entry the share that is no light besides."""
+    """Fit the number of a law and, if `offset` has an entry, the share that is no light."""
 
     def residuals(theta: FloatArray) -> FloatArray:
         shift = float(theta[1]) if offset.size else 0.0

@@ -1,4 +1,4 @@
-"""From recordings to a camera: what is read, left out, fitted and said."""
+"""From recordings to a calibration of the camera."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ LEAST_FRAMES_FOR_MAPS = 100
 
 _LEAST_PIXELS = 64
 _SPECTRUM_FRAMES = 128  # on which correlations of pixels are measured
-_CLIPPED = 0.01  # of a dark's pixels at zero that are worth a line
-_CURVED = 3.0  # reduced χ² of the photon-transfer curve
+_MOST_CLIPPED_SHARE = 0.01  # of a dark's pixels at zero that are worth a line
+_MOST_CHI2_REDUCED = 3.0  # reduced χ² of the photon-transfer curve
 _CURVE_COLUMNS = ["mean_adu", "variance_adu2", "variance_se", "fit_adu2", "pixels"]
 
 
@@ -78,7 +78,7 @@ def measure_camera(
         masked["hot"] |= stand_out(dark_found.mean) | stand_out(dark_found.variance)
         masked["dead"] |= dark_found.variance <= 0
         low = float(np.mean(clipped(dark_found.lowest)))
-        if low > _CLIPPED:
+        if low > _MOST_CLIPPED_SHARE:
             notes.append(
                 f"{100 * low:.0f} % of the dark's pixels reach zero counts, where noise is cut "
                 "off: its offset is too high and its read noise too small; raise the camera's "
@@ -120,8 +120,8 @@ def measure_camera(
     used &= ~unsteady(found, used)
     masked["hot"] |= ~(used | masked["saturated"] | masked["dead"] | masked["clipped"])
 
-    said: list[str] = []
-    result = solve(found, used, dark_found, offset_adu, said)
+    flicker_notes: list[str] = []
+    result = solve(found, used, dark_found, offset_adu, flicker_notes)
     longest = int(np.argmax([item.n_frames for item in found]))
     spectrum = _spectrum(light[longest], ~used, result)
     if spectrum is not None and any(spectrum.shared):
@@ -130,13 +130,13 @@ def measure_camera(
             replace(item, variance=moments_of(stack, used, _nothing, flickering=lines).variance)
             for stack, item in zip(light, found, strict=True)
         ]
-        said = [
+        flicker_notes = [
             f"whole {lines} flicker ({100 * max(spectrum.shared):.2g} % of the noise variance); "
             f"the flicker of each of the {lines} was taken out"
         ]
-        result = solve(found, used, dark_found, offset_adu, said)
+        result = solve(found, used, dark_found, offset_adu, flicker_notes)
         spectrum = _spectrum(light[longest], ~used, result)
-    notes += [*said, *mask_notes(masked)]
+    notes += [*flicker_notes, *mask_notes(masked)]
     noise = noise_curve(light[longest], found[longest], used, result, progress)
     if spectrum is not None and spectrum.correlated:
         result = _with_neighbours(result, spectrum, notes)
@@ -175,7 +175,7 @@ def _spectrum(stack: FrameSource, masked: BoolArray, result: Solution) -> NoiseS
 
 
 def _with_neighbours(result: Solution, spectrum: NoiseSpectrum, notes: list[str]) -> Solution:
-    """Judge the gain by the noise that neighbouring pixels have together."""
+    """Correct the gain for noise that neighbouring pixels share."""
     summed, error = (value / spectrum.variance for value in spectrum.summed)
     gain, scatter = result.gain.value / summed, math.sqrt(spectrum.alike) * result.gain.se
     x, y = spectrum.neighbours
@@ -219,7 +219,7 @@ def _checked(light: Sequence[FrameSource], dark: FrameSource | None, maps: bool)
 
 
 def _glance(stack: FrameSource) -> NDArray[Any]:
-    """Return a few frames from all over the stack."""
+    """Read a few frames from all over the stack."""
     frames = stack.shape[0]
     places = np.unique(np.linspace(0, frames - 1, 16).astype(int))
     return np.concatenate([stack.read(int(k), int(k) + 1) for k in places])
@@ -228,7 +228,7 @@ def _glance(stack: FrameSource) -> NDArray[Any]:
 def _curve(
     found: Sequence[Moments], used: BoolArray, result: Solution, notes: list[str]
 ) -> pd.DataFrame:
-    """Variance against mean in bins of equally many pixels, each stack by itself."""
+    """Average variance against mean in bins of equally many pixels, for each stack."""
     rows = []
     for item in found:
         mean, variance = item.mean[used], item.variance[used]
@@ -246,7 +246,7 @@ def _curve(
     chi2 = float(
         (((curve["variance_adu2"] - curve["fit_adu2"]) / curve["variance_se"]) ** 2).mean()
     )
-    if chi2 > _CURVED:
+    if chi2 > _MOST_CHI2_REDUCED:
         notes.append(
             f"the variance does not follow a straight line (reduced χ² {chi2:.3g}): the camera is "
             "not linear, the frames were processed, or the light itself is noisy"
@@ -261,7 +261,7 @@ def _maps(
     result: Solution,
     notes: list[str],
 ) -> dict[str, FloatArray]:
-    """One number per pixel; what is masked keeps the number of the whole sensor."""
+    """Make one number per pixel; masked pixels keep that of the whole sensor."""
     gain = result.gain.value
     offset = dark.mean if dark is not None else np.full(used.shape, result.offset.value)
     read = dark.variance if dark is not None else np.full(
@@ -299,7 +299,7 @@ def _maps(
 
 
 def _from_dark(dark: Moments, masked: dict[str, BoolArray], maps: bool) -> CameraCalibration:
-    """Without light there is an offset and a read noise in counts, and no gain."""
+    """Calibrate without light: offset and read noise in counts, but no gain."""
     used = ~(masked["hot"] | masked["dead"])
     offset, read = dark_numbers(dark, used)
     note = "a dark alone gives no gain, so the read noise is in counts; add a flat or the movie"

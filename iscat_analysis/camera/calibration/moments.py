@@ -1,4 +1,4 @@
-"""One stack read once: mean and variance of every pixel, and how it follows the laser."""
+"""Mean and variance of every pixel of a stack, and its response to the laser."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
 _BLOCK_BYTES = 4 * 2**20  # in doubles: what lies in a processor's cache takes no fresh memory
 _BINS = 32
-_MAD = 0.6744898
+_MAD_PER_SIGMA = 0.6744898
 _TOGETHER = {"frames": (1, 2), "rows": (2,), "columns": (1,)}  # axes of (t, y, x)
 
 
@@ -47,11 +47,11 @@ def blocks(stack: FrameSource) -> Iterator[tuple[int, int]]:
 
 def robust_sigma(deviations: FloatArray) -> float:
     """Estimate the standard deviation of normal deviations from their median size."""
-    return float(np.median(np.abs(deviations))) / _MAD
+    return float(np.median(np.abs(deviations))) / _MAD_PER_SIGMA
 
 
 def brightness_bins(mean: FloatArray) -> list[NDArray[np.intp]]:
-    """Group pixels of like brightness, equally many in each group.
+    """Group pixels by brightness, equally many in each group.
 
     Shapes: `mean` (n,).
     """

@@ -1,4 +1,4 @@
-"""Pixels that must not be used: saturated, dead, hot, blinking."""
+"""Pixels that cannot be used: saturated, dead, hot, blinking."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def stand_out(values: FloatArray) -> BoolArray:
 
 
 def unsteady(found: Sequence[Moments], used: BoolArray) -> BoolArray:
-    """Find pixels that blink, or through which a particle moved.
+    """Find pixels that blink, or over which a particle moved.
 
     Shapes: `used` (y, x), result (y, x).
     """

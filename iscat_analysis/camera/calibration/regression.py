@@ -1,4 +1,4 @@
-"""From moments to a camera: variance against mean, and where the light is zero."""
+"""From moments to numbers of the camera: variance against mean, and the zero of the light."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ _SIGMAS = 3.0
 _USABLE_SLOPE = 0.30  # relative standard error beyond which a gain is none
 _GOOD_SLOPE = 0.05
 _USABLE_OFFSET = 0.05  # standard error over the light level
-_STEADY = 2.0  # robust χ² of the flicker line beyond which the scene has moved
-_SEEN = 3.5  # of half of the pixels, standard errors from which read noise is not chance
+_MOST_FLICKER_CHI2 = 2.0  # robust χ² of the flicker line beyond which the scene has moved
+# Of half of the pixels, standard errors from which read noise is not chance
+_READ_NOISE_SIGMAS = 3.5
 _LEAST_HALF = 32  # pixels
 _TILE_PX = 8  # side of the tiles that the halves are made of; noise is correlated less far
 
@@ -94,8 +95,8 @@ def solve(
         return Solution(gain, offset, "line", None, None, None, intercept, slope)
     read = _read_variance(line, offset)
     half = _half(found, used, given)
-    if half is not None and half.value > _SEEN * half.se:
-        electrons = _root(_unselected(read, half, _SEEN * half.se))
+    if half is not None and half.value > _READ_NOISE_SIGMAS * half.se:
+        electrons = _root(_unselected(read, half, _READ_NOISE_SIGMAS * half.se))
         # in counts the gain has no part in the error
         narrower = read.adu2.se / (slope**2 * read.e2.se)
         adu = Estimate(electrons.value * slope, electrons.se * slope * narrower)
@@ -139,7 +140,7 @@ def _read_variance(line: tuple[float, float, FloatArray], offset: Estimate) -> _
 
 
 def _half(found: Sequence[Moments], used: BoolArray, given: float | None) -> Estimate | None:
-    """Give the variance of the read noise of every other tile of the sensor [counts²]."""
+    """Read noise of every other tile of the sensor [counts²]."""
     y, x = np.indices(used.shape) // _TILE_PX
     part = used & ((y + x) % 2 == 0)
     if np.count_nonzero(part) < _LEAST_HALF:
@@ -175,7 +176,7 @@ def _unselected(whole: _ReadVariance, half: Estimate, threshold: float) -> Estim
 
 
 def _root(variance: Estimate) -> Estimate:
-    """Take the root of a variance, and off it that the mean of a root is below its own."""
+    """Root of a variance, corrected for the bias of a root."""
     root = math.sqrt(max(variance.value, variance.se / 4))
     relative = variance.se / root**2
     return Estimate(root * (1 + min(relative, 1.0) ** 2 / 8), root * relative / 2)
@@ -198,7 +199,7 @@ def _with_dark(
     used: BoolArray,
     n: int,
 ) -> Solution:
-    """Fit the slope alone: the dark gives every pixel's own offset and read noise."""
+    """Fit only the slope; the dark gives offset and read noise of every pixel."""
     light = mean - np.tile(dark.mean[used], n)
     shot = variance - np.tile(dark.variance[used], n)
     if light.mean() <= 0:
@@ -331,7 +332,7 @@ def _offset(
 
 
 def _together(score: FloatArray, tiles: NDArray[np.int64] | None) -> FloatArray:
-    """Add up the scores (n, k) of pixels that may differ from a line together."""
+    """Sum the scores (n, k) of pixels whose deviations may be correlated."""
     if tiles is None:
         return score
     return np.stack([np.bincount(tiles, weights=column) for column in score.T], axis=1)
@@ -360,7 +361,7 @@ def zero_of_flicker(
         residual = (slope - level - gradient * x) * np.sqrt(weight)
         robust = robust_sigma(residual)
         kept = np.abs(residual) < 5 * max(robust, 1e-12)
-    if robust**2 > _STEADY or gradient <= 0:
+    if robust**2 > _MOST_FLICKER_CHI2 or gradient <= 0:
         return None
     rest = w * (slope - level - gradient * x)
     by_level, by_gradient = _together(np.stack([rest, rest * x], axis=1), tiles).T

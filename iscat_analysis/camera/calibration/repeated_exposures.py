@@ -1,4 +1,4 @@
-"""Frames that the camera dropped or repeated: they hold no noise of their own."""
+"""Frames that the camera dropped or repeated, which have no noise of their own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _NAMED = 4
 
 
 def without_repeats(stack: FrameSource, least: int, notes: list[str]) -> FrameSource:
-    """Leave out frames that are zero throughout or the same as the frame before."""
+    """Leave out frames that are zero throughout or equal to the frame before."""
     total = stack.shape[0]
     good = np.zeros(total, dtype=np.bool_)
     last: NDArray[Any] | None = None

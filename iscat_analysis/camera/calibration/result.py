@@ -1,4 +1,4 @@
-"""What photon transfer gives: numbers with standard errors, curves, masks, a verdict."""
+"""Results of photon transfer: numbers with standard errors, curves, masks, a verdict."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Photon transfer of one movie: how noise, and the answer to the laser, grow with the light.
+"""Photon transfer of one movie: noise and response to the laser, against the light.
 
-Pixels of one movie have different light.  Of each, the variance between frames and the slope with
-which it follows the laser's power are measured, and averaged over pixels of like brightness.
+Pixels of one movie have different light.  The variance between frames and the slope against the
+laser power are measured for each pixel, and averaged over pixels of like brightness.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def measure_transfer(
 
 
 def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
-    """Average over pixels of like brightness, and find where the lines through all pixels end."""
+    """Average over pixels of like brightness; find the zeros of the lines through all pixels."""
     mean, variance = found.mean[used], found.variance[used] - other
     level = float(mean.mean())
     y, x = np.nonzero(used)

@@ -37,7 +37,7 @@ class LightZero:
         return abs(self.share) > TOLERANCE + SIGMAS * self.se
 
     def may_be(self, share: float) -> bool:
-        """Tell whether the light that is none may be another share."""
+        """Tell whether another share may be no light."""
         return abs(self.share - share) < TOLERANCE + SIGMAS * self.se
 
 
@@ -55,7 +55,7 @@ def find_zero(
 
 
 def zero_of(found: Transfer) -> LightZero | None:
-    """Give the zero that is known best, of the flicker or of the noise."""
+    """Choose the zero with the smaller error, of flicker or of noise."""
     known = [
         LightZero(one.value / found.level, one.se / found.level, one.value, flickers)
         for one, flickers in ((found.flicker, True), (found.noise, False))

@@ -38,14 +38,14 @@ NOISE_FRAMES = 800
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
 
-_LOOKS = 24  # frames all over a movie, that tell how much light there is
+_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 _MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
 class Reader:
-    """Frames of one chunk after the other: where they lie in the file, or read into memory once."""
+    """Reads the frames of one chunk after the other, in place or into memory."""
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class Reader:
         return self._movie.name
 
     def forget(self) -> None:
-        """Give the memory of the frames back."""
+        """Release the memory of the frames."""
         if self._placed:
             self._placed.let_go()
         self._buffer = self._buffer[:0].copy()
@@ -138,7 +138,7 @@ class Reader:
         return self._frames(start, stop), good, light
 
     def _append(self, end: int, mapper: Mapper) -> None:
-        """Go on from the last frame that is held."""
+        """Read on from the last frame that is in memory."""
         start, begin = self._held
         if begin >= end:
             return
@@ -190,7 +190,7 @@ class Reader:
         return chunk
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
-        """Good frames among the first, on which the noise is judged."""
+        """Good frames among the first, for judging the noise."""
         stop = min(self.last, self.first + NOISE_FRAMES)
         counts, good, light = self.counts(self.first, stop, mapper)
         if self._dark_e > 0:  # of frames with a background
@@ -217,7 +217,7 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:
-    """Yield stretches of true."""
+    """Yield the ranges in which a mask is true."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], flags.astype(np.int8), [0]])))
     for start, stop in edges.reshape(-1, 2):
         yield slice(int(start), int(stop))
@@ -227,7 +227,7 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
     """Read frames of a landing movie."""
     dark_e = -math.inf
     if config.optics.scheme != "darkfield" and span[0] < span[1]:
-        numbers = np.linspace(span[0], span[1] - 1, _LOOKS).astype(int).tolist()
+        numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
         some = np.concatenate([movie.read(k, k + 1) for k in numbers])
         light = measure_frames(some, camera)[0]
         lit = light[well_lit(light)]
@@ -256,10 +256,10 @@ def plan_chunks(
     # out, that and a spectrum as well), and the field some images in doubles
     pixels = math.prod(reader.shape)
     per_block = 32 if config.background.follows_pattern else 20
-    beside = per_block * pixels // stride
-    if (last - first) * (reader.frame_bytes + beside) <= budget - 40 * pixels:
+    buffers_bytes = per_block * pixels // stride
+    if (last - first) * (reader.frame_bytes + buffers_bytes) <= budget - 40 * pixels:
         return [((first, last), (first, last))]
-    per_frame = reader.held_bytes + beside
+    per_frame = reader.held_bytes + buffers_bytes
     room = (budget - 40 * pixels) // per_frame
     core = (room - 2 * halo) // stride * stride
     if core < stride:

@@ -22,7 +22,7 @@ from iscat_analysis.search.sliding.rises import find_rise, line
 CREDIBLE = 0.95
 """Posterior probability inside the interval of a step's frame."""
 
-_STEEP = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
+_CLEAR_FRAME_SNR2 = 4.0  # (per-frame SNR)² at which about one frame around a step is doubtful
 
 
 @dataclass(frozen=True)
@@ -46,28 +46,28 @@ class StepFrame:
         return max(_gap(self.per_frame_snr), _half(self.rise))
 
     def kept_out(self, window: int) -> int:
-        """Frames on either side that stay out of a fit on windows of so many frames."""
+        """Frames on either side that are left out of a fit with windows of so many frames."""
         doubtful = min(_gap(self.per_frame_snr), window // 5)
         return max(doubtful, min(_half(self.rise), window // 2))
 
     @property
     def first_turn(self) -> int:
-        """First frame in which light of the new state may be there."""
+        """First frame that may have light of the new state."""
         return self.frame - self.rise // 2
 
     @property
     def last_turn(self) -> int:
-        """Frame from which on all of it is there."""
+        """First frame with all the light of the new state."""
         return self.frame + self.rise // 2
 
     @property
     def turns(self) -> NDArray[np.int64]:
-        """Frames at each of which an equal part of the light turns up."""
+        """Frames at which equal parts of the new light appear."""
         return np.arange(self.first_turn, self.last_turn + 1)
 
     @classmethod
     def undated(cls, frame: int, half_width: int) -> StepFrame:
-        """Date a step as the search did, before its own frames are looked at."""
+        """Take the date from the search, before single frames are tested."""
         return cls(frame, half_width, height=1.0, per_frame_snr=1.0, p_constant=1.0)
 
 
@@ -76,7 +76,7 @@ def _half(rise: int) -> int:
 
 
 def _gap(per_frame_snr: float) -> int:
-    return round(_STEEP / max(per_frame_snr, 0.5) ** 2)
+    return round(_CLEAR_FRAME_SNR2 / max(per_frame_snr, 0.5) ** 2)
 
 
 def locate_step(

@@ -20,10 +20,12 @@ HALF = 0.5
 DARK = 0.05
 """Share of the usual light, below which it is closed."""
 
-_CHANGES = 8.0  # times the usual change from one frame to the next, that it takes at least
-_EDGE = 0.1  # of the light of a frame's first and last rows, and of these over the middle one's
+# Times the usual change from one frame to the next, that it takes at least
+_LEAST_CHANGE_RATIO = 8.0
+# Of the light of a frame's first and last rows, and of these over the middle one's
+_LEAST_EDGE_LIGHT = 0.1
 _EDGE_E = 400.0  # photoelectrons of a row, without which it tells nothing
-_USUAL = 0.75  # quantile of the light of frames
+_LIGHT_QUANTILE = 0.75  # quantile of the light of frames
 
 
 @dataclass(frozen=True)
@@ -96,7 +98,7 @@ class Patch:
         return self.counts.reshape(len(self.counts), self.mean_e.size)
 
     def frames(self, start: int, stop: int) -> Patch:
-        """Give some of the frames, where they lie."""
+        """Select some of the frames, without a copy."""
         here = slice(max(start - self.first, 0), max(stop - self.first, 0))
         return replace(
             self, first=self.first + here.start, counts=self.counts[here], good=self.good[here],
@@ -184,7 +186,7 @@ def measure_frames(
 
 
 def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Tell which frames lack their first or last row, as where a transfer broke off.
+    """Tell which frames lack their first or last rows, as after an interrupted transfer.
 
     Shapes: `counts` (t, y, x), result (t,).
     """
@@ -195,27 +197,27 @@ def cut_off(counts: NDArray[Any], camera: Camera) -> BoolArray:
     )
     light = gain * (counts[:, ends].mean(axis=2, dtype=np.float64) - offset)
     usual = np.median(light, axis=0)
-    told = (usual > _EDGE * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
-    found: BoolArray = ((light < _EDGE * usual) & told).any(axis=1)
+    bright_enough = (usual > _LEAST_EDGE_LIGHT * usual[1]) & (usual * counts.shape[2] > _EDGE_E)
+    found: BoolArray = ((light < _LEAST_EDGE_LIGHT * usual) & bright_enough).any(axis=1)
     return found
 
 
 def well_lit(light_e: FloatArray, least: float = HALF) -> BoolArray:
-    """Tell which frames have the light of most, and not that of a shutter that is closed or opens.
+    """Tell which frames have the usual light, unlike those of a closed or opening shutter.
 
     Shapes: `light_e` (t,), result (t,).
     """
     lit: BoolArray = np.isfinite(light_e)
     if lit.any():
         known = light_e[lit]
-        usual = float(np.quantile(known, _USUAL))
+        usual = float(np.quantile(known, _LIGHT_QUANTILE))
         change = float(np.median(np.abs(np.diff(known)))) if known.size > 1 else 0.0
-        lit &= usual - light_e <= max((1 - least) * usual, _CHANGES * change)
+        lit &= usual - light_e <= max((1 - least) * usual, _LEAST_CHANGE_RATIO * change)
     return lit
 
 
 def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
-    """Tell which frames have the light of most, and do not repeat the one before.
+    """Tell which frames have the usual light, and do not repeat the one before.
 
     Shapes: `counts` (t, y, x), result (t,).
     """

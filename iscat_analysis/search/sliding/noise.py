@@ -1,4 +1,4 @@
-"""Noise against averaging, and the windows it makes worth having."""
+"""Noise of averages, and the window that follows from it."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ SHOT_LIMITED = 1.2
 """Noise variance over shot noise up to which averaging is called shot-noise limited."""
 
 _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
-_APART = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
-_PARTICLE = 4.0  # standard deviations, from which on a difference is not asked of motion
+_SLOPE_DISTANCES_PX = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
+_PARTICLE_SIGMAS = 4.0  # standard deviations, from which on a difference is not asked of motion
 _NORMAL_QUARTILE = 0.6744897501960817
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
@@ -80,7 +80,7 @@ def measure_noise(
 
     Shapes: `counts` (t, y, x).
     """
-    strip = _Strip.of(counts, camera, together=follows)
+    strip = _Strip.of(counts, camera, adjacent=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
     found = mapper(strip.compared, lengths)
@@ -92,11 +92,11 @@ def measure_motion(counts: NDArray[Any], camera: Camera, length: int) -> float:
 
     Shapes: `counts` (t, y, x).
     """
-    return _Strip.of(counts, camera, together=True).compared(length).motion
+    return _Strip.of(counts, camera, adjacent=True).compared(length).motion
 
 
 class _Compared(NamedTuple):
-    """Neighbouring averages of a length: variances over that of shot noise."""
+    """Variances of the difference of neighbouring averages, over that of shot noise."""
 
     noise: float  # of the contrast
     rest: float  # the same without motion
@@ -105,30 +105,30 @@ class _Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class _Strip:
-    """Some rows of frames, and their camera."""
+    """Some rows of all frames, and their camera."""
 
     counts: NDArray[Any]
     gain: FloatArray
     offset: FloatArray
     read: FloatArray
-    together: bool
+    adjacent: bool
 
     @classmethod
-    def of(cls, counts: NDArray[Any], camera: Camera, *, together: bool) -> _Strip:
-        """Take rows all over the field, or some that lie together."""
+    def of(cls, counts: NDArray[Any], camera: Camera, *, adjacent: bool) -> _Strip:
+        """Select rows from the whole field, or adjacent ones."""
         height = counts.shape[1]
         rows: Any = np.linspace(0, height - 1, min(_ROWS, height)).astype(int)
-        if together:
+        if adjacent:
             first = max(height - _ROWS_TOGETHER, 0) // 2
             rows = slice(first, first + _ROWS_TOGETHER)
         shape = (height, counts.shape[2])
         gain, offset = (
             np.broadcast_to(v, shape)[rows] for v in (camera.gain_e_per_adu, camera.offset_adu)
         )
-        return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], together)
+        return cls(counts[:, rows], gain, offset, camera.read_variance_e2(shape)[rows], adjacent)
 
     def compared(self, n: int) -> _Compared:
-        """Compare averages of n frames; of rows that do not lie together nothing tells motion."""
+        """Compare averages of n frames; motion can be measured in adjacent rows only."""
         blocks = 2 * min(len(self.counts) // (2 * n), 8)
         parts = self.counts[: blocks * n].reshape(blocks, n, *self.counts.shape[1:])
         sums = self.gain * (parts.sum(axis=1, dtype=np.float64) - n * self.offset)
@@ -140,24 +140,28 @@ class _Strip:
         sigma = np.sqrt((before + read) / before**2 + (after + read) / after**2)
         change = (contrast / sigma)[:, lit]
         noise = _variance(change)
-        if not self.together:
+        if not self.adjacent:
             return _Compared(noise, math.nan, math.nan)
         light = before + after
         slopes = np.stack(
-            [_across(light, reach, axis) / light for axis in (1, 2) for reach in _APART]
+            [
+                _across(light, reach, axis) / light
+                for axis in (1, 2)
+                for reach in _SLOPE_DISTANCES_PX
+            ]
         )
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
-        usual = np.abs(change) < _PARTICLE * math.sqrt(noise)
+        usual = np.abs(change) < _PARTICLE_SIGMAS * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
-        told = turned @ change[..., None]
-        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ told
+        projection = turned @ change[..., None]
+        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ projection
         by_chance = moved.size  # of χ²
-        motion = (float(np.sum(told * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
+        motion = (float(np.sum(projection * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
         return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
 
 
 def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
-    """Differences between the pixels on either side of each; beyond the border, of the border."""
+    """Differences between the neighbours of each pixel along an axis."""
     at = np.arange(images.shape[axis])
     after, before = (images.take(np.clip(at + step, 0, at[-1]), axis) for step in (reach, -reach))
     return np.asarray(after - before)

@@ -17,9 +17,9 @@ from iscat_analysis.records import FloatArray
 
 IntArray = NDArray[np.int64]
 
-_RISES = 6.0  # log-likelihood by which a line describes the frames better than a step
-_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
-_DECAYS = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
+_LEAST_GAIN = 6.0  # log-likelihood by which a line describes the frames better than a step
+_RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
+_DECAY_SHARES = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,16 @@ class Rise:
 
 
 def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> Rise | None:
-    """Find a rise about the best step, whose log-likelihood over none is given; None at once.
+    """Find a rise around the best step, whose log-likelihood is given; None where it is a step.
 
     Shapes: `heights` (t,), `weight` (t,).
     """
-    if step < _RISES:
+    if step < _LEAST_GAIN:
         return None
     lit = np.flatnonzero(weight > 0)
     w = weight[lit]
     y = heights[lit] - np.average(heights[lit], weights=w)
-    best, found = step + _RISES, (0, turn)
+    best, found = step + _LEAST_GAIN, (0, turn)
 
     def tried(rise: int, centres: IntArray) -> None:
         nonlocal best, found
@@ -63,7 +63,7 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
             if gains[top] > best:
                 best, found = float(gains[top]), (rise, int(centres[top]))
 
-    for rise in _FRAMES:
+    for rise in _RISE_FRAMES:
         if 2 * rise < heights.size:
             half = rise // 2
             tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
@@ -75,34 +75,34 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
         tried(max(rise, 2), np.arange(centre - reach, centre + reach + 1))
     rise, centre = found
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
-    curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAYS]
+    curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
     better = float(_gains(np.concatenate(curves), w, y).max()) - best
     p_line = float(erfc(np.sqrt(max(better, 0.0))))  # of χ² with one degree of freedom
-    return Rise(rise, centre, _beside(heights, weight, centre, rise // 2 + 1), p_line)
+    return Rise(rise, centre, _gain_beyond(heights, weight, centre, rise // 2 + 1), p_line)
 
 
 def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
-    """Give the share of the light that is there in frames over which it rises evenly."""
+    """Share of the new light in frames during a linear rise."""
     return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
 
 
 def _settling(frames: IntArray, decay: float, begin: FloatArray) -> FloatArray:
-    """Give the share of the light that is there in frames in which it settles exponentially."""
+    """Share of the new light in frames during an exponential rise."""
     return np.asarray(-np.expm1(-np.maximum(frames + 0.5 - begin, 0.0) / decay))
 
 
-def _gains(courses: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
-    """Log-likelihood of each course with a height of its own, over that of a constant.
+def _gains(traces: FloatArray, weight: FloatArray, heights: FloatArray) -> FloatArray:
+    """Log-likelihood of each time course with a free height, over that of a constant.
 
-    Shapes: `courses` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
+    Shapes: `traces` (n, t), `weight` (t,), `heights` (t,) less their mean, result (n,).
     """
-    courses = courses - (courses @ weight / weight.sum())[:, None]
-    along, known = courses @ (weight * heights), (courses**2) @ weight
+    traces = traces - (traces @ weight / weight.sum())[:, None]
+    along, known = traces @ (weight * heights), (traces**2) @ weight
     return np.where(along > 0, 0.5 * along**2 / np.maximum(known, 1e-300), 0.0)
 
 
-def _beside(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
-    """Give what frames after a gap have beyond those before it.
+def _gain_beyond(heights: FloatArray, weight: FloatArray, turn: int, gap: int) -> float:
+    """Difference of the means after and before a gap.
 
     Shapes: `heights` (t,), `weight` (t,).
     """

@@ -182,7 +182,7 @@ def sliding_maps(
 
 @dataclass(frozen=True)
 class Peak:
-    """A place and a boundary at which the contrast seems to step."""
+    """A place and boundary with a local maximum of the filtered contrast."""
 
     frame: int
     x_px: float

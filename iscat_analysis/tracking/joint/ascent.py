@@ -16,21 +16,21 @@ from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.tracking.joint.likelihood import BLOCK, MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 
-AMPLIFIED = 5.0
+MOST_STEP_RATIO = 5.0
 """Newton's step over the move of one turn, from which it is not trusted."""
 
 _DAMPING = 0.01  # at first and at least: by as much 1 − E is wrong
-_STIFFER, _SOFTER = 10.0, 0.5
-_NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
-_ENOUGH = 0.05  # expected gain of the step that is the last one
+_DAMPING_UP, _DAMPING_DOWN = 10.0, 0.5
+_LIKELIHOOD_NOISE = 0.5  # of the log-likelihood, by how the canvas is drawn
+_LEAST_GAIN = 0.05  # expected gain of the step that is the last one
 _MOST_STEPS = 40
-_DARKEST = 0.99  # signal of a pixel that is taken to be none of a particle's
+_MOST_SIGNAL = 0.99  # signal of a pixel that is taken to be none of a particle's
 
 
 def ascend(
     field: MovingField, ground: BackgroundEstimate, rows: Localizations, *, follow_power: bool
 ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
-    """Fit rows and background to the maximum of their likelihood, without a step that lowers it."""
+    """Maximise the likelihood of rows and background by steps that never lower it."""
     counts = np.where(field.used, np.maximum(field.total_e, 1.0), 0.0)
     damping, best, kept = _DAMPING, -np.inf, (rows, ground)
     for _ in range(_MOST_STEPS):
@@ -38,38 +38,38 @@ def ascend(
         found = BackgroundEstimate(found.level, found.power if follow_power else ground.power)
         move = np.where(field.used, np.log(found.level / ground.level), 0.0)
         value = log_likelihood(field, found, rows)
-        if value < best - _NOISE:
+        if value < best - _LIKELIHOOD_NOISE:
             rows, ground = kept
-            damping *= _STIFFER
+            damping *= _DAMPING_UP
             continue
         best, kept = max(best, value), (rows, found)
-        damping = max(_SOFTER * damping, _DAMPING)
-        step, gain = _uphill(field, move, counts, damping)
+        damping = max(_DAMPING_DOWN * damping, _DAMPING)
+        step, gain = _damped_step(field, move, counts, damping)
         ground = BackgroundEstimate(found.level * np.exp(step - move), found.power)
-        if gain < _ENOUGH:
+        if gain < _LEAST_GAIN:
             return field.followed(rows, step), ground, done
     return *kept, done
 
 
-def _uphill(
+def _damped_step(
     field: MovingField, move: FloatArray, counts: FloatArray, damping: float
 ) -> tuple[FloatArray, float]:
-    """Give Newton's step, damped until it climbs, and by how much it should."""
+    """Damp a Newton step until the likelihood is expected to rise; give the expected gain."""
     while True:
         step = field.where_turns_end(move, damping)
         gain = 0.5 * float(np.sum(counts * move * step))
         if not gain <= 0 or not move.any():  # one that is no number climbs no better when damped
             return step, gain
-        damping *= _STIFFER
+        damping *= _DAMPING_UP
 
 
 def log_likelihood(field: MovingField, ground: BackgroundEstimate, rows: Localizations) -> float:
-    """Give the log-likelihood of rows over the background that is most likely under them."""
+    """Profile log-likelihood of rows: the background maximises it under these rows."""
     total, power = field.draw(ground, rows, coarse=False), ground.power
 
     def block(first: int) -> FloatArray:
         here = slice(first, first + BLOCK)
-        signal = np.maximum(total[here].astype(np.float64), -_DARKEST)
+        signal = np.maximum(total[here].astype(np.float64), -_MOST_SIGNAL)
         bright = power[here, None, None] * (1 + signal)
         seen = np.einsum("tyx,tyx->yx", field.exposures.electrons(here), np.log1p(signal))
         return np.stack([seen, bright.sum(axis=0)])

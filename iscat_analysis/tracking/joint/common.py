@@ -39,11 +39,12 @@ IntArray = NDArray[np.int64]
 
 _SINGULAR = 1e-9
 _IMAGES = 4  # that are sent through E at a time
-_LEFT = 3e-4  # of the variance of a row, that may be left out
+_MOST_VARIANCE_LEFT_OUT = 3e-4  # of the variance of a row, that may be left out
 _SEED = 1  # of the images to begin with
 _ROUNDS = 3  # of a mean and of the weights there
-_UNLIKE = 2.0  # amplitude over the mean, beyond which weights stay
-_UNSOLVED = 1e-6  # of the information on a mass, that a step of the conjugate gradients adds
+_MOST_AMPLITUDE_RATIO = 2.0  # amplitude over the mean, beyond which weights stay
+# Of the information on a mass, that a step of the conjugate gradients adds
+_LEAST_INFORMATION_SHARE = 1e-6
 _MOST_STEPS = 400
 
 
@@ -86,20 +87,20 @@ def _added(coupling: Coupling, inverse: FloatArray) -> FloatArray:
     inner = turned @ coupling.own() @ root
     most = float(np.linalg.eigvalsh(inner)[:, -1].max())
     # as no eigenvalue is larger than their sum
-    if _left(most, float(np.einsum("nii->", inner))) > _LEFT:
-        more = _beyond(coupling, root, most)
+    if _variance_left_out(most, float(np.einsum("nii->", inner))) > _MOST_VARIANCE_LEFT_OUT:
+        more = _krylov_part(coupling, root, most)
         if more is None:
             return np.broadcast_to(np.diag(np.full(free, np.inf)), inverse.shape)
         inner += more
     return np.asarray(root @ inner @ turned)
 
 
-def _left(most: float, largest: float) -> float:
+def _variance_left_out(most: float, largest: float) -> float:
     """Tell how much of the variance of a row is left out with eigenvalues of E, at most."""
     return most * largest / (1 - largest) if largest < 1 else np.inf
 
 
-def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
+def _krylov_part(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | None:
     """P (1 − E)⁻¹ Pᵀ − P Pᵀ of every row, but for what is small; None where 1 − E is singular."""
     n, free = root.shape[:2]
     covariance = root @ np.swapaxes(root, 1, 2)
@@ -108,7 +109,7 @@ def _beyond(coupling: Coupling, root: FloatArray, most: float) -> FloatArray | N
     images = coupling.sent(some @ np.swapaxes(root, 1, 2))
     basis, felt = np.empty((0, coupling.pixels)), np.empty((n, 0, free))
     largest = 1.0
-    while len(basis) < rank and _left(most, largest) > _LEFT:
+    while len(basis) < rank and _variance_left_out(most, largest) > _MOST_VARIANCE_LEFT_OUT:
         added = _orthonormal(images, basis)[: rank - len(basis)]
         seen, images = coupling.followed(covariance, added)
         seen = seen @ root
@@ -204,13 +205,13 @@ def common_amplitudes(
         covariance[used, :-1, :-1] = _inverse(fisher[used], index[:-1])
         coupling = Coupling(field, ground, judged.slopes, mine)
         off = estimate - mean
-        mode, pulled = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
+        mode, sent_offset = coupling.sent(np.stack([sends, sends * off[:, None]], axis=1))
         total = weight.sum()
-        answer, taken = _answer(coupling, covariance, mode, total)
+        answer, taken = _solve_conjugate_gradients(coupling, covariance, mode, total)
         left = total - taken
         out[2:, k] = 1 / total, total**2 / np.sum(weight**2)
         if left > _SINGULAR * total:
-            out[:2, k] = mean + (weight @ off - answer @ pulled) / left, 1 / left
+            out[:2, k] = mean + (weight @ off - answer @ sent_offset) / left, 1 / left
 
     field.share(of_one, len(tracks))
     return CommonAmplitudes(*out)
@@ -223,12 +224,12 @@ def _at_their_mean(
     power = np.average(growth, weights=information)
     mean, more = float(np.average(estimate, weights=information)), np.ones(len(estimate))
     for _ in range(_ROUNDS):
-        more = np.clip(amplitude / mean, 1 / _UNLIKE, _UNLIKE) ** -power
+        more = np.clip(amplitude / mean, 1 / _MOST_AMPLITUDE_RATIO, _MOST_AMPLITUDE_RATIO) ** -power
         mean = float(np.average(estimate, weights=information * more))
     return mean, more
 
 
-def _answer(
+def _solve_conjugate_gradients(
     coupling: Coupling, covariance: FloatArray, image: FloatArray, total: float
 ) -> tuple[FloatArray, float]:
     """Solve (1 − E') answer = image by conjugate gradients; give image · answer as well.
@@ -236,21 +237,21 @@ def _answer(
     That is infinite where 1 − E' is singular.
     """
     answer, taken = np.zeros_like(image), 0.0
-    left, way = image.copy(), image.copy()
+    left, direction = image.copy(), image.copy()
     size = float(left @ left)
     for _ in range(_MOST_STEPS):
-        turned = way - coupling.followed(covariance, way[None])[1][0]
-        bend = float(way @ turned)
-        if not bend > _SINGULAR * float(way @ way):
+        turned = direction - coupling.followed(covariance, direction[None])[1][0]
+        curvature = float(direction @ turned)
+        if not curvature > _SINGULAR * float(direction @ direction):
             return answer, np.inf
-        step = size / bend
-        answer += step * way
+        step = size / curvature
+        answer += step * direction
         taken += step * size
-        if step * size < _UNSOLVED * (total - taken):
+        if step * size < _LEAST_INFORMATION_SHARE * (total - taken):
             break
         left -= step * turned
         before, size = size, float(left @ left)
-        way = left + size / before * way
+        direction = left + size / before * direction
     return answer, taken
 
 

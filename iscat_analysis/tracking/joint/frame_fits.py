@@ -1,7 +1,7 @@
-"""Fits of rows, frame after frame, by plain steps where these lead and with more care elsewhere.
+"""Fits of rows, frame after frame: plain Fisher scoring where it converges, else a search.
 
-Nearly all rows are fitted by the steps of Fisher scoring as they are.  The search that brakes them
-is a kernel of its own, which is compiled by the first row that needs it.
+Nearly all rows converge by plain steps.  The kernel of the search with a step control is compiled
+only when the first row needs it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ IntArray = NDArray[np.int64]
 
 
 def room_for(field: Field, near: Pictures, free: BoolArray) -> Room:
-    """Make room for the kernels of rows.
+    """Allocate the scratch memory of the kernels that fit rows.
 
     Shapes: `free` (5,).
     """
@@ -50,7 +50,7 @@ def draw_rows(
     field: Field, near: Pictures, far: Pictures, starts: IntArray, first: int, last: int,
     theta: FloatArray, group: IntArray, canvas: Canvas,
 ) -> None:  # fmt: skip
-    """Bring frames first…last − 1 of the canvas to the rows as they are.
+    """Update frames first…last − 1 of the canvas to the current rows.
 
     Shapes: `starts` (t + 1,), `theta` (rows, 5), `group` (rows,).
     """
@@ -78,16 +78,18 @@ def fit_rows(
         information, gain, expected, background, sums, place, room,
     ):  # fmt: skip
         row = int(place[2])
-        gain[row], outcome[row] = _climb(
+        gain[row], outcome[row] = _fit_with_search(
             field, near, search, place, room, int(group[row]), theta[row]
         )
 
 
-def _climb(
+def _fit_with_search(
     field: Field, near: Pictures, search: Search, place: IntArray, room: Room, group: int,
     theta: FloatArray,
 ) -> tuple[float, int]:  # fmt: skip
-    """Fit a row whose plain steps lead nowhere, from θ, which is overwritten with the estimate.
+    """Fit a row whose plain steps diverge; θ is overwritten with the estimate.
+
+    Returns the log-likelihood over that without the particle, and how the fit ended.
 
     Returns its log-likelihood over that without the particle, and how the fit ended.
     """

@@ -58,19 +58,20 @@ COARSE = 2
 BLOCK = 32
 """Frames that one thread takes at a time."""
 
-_SWEPT = 4  # of them, where every row is fitted several times
+_FRAMES_PER_SWEEP = 4  # of them, where every row is fitted several times
 _TOLERANCE = 2e-4  # as in `Likelihood.maximize`
-_PASSING = 0.02  # the same, of a fit that the next turn goes on with
+_ROUGH_TOLERANCE = 0.02  # the same, of a fit that the next turn goes on with
 _PASSES = 40
 _SLACK = np.array([0.1, 0.1, 0.01, 0.05])
 """How far particles may go from their rings: pixels, wavelengths, relative."""
-_ANY = 1e300
-_MORE_ROWS = 2.0  # for which there is room, than those of the first fit: untouched it is free
-_BEYOND = 1.0  # resolutions λ/NA outside the field, from where a particle is still seen
+_NO_LIMIT = 1e300
+_ROOM_FACTOR = 2.0  # for which there is room, than those of the first fit: untouched it is free
+# Resolutions λ/NA outside the field, from where a particle is still seen
+_VISIBLE_RESOLUTIONS = 1.0
 
 
 class MovingField:
-    """A movie in memory, and the pictures of what moves in it."""
+    """A movie in memory, and the pictures of the particles that move in it."""
 
     def __init__(
         self,
@@ -109,23 +110,25 @@ class MovingField:
         self._room_of_slopes = np.empty(0, dtype=np.int16)
         self.free = np.array([True, True, z_range_nm is not None, True, False])
         reach = window_nm(pixel_nm)
-        half = pixel_nm / 2 + _BEYOND * wavelength / near.optics.na
+        half = pixel_nm / 2 + _VISIBLE_RESOLUTIONS * wavelength / near.optics.na
         if z_range_nm is not None:  # rings reach farther
             half = max(half, roi_px * pixel_nm / 4)
         low, high = z_range_nm or (near.height_nm, near.height_nm)
         sign_kept = z_range_nm is not None
         self._search = Search(
             self.free,
-            np.array([reach, reach, _ANY, _ANY, 0.0]),
+            np.array([reach, reach, _NO_LIMIT, _NO_LIMIT, 0.0]),
             np.array([-half, -half, low, 0.0 if sign_kept else -largest, 0.0]),
             np.array(
                 [(columns - 1) * pixel_nm + half, (rows - 1) * pixel_nm + half, high, largest, 0.0]
             ),
-            np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _ANY, 1.0]),
+            np.array([0.25 * wavelength, 0.25 * wavelength, 0.1 * wavelength, _NO_LIMIT, 1.0]),
             _TOLERANCE,
             _PASSES,
         )
-        farthest = max(rows, columns) + _BEYOND * wavelength / (near.optics.na * pixel_nm)
+        farthest = max(rows, columns) + _VISIBLE_RESOLUTIONS * wavelength / (
+            near.optics.na * pixel_nm
+        )
         self._book = PictureBook(
             near, far,
             pixel_nm=pixel_nm,
@@ -167,7 +170,7 @@ class MovingField:
         return len(self.exposures.counts)
 
     def renew(self, block: Callable[[int, int], NDArray[Any]]) -> None:
-        """Put other frames in the place of these."""
+        """Replace the frames."""
 
         def put(first: int) -> None:
             last = min(first + BLOCK, self.frames)
@@ -179,7 +182,7 @@ class MovingField:
         self.draw_anew()
 
     def set_blurs(self, variances_nm2: FloatArray) -> None:
-        """Make the pictures that `Localizations.group` numbers.
+        """Make the pictures of blurs, which `Localizations.group` numbers.
 
         Shapes: `variances_nm2` (groups,).
         """
@@ -194,10 +197,10 @@ class MovingField:
         sweeps: int = 1,
         coarse: bool = False,
     ) -> tuple[Localizations, BackgroundEstimate, BoolArray]:
-        """Fit every row over a background, and give the background under the rows.
+        """Fit every row over a background, and estimate the background under the rows.
 
-        Rows that overlap follow one another in the end, but those of smaller squares, some of which
-        are only tried.  How all of them follow their background is kept for `where_turns_end`.
+        In the last fit, rows that overlap are corrected for each other's changes.  The response of
+        all rows to a change of the background is kept for `where_turns_end`.
 
         Shapes: `converged` (n,).
         """
@@ -209,7 +212,7 @@ class MovingField:
         fisher, gain = np.zeros((len(theta), 4, 4)), np.empty(len(theta))
         canvas = self._canvas_for(rows, coarse=coarse)
         field = self._coarse if coarse else self._whole
-        search = self._search if sweeps > 1 else self._search._replace(tolerance=_PASSING)
+        search = self._search if sweeps > 1 else self._search._replace(tolerance=_ROUGH_TOLERANCE)
         slopes = self._slopes_of(len(theta), field.side if sweeps else 0)
         expected = np.zeros(self.frames)
 
@@ -245,14 +248,14 @@ class MovingField:
         )
 
     def where_turns_end(self, move: FloatArray, damping: float) -> FloatArray:
-        """Give the step of the background whose first turn, with the last fit, is `move`.
+        """Extrapolate all further turns from the first one, whose step of the background is `move`.
 
         Shapes: `move` (y, x), result (y, x).
         """
         return self._response.step(move, self.total_e, self.used, damping)
 
     def followed(self, rows: Localizations, step: FloatArray) -> Localizations:
-        """Let the rows of the last fit follow a step of the background, to first order.
+        """Move the rows of the last fit with a step of the background, to first order.
 
         Shapes: `step` (y, x).
         """
@@ -262,13 +265,13 @@ class MovingField:
         return replace(rows, theta=theta)
 
     def draw_anew(self) -> None:
-        """Draw all rings where their particles are, at the next pass."""
+        """Mark all pictures to be drawn again in the next pass."""
         self._canvas = None
 
     def draw(
         self, ground: BackgroundEstimate, rows: Localizations, *, coarse: bool = True
     ) -> NDArray[np.float32]:
-        """Draw the rows of all frames at once; `residual` of the same object then only subtracts.
+        """Draw the rows of all frames, so that `residual` only has to subtract them.
 
         Shapes: result (t, y, x).
         """
@@ -279,7 +282,7 @@ class MovingField:
     def residual(
         self, ground: BackgroundEstimate, rows: Localizations, first: int, last: int
     ) -> NDArray[np.float32]:
-        """Give the counts of some frames minus what is expected.
+        """Give the counts of some frames minus their expectation.
 
         Shapes: result (last - first, y, x).
         """
@@ -296,7 +299,7 @@ class MovingField:
         which: IntArray, corner: IntArray, owner: IntArray,
         out: FloatArray,
     ) -> None:  # fmt: skip
-        """Put squares around rows on top of each other, with all rows taken off.
+        """Superpose the squares around rows, after all rows are subtracted.
 
         Shapes: `which` (n,), `corner` (n, 2), `owner` (n,), `out` (m, 3, side, side).
         """
@@ -320,7 +323,7 @@ class MovingField:
         return canvas.total
 
     def judge(self, ground: BackgroundEstimate, rows: Localizations) -> Judged:
-        """Say what the likelihood knows of every row."""
+        """Compute the information on every row."""
         n = len(rows.frame)
         light = self._light(ground)
         near, far = self._pictures_for(coarse=False)
@@ -344,7 +347,7 @@ class MovingField:
         return Judged.of(fisher, turned, ways, bias, numbers, slopes, free=self.free[:4])
 
     def sum_of(self, block: Callable[[int], NDArray[np.floating[Any]]]) -> FloatArray:
-        """Run blocks of frames and add what they give, in their order."""
+        """Run a function on blocks of frames and sum the results in order."""
         parts = list(self._pool.map(block, range(0, self.frames, BLOCK)))
         total = parts[0].astype(np.float64)
         for part in parts[1:]:
@@ -352,11 +355,11 @@ class MovingField:
         return total
 
     def share(self, task: Callable[[int], None], count: int) -> None:
-        """Run a numbered task for every number below `count`, several at a time."""
+        """Run numbered tasks in threads."""
         list(self._pool.map(task, range(count)))
 
     def holds(self, theta: FloatArray) -> BoolArray:
-        """Tell which particles are in the field.
+        """Tell which positions are in the field.
 
         Shapes: `theta` (..., 5), result (...).
         """
@@ -368,7 +371,7 @@ class MovingField:
     def refit(
         self, ground: BackgroundEstimate, rows: Localizations, *, sweeps: int
     ) -> tuple[Localizations, BoolArray]:
-        """Fit all particles of a few frames, the smaller square of each.
+        """Fit all particles of a few frames in the smaller square.
 
         Shapes: `converged` (n,).
         """
@@ -384,7 +387,7 @@ class MovingField:
         slopes, expected = self._slopes_of(n, 0), np.zeros(times.size)
 
         def block(part: int) -> None:
-            first, last = part * _SWEPT, min((part + 1) * _SWEPT, times.size)
+            first, last = part * _FRAMES_PER_SWEEP, min((part + 1) * _FRAMES_PER_SWEEP, times.size)
             draw_rows(self._coarse, near, far, starts, first, last, theta, rows.group, canvas)
             fit_rows(
                 light, self._coarse, near, self._search, starts, first, last, sweeps, theta,
@@ -392,11 +395,11 @@ class MovingField:
                 np.zeros(self.used.shape, dtype=np.float32),
             )  # fmt: skip
 
-        self.share(block, -(-times.size // _SWEPT))
+        self.share(block, -(-times.size // _FRAMES_PER_SWEEP))
         return rows.fitted(theta, fisher, gain), outcome == CONVERGED
 
     def on_wall(self, rows: Localizations) -> BoolArray:
-        """Tell which rows ended on a wall of the search.
+        """Tell which rows ended at a limit of the search.
 
         Shapes: result (n,).
         """
@@ -406,7 +409,7 @@ class MovingField:
         return np.asarray((near & self.free).any(axis=1))
 
     def _pictures_for(self, *, coarse: bool) -> tuple[Pictures, Pictures]:
-        """Give the pictures to fit and to draw, which are the same where little is drawn."""
+        """Give the pictures to fit and to draw; they are the same where little is drawn."""
         near, far = self._pictures
         return near, near if coarse and not self.free[2] else far
 
@@ -426,12 +429,12 @@ class MovingField:
         return canvas
 
     def _slopes_of(self, rows: int, side: int) -> Slopes:
-        """Room for slopes, in the place of those before."""
+        """Allocate slopes, reusing the memory of the previous ones."""
         free = int(self.free[:4].sum())
         size = rows * free * side**2
         if self._room_of_slopes.size < size:
             # It is cleared where it is first used, as long as a fit takes: once, for all to come.
-            most = round(_MORE_ROWS * rows) * free * self._whole.side**2
+            most = round(_ROOM_FACTOR * rows) * free * self._whole.side**2
             self._room_of_slopes = np.empty(most, dtype=np.int16)
         values = self._room_of_slopes[:size].reshape(rows, free, side**2)
         squares, units, moves = np.zeros((rows, 4), dtype=np.int64), *np.zeros((2, rows, free))

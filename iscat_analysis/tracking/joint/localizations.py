@@ -1,4 +1,4 @@
-"""What particles that move are known by: where they are in each frame, over which light."""
+"""Rows of moving particles, and the background under them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Localizations:
-    """Particles in frames, in the order of the frames."""
+    """Particles in frames, sorted by frame."""
 
     frame: IntArray
     track: IntArray
@@ -30,7 +30,7 @@ class Localizations:
     def of(
         cls, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray | None = None
     ) -> Localizations:
-        """Put rows, none of them fitted yet, into the order of their frames."""
+        """Sort rows that are not fitted yet by frame."""
         n = len(frame)
         blur = np.zeros(n, dtype=np.int64) if group is None else group
         unknown = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
@@ -38,28 +38,28 @@ class Localizations:
 
     @classmethod
     def together(cls, parts: Sequence[Localizations]) -> Localizations:
-        """Take rows of several, one after the other."""
+        """Concatenate several sets of rows."""
         every = ([getattr(rows, part.name) for rows in parts] for part in fields(cls))
         return cls(*map(np.concatenate, every))
 
     def in_order(self) -> Localizations:
-        """Put them into the order of their frames, and in a frame of their tracks."""
+        """Sort rows by frame and track."""
         return self.only(np.lexsort((self.track, self.frame)))
 
     def joined(
         self, frame: IntArray, track: IntArray, theta: FloatArray, group: IntArray
     ) -> Localizations:
-        """Add rows that are not fitted yet."""
+        """Append rows that are not fitted yet."""
         return Localizations.together(
             [self, Localizations.of(frame, track, theta, group)]
         ).in_order()
 
     def fitted(self, theta: FloatArray, fisher: FloatArray, gain: FloatArray) -> Localizations:
-        """Put rows at their estimates, with their informations and gains in log-likelihood."""
+        """Set estimates, informations and gains in log-likelihood."""
         return replace(self, theta=theta, fisher=fisher, snr=np.sqrt(2 * np.maximum(gain, 0.0)))
 
     def recalling(self, old: Localizations) -> Localizations:
-        """Give rows that are the same in others what these know of their fits."""
+        """Copy the fits of rows that are the same in others."""
         many = int(max(self.track.max(initial=0), old.track.max(initial=0))) + 1
         keys, sought = old.frame * many + old.track, self.frame * many + self.track
         where = np.minimum(np.searchsorted(keys, sought), len(keys) - 1)
@@ -69,16 +69,16 @@ class Localizations:
         return replace(self, fisher=fisher, snr=snr)
 
     def starts(self, frames: int) -> IntArray:
-        """First row of each frame, and the number of rows."""
+        """Index of the first row of each frame, and the number of rows."""
         first: IntArray = np.searchsorted(self.frame, np.arange(frames + 1)).astype(np.int64)
         return first
 
     def only(self, kept: BoolArray | IntArray) -> Localizations:
-        """Take some of the rows."""
+        """Select some rows."""
         return Localizations(*(getattr(self, part.name)[kept] for part in fields(self)))
 
     def pairs_within(self, limit_nm: float) -> IntArray:
-        """Give the pairs of rows of a frame that are no farther apart than a limit.
+        """Find pairs of rows of one frame within a distance.
 
         Shapes: result (pairs, 2).
         """
@@ -90,7 +90,7 @@ class Localizations:
 
 @dataclass(frozen=True)
 class BackgroundEstimate:
-    """The light without the particles."""
+    """The background, and the laser power of each frame."""
 
     level: FloatArray
     power: FloatArray
@@ -123,7 +123,7 @@ class Judged:
         *,
         free: BoolArray,
     ) -> Judged:
-        """Make it of what `iscat_analysis._kernels.track_precision.judge_frames` fills.
+        """Make it of the arrays that `iscat_analysis._kernels.track_precision.judge_frames` fills.
 
         Shapes: `free` (4,).
         """

@@ -22,7 +22,7 @@ from iscat_analysis._kernels.canvas import Light
 from iscat_analysis.records import BoolArray, FloatArray
 
 _PARTS = 8  # of the clusters, that threads take in turn
-_RESIDUE = 0.02  # of a step that is left to the next
+_STEP_RESIDUE = 0.02  # of a step that is left to the next
 _MOST_STEPS = 40  # of the conjugate gradients
 _FARTHEST = 0.05  # step of the logarithm of the background
 _LONGEST = np.array([50.0, 50.0, 20.0, 0.3, 0.0])
@@ -110,7 +110,7 @@ class Response:
         step, _ = of.cg(
             of.LinearOperator(square, undetermined, dtype=np.float64),
             (counts * move).ravel(),
-            rtol=_RESIDUE,
+            rtol=_STEP_RESIDUE,
             maxiter=_MOST_STEPS,
             M=of.LinearOperator(square, lambda v: v.ravel() / weight, dtype=np.float64),
         )

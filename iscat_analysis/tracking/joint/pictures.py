@@ -16,7 +16,7 @@ from iscat_analysis.records import FloatArray
 
 
 class PictureBook:
-    """Makes the pictures of particles with any blur."""
+    """Makes pictures of particles with any blur."""
 
     def __init__(
         self,

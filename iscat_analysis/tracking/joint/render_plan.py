@@ -20,7 +20,7 @@ class RenderPlan:
     coarse: bool
 
     def moved(self, rows: Localizations, frames: int) -> Canvas:
-        """Turn to other rows; frames in which they are not the same ones are marked."""
+        """Set other rows; frames in which rows changed are marked."""
         old, canvas = self.rows, self.canvas
         here, there = rows.starts(frames), old.starts(frames)
         same = np.diff(here) == np.diff(there)
@@ -34,7 +34,7 @@ class RenderPlan:
 
 
 def blank(room: NDArray[np.float32], rows: Localizations) -> Canvas:
-    """Make a canvas with nothing drawn on it yet.
+    """Make an empty canvas.
 
     Shapes: `room` (t, y, x).
     """

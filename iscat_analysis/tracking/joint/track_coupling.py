@@ -1,8 +1,8 @@
-"""How the rows of a track feel one another through the light of its pixels.
+"""Coupling of the rows of a track through the background of their pixels.
 
-The light of every pixel is measured in its own standard deviation, known from the N counts of all
-frames: an image v of such numbers changes the logarithm of the light by v/√N, and a row with the
-slopes G = w B ∂C sees G v/√N of it.
+The background of each pixel is expressed in units of its standard deviation, which follows from the
+N counts of all frames: an image v of such numbers changes the logarithm of the background by v/√N,
+and a row with the slopes G = w B ∂C responds with G v/√N.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ class Coupling:
 
     @property
     def pixels(self) -> int:
-        """How many."""
+        """Number of pixels."""
         return self._weight.size
 
     def own(self) -> FloatArray:
-        """Give what the light takes from each row by itself, G N⁻¹ Gᵀ.
+        """Information that each row by itself loses to the background, G N⁻¹ Gᵀ.
 
         Shapes: result (n, free, free).
         """
@@ -58,7 +58,7 @@ class Coupling:
         return out
 
     def sent(self, by: FloatArray) -> FloatArray:
-        """Give what the light would take up of changes of the rows, N⁻½ Σ Gᵀ by.
+        """Change of the background that changes of rows make, N⁻½ Σ Gᵀ by.
 
         Shapes: `by` (n, b, free), result (b, pixels).
         """
@@ -67,7 +67,7 @@ class Coupling:
         return (out * self._sigma).reshape(len(out), -1)
 
     def followed(self, covariance: FloatArray, images: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Let rows follow images, and give what they feel and what they send back.
+        """Let rows respond to images; give the responses and the images that these make.
 
         Shapes: `covariance` (n, free, free), `images` (b, pixels), `felt` (n, b, free), `back` (b,
         pixels).

@@ -1,4 +1,4 @@
-"""Particles that stand against a background recorded before them, or against a known level."""
+"""Particles on top of a background that was recorded before they bound, or whose level is known."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ _LEAST_AWAY = 0.25  # of the field, from which what no particle explains is told
 _NEAR = 2.0  # λ/NA from a particle, within which a wrong model leaves most of it over
 
 
-def find_bound(ready: Prepared, run: Run) -> DetectionResult:
-    """Find particles in the frames after a background, together or, in mode track, one by one."""
-    ready, windows = _summed(ready, run)
+def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
+    """Find particles in the frames after a background; mode track fits each frame by itself."""
+    ready, windows = _sum_frames(ready, run)
     context, noise, summary, doubt = _background(ready, run, windows)
     movie, camera = ready.steady, ready.camera
     with threads(context.config.compute.workers) as pool:
@@ -72,15 +72,15 @@ def find_bound(ready: Prepared, run: Run) -> DetectionResult:
                 doubt=doubt, warn=run.warn,
             )  # fmt: skip
             if not windows.n_before:
-                for text in _judged_beside(ready, context, windows, found.fits).messages:
+                for text in _judge_beside_particles(ready, context, windows, found.fits).messages:
                     run.warn(text)
         else:
-            found = _together(ready, run, context, windows, noise, summary, pool)
+            found = _fit_together(ready, run, context, windows, noise, summary, pool)
     run.clock.lap("results")
     return found if ready.kept is None else ready.kept.put_back(found)
 
 
-def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
+def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
     """Sum the background and the frames after it, without those that are cut off."""
     config, camera = ready.config, ready.camera
     before, after = frame_ranges(ready.steady, config)
@@ -102,9 +102,9 @@ def _summed(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
 def _background(
     ready: Prepared, run: Run, windows: Windows
 ) -> tuple[AnalysisContext, Noise, dict[str, Any], str]:
-    """Make the models, and judge the noise, pixels and drift of the background.
+    """Make the models, and judge noise, pixels and drift of the background.
 
-    The last is why it may not be the background of these frames; empty where it is.
+    Also returned is why it may not be the background of these frames; empty where it is.
     """
     movie, config, camera = ready.steady, ready.config, ready.camera
     after = windows.frames_after
@@ -118,7 +118,7 @@ def _background(
         context = make_context(
             config, ready.shape, searches=searches, noise=noise.spectrum, lines=ready.lines
         )
-    for text in (*noise.said(movie.name), *pixel_warnings(*windows.left_out)):
+    for text in (*noise.messages_of(movie.name), *pixel_warnings(*windows.left_out)):
         run.warn(text)
     uneven = uneven_warning(config, movie.name, windows) if still else ""
     for text in ("" if still else repeats_warning(movie, windows), uneven):
@@ -136,10 +136,10 @@ def _background(
     return context, noise, summary, uneven or moved
 
 
-def _judged_beside(
+def _judge_beside_particles(
     ready: Prepared, context: AnalysisContext, windows: Windows, table: pd.DataFrame
 ) -> Noise:
-    """Judge the camera where the background is known and all frames hold particles that move."""
+    """Judge the camera in pixels that no moving particle comes near; the background is known."""
     movie, camera, (first, last) = ready.steady, ready.camera, windows.frames_after
     frame = table["frame"].to_numpy(np.int64)
     particles = table[["x_nm", "y_nm", "z_nm", "mass_kda"]].to_numpy(float)
@@ -158,10 +158,10 @@ def _judged_beside(
     noise = judge_beside(
         context, movie, camera, (first, last), (frame, particles[:, :2]), ~windows.masked, without
     )
-    return noise.beside(table["chi2_reduced"].to_numpy(float))
+    return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
 
 
-def _together(
+def _fit_together(
     ready: Prepared,
     run: Run,
     context: AnalysisContext,
@@ -170,19 +170,19 @@ def _together(
     summary: dict[str, Any],
     pool: ThreadPoolExecutor,
 ) -> DetectionResult:
-    """Find, fit and sample the particles that are there in all frames after the background."""
+    """Find and fit the particles that are there in all frames, and sample their posteriors."""
     events, windows = fit_field(
         context, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
     )
     run.clock.lap("fit")
     # rings of many particles that a wrong microscope leaves over look uneven too
     cause = misfit_warning(context.config, events)
-    cause = cause or _uneven(context, ready.steady.name, windows, events)
+    cause = cause or _uneven_message(context, ready.steady.name, windows, events)
     if cause:
         run.warn(cause)
     repeats, empty = field_repeats(context, ready.steady, ready.camera, windows, events)
     if context.config.fit.sigma != "measured":
-        events, changing = _with_changes(context.mode, events, repeats)
+        events, changing = _flag_changing_masses(context.mode, events, repeats)
         if changing:
             run.warn(
                 f"the mass of {count(changing, 'event')} changes within the frames by more than "
@@ -193,7 +193,7 @@ def _together(
     chains: list[PosteriorResult] = []
     interrupted = False
     if context.config.samples_posterior:
-        chains, interrupted = _sampled(context, events, pool, run.progress)
+        chains, interrupted = _sample_posteriors(context, events, pool, run.progress)
         run.clock.lap("posterior")
     return DetectionResult(
         context=context,
@@ -213,8 +213,10 @@ def _together(
     )
 
 
-def _uneven(context: AnalysisContext, name: str, windows: Windows, events: Sequence[Event]) -> str:
-    """Say that a known background is uneven, away from the particles that were fitted over it."""
+def _uneven_message(
+    context: AnalysisContext, name: str, windows: Windows, events: Sequence[Event]
+) -> str:
+    """Say that a known background is uneven, where no particle was fitted."""
     if windows.n_before:
         return ""
     rows, columns = windows.after_e.shape
@@ -235,7 +237,7 @@ def _uneven(context: AnalysisContext, name: str, windows: Windows, events: Seque
     return uneven_warning(context.config, name, windows, np.where(away, signal, np.nan))
 
 
-def _with_changes(
+def _flag_changing_masses(
     mode: str, events: Sequence[Event], repeats: Sequence[FloatArray]
 ) -> tuple[tuple[Event, ...], int]:
     """Flag events whose mass differs between parts of their frames, and count them."""
@@ -251,7 +253,7 @@ def _with_changes(
     return tuple(judged), changing
 
 
-def _sampled(
+def _sample_posteriors(
     context: AnalysisContext, events: Sequence[Event], pool: ThreadPoolExecutor, progress: Progress
 ) -> tuple[list[PosteriorResult], bool]:
     """Sample the posteriors, in order; an interrupt keeps those that are done."""

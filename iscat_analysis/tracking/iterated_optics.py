@@ -30,7 +30,7 @@ _FARTHEST = 0.7  # times the last change that is added to it: some directions ch
 
 @dataclass(frozen=True)
 class Round:
-    """Optics with which tracks were followed, and those that were learned from these tracks."""
+    """The optics that tracks were followed with, and those learned from these tracks."""
 
     before: Config
     after: Config
@@ -38,7 +38,7 @@ class Round:
 
     @property
     def step(self) -> FloatArray:
-        """Change of the measured parameters, shape (n,)."""
+        """Change of the measured parameters in this round, shape (n,)."""
         return _change(self.before, self.after, self.found.names)
 
     @property
@@ -49,7 +49,7 @@ class Round:
 
 @dataclass(frozen=True)
 class Rounds:
-    """One round after the other."""
+    """All rounds so far."""
 
     all: tuple[Round, ...] = ()
 
@@ -59,7 +59,7 @@ class Rounds:
 
     @property
     def share(self) -> float | None:
-        """Of an error, what a round leaves; None where the rounds do not tell."""
+        """Share of an error that a round leaves; None where that cannot be estimated."""
         if len(self.all) < 2:
             return None
         then, now = self.all[-2:]
@@ -78,20 +78,20 @@ class Rounds:
 
     @property
     def to_come(self) -> FloatArray:
-        """Change of the latest parameters that other rounds would make, shape (n,)."""
+        """Change that all further rounds together would make, extrapolated, shape (n,)."""
         share = _FIRST_SHARE if self.share is None else self.share
         return self.all[-1].step * share / (1 - share)
 
     @property
     def settled(self) -> bool:
-        """Whether other rounds would change nothing worth the time."""
+        """Whether further rounds would change less than the errors."""
         last, rest = self.all[-1], self.to_come
         weight = np.linalg.pinv(last.found.covariance, hermitian=True)
         return last.same_kind and float(rest @ weight @ rest) < SETTLED**2
 
     @property
     def next(self) -> Config:
-        """Optics to follow the tracks with: what was learned, and what is to come where known."""
+        """Optics for the next round: those learned last, extrapolated where the share is known."""
         last = self.all[-1]
         if self.share is None:
             return last.after
@@ -105,7 +105,7 @@ class Rounds:
         return with_settings(last.after, values)
 
     def error_of(self, taken: Round) -> FloatArray:
-        """Give what later rounds changed of a round, and others would, shape (n,)."""
+        """Change of a result by later rounds, those to come included, shape (n,)."""
         last = self.all[-1]
         names = taken.found.names
         rest = dict(zip(last.found.names, self.to_come.tolist(), strict=True))
@@ -114,7 +114,7 @@ class Rounds:
 
 
 def _change(before: Config, after: Config, names: Sequence[str]) -> FloatArray:
-    """Change of parameters, the short way round where they are angles."""
+    """Change of parameters; of angles, the shorter way round."""
     was, now = settings_of(before), settings_of(after)
     out = np.array([now[name] - was[name] for name in names], dtype=float)
     for i, name in enumerate(names):

@@ -1,11 +1,12 @@
-"""Light that goes on changing: at the place of a particle that is there, or as it comes.
+"""Steps whose light goes on changing, because the particle is there already or lands slowly.
 
-The light of a particle that settles, bleaches or breathes changes again and again at its place, and
-each change is found as a step of its own.  A second particle at the very place of a first one is
-rare, and cannot be told from that.
+The light of a particle that settles, bleaches or breathes changes repeatedly at its place, and each
+change is found as a step.  A second particle at exactly the same place is rare, and cannot be told
+from that.
 
-Where particles take their time to settle, the rise of a faint one drowns in the noise of its
-frames: it is fitted as a step, and its mass is too small.  That is known from the bright ones.
+If particles take several frames to land, the rise of a faint one drowns in the noise of single
+frames.  It is then fitted as a step, and its mass is too small.  Bright ones show that this
+happens.
 """
 
 from __future__ import annotations
@@ -22,19 +23,23 @@ from iscat_analysis.records import BoolArray, Status
 SAME_NM = 150.0
 """Distance within which two steps are at one place."""
 
-_MUCH = 3.0  # times a step's own mass that a particle must have, whose light the step may be of
-_ALIKE = 3.0  # ratio of masses up to which two steps close in time may be the halves of one
-_SEEN = 10.0  # log-likelihood by which a rise is expected to be told from a step, to be always seen
+# Mass of a particle over that of a step, from which on the step may be a change of its light.
+_LEAST_MASS_RATIO = 3.0
+# Ratio of masses up to which two steps close in time may be two halves of one landing.
+_MOST_MASS_RATIO = 3.0
+# Expected gain in log-likelihood of a rise over a step, from which on rises are always seen.
+_LEAST_GAIN_SEEN = 10.0
 _FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
-_SEEN_TO_GO_ON = 0.1  # share of rising steps that go on, beyond which all may; 0.002 by chance
+# Share of rising steps that go on rising, beyond which all may; by chance it is 0.002.
+_LEAST_SHARE_CONTINUING = 0.1
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
 def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
-    """Tell which steps of a landing movie may be changes of a particle that is there.
+    """Flag steps that may be changes of the light of a particle that is there already.
 
-    These are the much smaller ones while it is there, and of two alike in sign, mass and place that
-    follow each other within one window, both.
+    These are steps much smaller than that particle.  Of two steps of the same sign, mass and place
+    within one window, both are flagged.
 
     Shapes: result (rows,).
     """
@@ -55,25 +60,24 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
         near = apart < max(window[i], window[j])
         there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
         gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
-        if (there or near) and not gone and abs(mass[i]) > _MUCH * abs(mass[j]):
+        if (there or near) and not gone and abs(mass[i]) > _LEAST_MASS_RATIO * abs(mass[j]):
             flagged[real[j]] = True
-        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _ALIKE * abs(mass[j]):
+        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _MOST_MASS_RATIO * abs(mass[j]):
             flagged[real[[i, j]]] = True
     return flagged
 
 
-def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
-    """Tell which steps may rise as others do, unseen; and over how many frames those rise.
+def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]:
+    """Flag steps that may rise slowly without showing it, and give the duration of rises.
 
-    Where many of those that rise go on rising after their lines, all may.
-
-    A line over r frames and the step nearest to it differ by r/12 times the squared signal-to-noise
-    ratio of one frame, of which the log-likelihood is half.
+    If many of the visible rises go on rising after the end of their lines, all steps may.  A line
+    over r frames and the nearest step differ by r/12 times the squared signal-to-noise ratio of one
+    frame, half of which is the gain in log-likelihood.
 
     Shapes: result (rows,).
     """
     nothing = np.zeros(len(table), dtype=bool), 0.0
-    rise = np.nan_to_num(told.rise_frames)
+    rise = np.nan_to_num(evidence.rise_frames)
     rising = rise > 0
     if rising.sum() < _FEWEST:
         return nothing
@@ -81,17 +85,17 @@ def may_rise(table: pd.DataFrame, told: Evidence) -> tuple[BoolArray, float]:
     mass, crb = (table[name].to_numpy(float) for name in ("mass_kda", "crb_mass_kda"))
     before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
     one2 = (mass / crb) ** 2 * (before + after) / (before * after)
-    seen = np.nan_to_num(one2) * frames / 24 > _SEEN
+    seen = np.nan_to_num(one2) * frames / 24 > _LEAST_GAIN_SEEN
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
-    many = (goes_on & rising).sum() >= max(_FEWEST, _SEEN_TO_GO_ON * rising.sum())
+    many = (goes_on & rising).sum() >= max(_FEWEST, _LEAST_SHARE_CONTINUING * rising.sum())
     alike = rising if many else nothing[0]
     return (~rising & ~seen) | alike, frames
 
 
-def rise_said(frames: float, unseen: int, rising: int, rows: int) -> str:
-    """Say that particles take their time; empty where none does."""
+def rise_message(frames: float, unseen: int, rising: int, rows: int) -> str:
+    """Say that particles take several frames to land; empty where they do not."""
     if not frames:
         return ""
     also = f"; {unseen} that may rise on unseen are flagged changing" if unseen else ""

@@ -1,4 +1,4 @@
-"""Three ways to look at some frames: as a landing movie, over a background, and one by one."""
+"""The searches of a preview, one for each background mode, and what they find."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.moving_field import (
     LEAST_FRAMES,
+    initial_background,
     load_field,
-    opening_ground,
     search_frames,
-    track_scene,
+    tracking_context,
 )
 
 FOUND_COLUMNS = ("x_px", "y_px", "snr", "contrast", "mass_kda")
@@ -106,25 +106,25 @@ class Look:
         ConfigError
             The threshold is not positive.
         """
-        return self.search(positive(self.threshold if threshold is None else threshold))
+        return self.search(positive_threshold(self.threshold if threshold is None else threshold))
 
 
 class Search(Protocol):
-    """One way to search; each belongs to a kind of movie."""
+    """A search for one background mode."""
 
     window: int
     longest: int
     frames: tuple[int, int]
 
     def context(self, window: int) -> AnalysisContext:
-        """Give models and threshold for windows of a length."""
+        """Give models and threshold for windows of `window` frames."""
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the frames around one."""
+        """Search the frames around one."""
 
 
 class LandingSearch:
-    """What lands or leaves between two windows of a landing movie."""
+    """Searches for particles that land or leave between two windows."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self.frames = first, last = fitted_frames(movie, config)
@@ -145,7 +145,7 @@ class LandingSearch:
         self.context = context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the windows before and after the boundary at which a frame begins."""
+        """Compare the windows before and after the boundary at which a frame begins."""
         first, last = self.frames
         stride = stride_of(window)
         frame = min(max(frame, first + stride), last - stride)
@@ -184,7 +184,7 @@ class LandingSearch:
             peaks = find_steps(chunk, matched, snr, effective, threshold)
             sieve = SidelobeFilter(chunk.first, stride, window, context.roi_px)
             sign, scale = reported_steps(context), context.model.scale
-            return _listed(
+            return _candidate_table(
                 (p.x_px, p.y_px, p.snr, float(context.contrasts(np.asarray(p.amplitude))),
                  math.copysign(float(scale.mass(np.asarray(abs(p.amplitude)))), p.amplitude))
                 for p in sieve.sift(peaks, (), snr)[0]
@@ -197,8 +197,8 @@ class LandingSearch:
         )  # fmt: skip
 
 
-class BoundSearch:
-    """What is there in some frames and was not in the background."""
+class BeforeAfterSearch:
+    """Searches for particles that were not in the background."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -229,7 +229,7 @@ class BoundSearch:
         return self._context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at the frames from one on, over the background."""
+        """Compare the frames from one on with the background."""
         context, known = self._context, self._windows
         frame = min(max(frame, self.frames[0]), self.frames[1] - window)
         part = measure_windows(
@@ -257,7 +257,7 @@ class BoundSearch:
                 (c.x_px, c.y_px, c.snr, context.model.peak_contrast(c.z_nm, c.mass_kda), c.mass_kda)
                 for c in found
             ]
-            return _listed(r for r in rows if context.additive or wanted * r[3] >= 0)
+            return _candidate_table(r for r in rows if context.additive or wanted * r[3] >= 0)
 
         return Look(
             frame, known.frames_before if known.n_before else None, windows.frames_after,
@@ -266,7 +266,7 @@ class BoundSearch:
 
 
 class MovingSearch:
-    """What is in one frame and not in the median of the frames around it."""
+    """Searches single frames for particles that are not in the median of the frames around."""
 
     def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
         self._movie = steady(movie, lines, camera)
@@ -276,7 +276,7 @@ class MovingSearch:
         self.longest = last - first
         self.window = min(AROUND, self.longest)
         shape = (movie.shape[1], movie.shape[2])
-        self._context = track_scene(config, shape, max(last - first, 1))
+        self._context = tracking_context(config, shape, max(last - first, 1))
 
         @lru_cache(1)
         def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
@@ -284,7 +284,7 @@ class MovingSearch:
                 field = load_field(
                     self._context, self._movie, camera, span, self._check, pool, silent
                 )
-                return field, opening_ground(config, field)
+                return field, initial_background(config, field)
 
         self._background = background
 
@@ -293,7 +293,7 @@ class MovingSearch:
         return self._context
 
     def look(self, frame: int, window: int) -> Look:
-        """Look at one frame over the median of those around it."""
+        """Compare one frame with the median of those around it."""
         first, last = self.frames
         window = max(window, min(LEAST_FRAMES, last - first))
         frame = min(max(frame, first), last - 1)
@@ -314,7 +314,7 @@ class MovingSearch:
                 )  # fmt: skip
             mass = np.asarray(context.model.scale.mass(found.strength))
             each = zip(found.x_px, found.y_px, found.snr, found.z_nm, mass, strict=True)
-            return _listed(
+            return _candidate_table(
                 (x, y, snr, context.model.peak_contrast(float(z), float(m)), m)
                 for x, y, snr, z, m in each
             )
@@ -329,15 +329,15 @@ def _with_threshold(context: AnalysisContext, threshold: float) -> AnalysisConte
     return replace(context, templates=replace(context.templates, threshold=threshold))
 
 
-def _listed(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
-    """Make a table, strongest first."""
+def _candidate_table(rows: Iterable[tuple[float, ...]]) -> pd.DataFrame:
+    """Make a table of candidates, the strongest first."""
     values = np.array([tuple(map(float, row)) for row in rows]).reshape(-1, len(FOUND_COLUMNS))
     order = np.argsort(-np.abs(values[:, FOUND_COLUMNS.index("snr")]), kind="stable")
     return pd.DataFrame(values[order], columns=list(FOUND_COLUMNS))
 
 
-def positive(threshold: float) -> float:
-    """Refuse a threshold that is none."""
+def positive_threshold(threshold: float) -> float:
+    """Refuse a threshold that is no positive number."""
     if not (math.isfinite(threshold) and threshold > 0):
         raise ConfigError(f"threshold = {threshold:g} must be a positive signal-to-noise ratio")
     return threshold
