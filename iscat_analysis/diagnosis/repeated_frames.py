@@ -72,8 +72,7 @@ def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:
     before, after = frame_ranges(movie, config)
     spans = [span for span in (before, after) if span is not None]
     used = np.concatenate([np.arange(*span) for span in spans])
-    beyond = max(span[1] for span in spans) > movie.shape[0]
-    if beyond or np.unique(used).size < used.size:  # which is refused where they are summed
+    if used.max() >= movie.shape[0] or np.diff(used).min(initial=1) < 1:  # refused later
         return KeptFrames(movie, config, config)
     kept = [span[0] + np.flatnonzero(~_repeats(movie, camera, span)) for span in spans]
     numbers = np.concatenate(kept)
