@@ -31,6 +31,7 @@ _CLEAR = 5.0  # standard deviations of a cell
 _STEP_SHARE, _STEP_EVEN = 0.6, 0.15  # of the cells that a break changes, and how evenly (Gauss: ⅓)
 _STEP_SIZE = 0.1  # of the pattern's contrast, which changes in a break
 _LASTING, _LASTING_SHARE = 3, 0.2  # groups through which many cells go on changing
+_LASTING_SUM = 0.8  # and these shares in all; of a few bright particles, one after the other, 0.5
 _LASTING_SIZE = 0.05  # of the pattern's contrast, from one group to the next
 _MORE = 0.05  # of the cells, from where a change has begun
 _SUDDEN = 0.7  # of a change, which one frame makes
@@ -185,6 +186,7 @@ def _runs(cells: FloatArray) -> list[tuple[int, int]]:
         lasting = (
             last - first >= _LASTING
             and float(share[first:last].max()) > base + _LASTING_SHARE
+            and float(np.sum(share[first:last] - base)) > _LASTING_SUM
             and float(np.median(size)) > _LASTING_SIZE
         )
         if sudden.any() or lasting:

@@ -119,7 +119,9 @@ def test_a_break_is_named_left_out_and_the_rest_is_right(
     assert sum(timeline["events"]["ok"]) == len(found)
 
 
-@pytest.mark.parametrize("kind", ["quiet", "drift", "landings", "heavy", "flicker", "dark"])
+@pytest.mark.parametrize(
+    "kind", ["quiet", "drift", "landings", "heavy", "bright", "flicker", "dark"]
+)
 def test_what_is_no_break(kind: str) -> None:
     light = _light(1).copy()
     y, x = np.indices((SIDE, SIDE))
@@ -135,6 +137,11 @@ def test_what_is_no_break(kind: str) -> None:
     if kind == "heavy":  # one of 30 %, with rings
         away = np.hypot(x - 30, y - 34)
         light[150:] *= 1 - 0.3 * np.exp(-away / 5) * np.cos(away / 1.5)
+    if kind == "bright":  # a dozen of 10 %, whose rings reach over the field
+        for _ in range(12):
+            a, b = rng.uniform(0, SIDE, 2)
+            away = np.hypot(y - a, x - b)
+            light[rng.integers(FRAMES) :] *= 1 - 0.1 * np.exp(-away / 5) * np.cos(away / 1.5)
     if kind == "flicker":
         light *= rng.uniform(0.7, 1.3, (FRAMES, 1, 1))
     if kind == "dark":
