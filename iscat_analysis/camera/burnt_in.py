@@ -66,7 +66,7 @@ class PatchedFrames:
         """Do nothing: the movie has an owner."""
 
 
-def text_said(text: BoolArray, name: str) -> str:
+def text_message(text: BoolArray, name: str) -> str:
     """Say where text is burnt in.
 
     Shapes: `text` (y, x).

@@ -85,7 +85,7 @@ class LearnedCamera:
     padded: int = 0
 
     @property
-    def padding(self) -> str:
+    def padding_message(self) -> str:
         """Say that the camera's bits are not the lowest; empty where they are."""
         if not self.padded:
             return ""

@@ -51,8 +51,8 @@ class Break:
     cause: str
 
     @property
-    def said(self) -> str:
-        """Give it in words."""
+    def description(self) -> str:
+        """Describe it in words."""
         if self.start == self.stop:
             return f"{self.cause} at frame {self.start}"
         return f"{self.cause} in frames {self.start}:{self.stop}, which are left out"
@@ -77,7 +77,7 @@ class Stretches:
             return ""
         parts = ", ".join(f"{a}:{b}" for a, b in self.kept)
         return (
-            f"{name}: {'; '.join(one.said for one in self.breaks)}: frames before and after are "
+            f"{name}: {'; '.join(one.description for one in self.breaks)}: frames before and after are "
             f"not compared with each other, and {parts} are analysed"
         )
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.calibration.mass import with_standards
-from iscat_analysis.camera.burnt_in import text_said, text_summary, without_text
+from iscat_analysis.camera.burnt_in import text_message, text_summary, without_text
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
@@ -86,9 +86,9 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         run.warn(f"{movie.name}: {text}")
     if known.text is not None:
         stored = without_text(stored, known.text, camera)
-        run.warn(text_said(known.text, movie.name))
-    if known.padding:
-        run.notify(f"{movie.name}: {known.padding}")
+        run.warn(text_message(known.text, movie.name))
+    if known.padding_message:
+        run.notify(f"{movie.name}: {known.padding_message}")
     if auto:
         run.notify(f"{movie.name}: {known.description}")
     whole, kept = movie, None

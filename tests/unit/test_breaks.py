@@ -18,6 +18,8 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.stretches import find_stretches
 from iscat_analysis.diagnosis.turns import channels_of
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.report.movie_figure import movie_figure
+from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.study.simulate import Movie
 
 Counts = NDArray[np.uint16]
@@ -117,6 +119,12 @@ def test_a_break_is_named_left_out_and_the_rest_is_right(
     timeline = result.summary["timeline"]
     assert any(each["start"] == one["start"] for each in timeline["intervals"])
     assert sum(timeline["events"]["ok"]) == len(found)
+    for model, said in ((LeftOut, left_out), (Timeline, timeline)):
+        assert model.model_validate(said).model_dump(mode="json") == said
+    figure = movie_figure(result.analysis)
+    rows = [axes.get_ylabel().split("\n")[0].strip(",") for axes in figure.axes]
+    assert rows == ["light", "noise", "focus", "drift", "events"]
+    assert {axes.get_xlim() for axes in figure.axes} == {(0.0, FRAMES)}  # one axis
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,9 @@ def test_a_drivers_gain_is_per_count_of_the_camera(shift: int) -> None:
     measured = learn_camera(movie, CameraConfig(), (0, 40), metadata=replace(said, offset_adu=None))
     gain = measured.numbers["gain_e_per_adu"]
     assert abs(gain.value - GAIN / 2**shift) < 5 * gain.se
-    assert bool(measured.padding) == bool(shift)
+    assert bool(measured.padding_message) == bool(shift)
     if shift:
-        assert measured.padding.startswith("all counts are multiples of 16, as where 12 bits")
+        assert measured.padding_message.startswith(
+            "all counts are multiples of 16, as where 12 bits"
+        )
     assert isinstance(measured.camera, Camera)
