@@ -76,9 +76,10 @@ class Stretches:
         if not self.breaks:
             return ""
         parts = ", ".join(f"{a}:{b}" for a, b in self.kept)
+        breaks = "; ".join(one.description for one in self.breaks)
         return (
-            f"{name}: {'; '.join(one.description for one in self.breaks)}: frames before and after are "
-            f"not compared with each other, and {parts} are analysed"
+            f"{name}: {breaks}: frames before and after are not compared with each other, and "
+            f"{parts} are analysed"
         )
 
     @property
