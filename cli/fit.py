@@ -20,6 +20,7 @@ from iscat_cli.options import (
     SchedulerOption,
     SetOption,
     WorkersOption,
+    channel_of,
     command,
     frame_range,
 )
@@ -86,6 +87,12 @@ def fit(
             metavar="A:B", help="Frames of the background, before the particles bound, half-open."
         ),
     ] = None,
+    channels: Annotated[
+        str | None,
+        typer.Option(
+            metavar="N:K", help="Of N channels whose frames take turns, analyse channel K, from 0."
+        ),
+    ] = None,
     settings: SetOption = None,
     posterior: Annotated[
         bool | None,
@@ -133,7 +140,7 @@ def fit(
         (stack,) = stacks
         from iscat_analysis.config import load_config
 
-        changes = _changes(settings, mode, frames, background, posterior, workers)
+        changes = _changes(settings, mode, frames, background, channels, posterior, workers)
 
         from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside
         from iscat_analysis.reading import is_file
@@ -194,6 +201,7 @@ def _changes(
     mode: Mode | None,
     frames: str | None,
     background: str | None,
+    channels: str | None,
     posterior: bool | None,
     workers: int | None,
 ) -> list[str]:
@@ -205,6 +213,8 @@ def _changes(
         changes.append(f"fit.frames={list(frame_range('--frames', frames))}")
     if background is not None:
         changes.append(f"background.frames={list(frame_range('--background', background))}")
+    if channels is not None:
+        changes.append(f"camera.channels={list(channel_of(channels))}")
     if posterior is not None:
         changes.append(f"posterior.enabled={str(posterior).lower()}")
     if workers is not None:

@@ -151,6 +151,19 @@ def frame_range(option: str, text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
+def channel_of(text: str) -> tuple[int, int]:
+    """Read how many channels take turns, and which one is meant, ``"N:K"``."""
+    from iscat_analysis.errors import ConfigError
+
+    match = re.fullmatch(r"\s*(\d{1,4})\s*:\s*(\d{1,4})\s*", text, flags=re.ASCII)
+    if match is None:
+        raise ConfigError(
+            f"--channels {text}: write it as N:K, how many channels take turns and which one is "
+            "analysed, from 0, as in --channels 2:0"
+        )
+    return int(match[1]), int(match[2])
+
+
 def with_workers(settings: list[str] | None, workers: int | None) -> list[str]:
     """Add the number of threads to changes of the configuration, last, so that they win."""
     return [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]

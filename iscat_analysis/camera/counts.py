@@ -110,9 +110,27 @@ def rounding_variance_adu2(counts: NDArray[Any]) -> float:
 
     Twelve bits that are stored as sixteen have steps of 16 counts.
     """
+    return count_step(counts) ** 2 / 12
+
+
+def count_step(counts: NDArray[Any]) -> int:
+    """Give the largest number that all counts are multiples of; 0 of no integers.
+
+    Shapes: `counts` (t, y, x).
+    """
     if not np.issubdtype(counts.dtype, np.integer) or not counts.size:
-        return 0.0
-    return float(np.gcd.reduce(counts[0], axis=None)) ** 2 / 12
+        return 0
+    return int(np.gcd.reduce(counts[0], axis=None))
+
+
+def padded_bits(counts: NDArray[Any]) -> int:
+    """Tell how many low bits of all counts are empty, as where 12 bits are stored as 16; 0: none.
+
+    Shapes: `counts` (t, y, x).
+    """
+    step = count_step(counts)
+    empty = (step & -step).bit_length() - 1 if step > 0 else 0
+    return empty if 1 < empty < 8 * counts.dtype.itemsize - 1 else 0
 
 
 def camera_from_config(config: CameraConfig, shape_yx: tuple[int, int], dtype: DTypeLike) -> Camera:
@@ -216,7 +234,17 @@ def check_counts(
         if low < highest_floor:
             _refuse_negative(frame, floor, where)
         full = low == high >= converter_ceiling(frame)
-        if full or (low >= lowest_ceiling and bool(np.all(frame >= ceiling))):
+        beyond = low >= lowest_ceiling and bool(np.all(frame >= ceiling))
+        if beyond and low < high and camera.well_depth_e is not None:  # full pixels are alike
+            raise DataError(
+                f"{where} has {low:g} to {high:g} counts, all beyond camera.well_depth_e = "
+                f"{camera.well_depth_e:g} with camera.gain_e_per_adu = "
+                f"{float(np.mean(camera.gain_e_per_adu)):.4g} and camera.offset_adu = "
+                f"{float(np.mean(camera.offset_adu)):.4g}, but they differ, as those of full "
+                "pixels would not: correct these numbers, or leave them out to have gain and "
+                "offset measured"
+            )
+        if full or beyond:
             raise DataError(
                 f"{where} is saturated throughout; lower the exposure or the laser power, "
                 "or correct camera.well_depth_e"
@@ -299,7 +327,11 @@ def converter_ceiling(counts: NDArray[Any]) -> float:
     if not np.issubdtype(counts.dtype, np.integer) or not counts.size:
         return math.inf
     top = int(counts.max())
-    if top < 255 or top & (top + 1) or np.count_nonzero(counts == top) < CEILING_REPEATS:
+    step = top & -top  # twelve bits may stand in the high bits of sixteen
+    full = top // step if top > 0 else 0
+    if full < 255 or full & (full + 1) or np.count_nonzero(counts == top) < CEILING_REPEATS:
+        return math.inf
+    if step > 1 and int(np.bitwise_or.reduce(counts, axis=None)) % step:
         return math.inf
     return float(top)
 

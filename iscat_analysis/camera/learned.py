@@ -17,9 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.camera.burnt_in import find_text, patched, without_text
 from iscat_analysis.camera.calibration.laws import Law, find_law
 from iscat_analysis.camera.calibration.transfer import Transfer, measure_transfer
-from iscat_analysis.camera.counts import Camera, camera_from_config, rounding_variance_adu2
+from iscat_analysis.camera.counts import (
+    Camera,
+    camera_from_config,
+    padded_bits,
+    rounding_variance_adu2,
+)
 from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.response import Response, full_scale, linear, response_of
@@ -28,7 +34,7 @@ from iscat_analysis.camera.successive import averaged_noise
 from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import CountSource, StackMetadata
+from iscat_analysis.records import BoolArray, CountSource, StackMetadata
 
 MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", "metadata"
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
@@ -51,6 +57,7 @@ _FINE = 1e4  # times the variance of rounding, from where that has no part in th
 _COARSE = 0.16  # of a squared step: less noise is lost in rounding
 _LEAST_JITTER_SHARE = 0.03  # of the noise, from where motion of the pattern is taken off before
 _TURNS = 3
+_WORD = 16  # bits of most files
 _RESOLVED_PIXEL = 0.4  # of λ/NA, below which pixels are finer than any detail of light
 _FOURTH = 70.0  # sum of the squares of 1, −4, 6, −4, 1: the norm of both axes together
 
@@ -74,6 +81,20 @@ class LearnedCamera:
     messages: tuple[str, ...]
     level_e: float = 0.0
     response: Response | None = None
+    text: BoolArray | None = None
+    padded: int = 0
+
+    @property
+    def padding_message(self) -> str:
+        """Say that the camera's bits are not the lowest; empty where they are."""
+        if not self.padded:
+            return ""
+        return (
+            f"all counts are multiples of {2**self.padded}, as where "
+            f"{_WORD - self.padded} bits stand in the high bits of {_WORD}: a gain of a data "
+            f"sheet, per count of the camera, is to be divided by {2**self.padded}, an offset "
+            "multiplied; what the file's metadata say is taken so"
+        )
 
     @property
     def description(self) -> str:
@@ -116,15 +137,19 @@ def with_camera(
     movie: Stack, config: Config, span: tuple[int, int]
 ) -> tuple[Stack, Config, LearnedCamera]:
     """Apply the response curve to a movie, and set the numbers of its camera."""
+    text = find_text(movie, span)
     movie = linear(movie, config.camera)
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
     resolved = pixel_nm < _RESOLVED_PIXEL * optics.wavelength_nm / optics.na
     learned = learn_camera(
-        movie, config.camera, span,
+        movie if text is None else patched(movie, text), config.camera, span,
         additive=optics.scheme == "darkfield",
         moving=config.fit.mode == "track" and resolved,
         metadata=movie.metadata,
     )  # fmt: skip
+    if text is not None:
+        movie = without_text(movie, text, learned.camera)
+        learned = replace(learned, text=text)
     return movie, config.model_copy(update={"camera": learned.config}), learned
 
 
@@ -163,6 +188,7 @@ def learn_camera(
         messages=tuple(found.messages),
         level_e=found.transfer.level if found.transfer else 0.0,
         response=found.response(),
+        padded=padded_bits(counts) if counts.dtype.itemsize * 8 == _WORD else 0,
     )
 
 
@@ -256,10 +282,11 @@ class _Learning:
 
     def take_metadata(self, metadata: StackMetadata) -> None:
         """Take the numbers that the driver of the camera wrote into the file."""
-        for key in ("gain_e_per_adu", "offset_adu"):
+        step = 2 ** padded_bits(self.counts)  # whose driver counts in its own bits
+        for key, per in (("gain_e_per_adu", 1 / step), ("offset_adu", step)):
             value = getattr(metadata, key)
             if value is not None and key in self.free:
-                self._set(key, value, 0.0, METADATA)
+                self._set(key, value * per, 0.0, METADATA)
 
     def take_dark(self, dark: NDArray[Any]) -> None:
         """Take offset and read noise from frames without light.

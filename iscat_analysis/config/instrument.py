@@ -12,6 +12,7 @@ from iscat_analysis.config.field import FIELD_TERMS, FieldTerms, Share, Size
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
+    ChannelOf,
     Finite,
     NonNegative,
     Positive,
@@ -302,6 +303,11 @@ class CameraConfig(Section):
     )
     well_depth_e: Positive | None = Field(
         None, description="full well: counts at or above it are flagged as saturated"
+    )
+    channels: ChannelOf | None = Field(
+        None,
+        description="[2, 0]: frames of two channels take turns, and those of the first are a movie "
+        "of their own, with numbers and times of their own",
     )
     exposure_ms: Positive | None = Field(None, description="absent: taken from the metadata")
     frame_rate_hz: Positive | None = Field(None, description="absent: taken from the metadata")

@@ -114,6 +114,21 @@ def _kind_of_frames(frames: Any) -> str:
     return "literal" if isinstance(frames, str) and frames == ALL else "tuple"
 
 
+MOST_CHANNELS = 16
+"""Channels whose frames take turns, at most."""
+
+
+def _one_of_them(channel: tuple[int, int]) -> tuple[int, int]:
+    channels, which = channel
+    if not (2 <= channels <= MOST_CHANNELS and 0 <= which < channels):
+        raise ValueError(
+            f"[{channels}, {which}] must be how many channels take turns, 2 to {MOST_CHANNELS}, "
+            "and which one is analysed, from 0, as in [2, 0]"
+        )
+    return channel
+
+
+ChannelOf = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_one_of_them)]
 FrameRange = Annotated[tuple[int, int], BeforeValidator(_two), AfterValidator(_ordered)]
 FramesOrAll = Annotated[
     Annotated[FrameRange, Tag("tuple")] | Annotated[Literal["all"], Tag("literal")],

@@ -13,6 +13,8 @@ from iscat_analysis.camera.processed import Processing
 from iscat_analysis.camera.response import Response
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
+from iscat_analysis.diagnosis.repeated_frames import KeptFrames
+from iscat_analysis.diagnosis.stretches import Stretches
 from iscat_analysis.fitting.background_mode import BackgroundMode
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Status
@@ -20,8 +22,9 @@ from iscat_analysis.records import Status
 
 @dataclass(frozen=True)
 class Prepared:
-    """A movie that can be searched."""
+    """A movie that can be searched; `whole` is all of it, `movie` what is analysed."""
 
+    whole: Stack
     movie: Stack
     steady: Stack
     config: Config
@@ -32,8 +35,10 @@ class Prepared:
     other_kind: str
     digest: Future[str]
     summary: Mapping[str, Any]
+    stretches: Stretches
     response: Response | None = None
     processing: Processing | None = None
+    kept: KeptFrames | None = None
 
     @property
     def flags(self) -> tuple[Status, ...]:

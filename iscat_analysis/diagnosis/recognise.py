@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import NO_CHANGES, Changes, find_changes, spot_of
-from iscat_analysis.records import FrameSource
+from iscat_analysis.records import FloatArray, FrameSource
 from iscat_analysis.search.sliding import summed
 
 MOST_FRAMES = 2000
@@ -29,6 +31,8 @@ LEAST_MOVING = 0.4
 more from 0.1 to 1 µm²/s.  Where landings crowd, one and a leaving to 70 pixels in 400 frames, it
 is 0.14, and 0.36 at most."""
 
+_DIM = 0.5  # of the usual light, below which changes are damped
+
 LARGEST_CHANCE = 0.03
 """A movie is said to be of the other kind where so many changes have a smaller chance than this."""
 
@@ -41,13 +45,14 @@ def look_at_changes(
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away
     images = np.empty((len(starts), *movie.shape[1:]), dtype=np.float32)
-    level, lit = np.zeros(movie.shape[1:]), 0
+    level, power, lit = np.zeros(movie.shape[1:]), 0.0, 0
     saturated = np.zeros(movie.shape[1:], dtype=np.bool_)
     for first in starts:
         counts, highest = summed(movie.read(first, first + BLOCK))
         saturated |= camera.saturated(highest)
         light = camera.to_electrons(counts / BLOCK)
         if light.mean() > 0:
+            power += light.mean()
             light /= light.mean()
             level += light
             images[lit] = light
@@ -57,9 +62,23 @@ def look_at_changes(
     images, level = images[:lit], level / lit
     usable = (level > 0.1 * np.median(level)) & ~saturated
     images /= np.where(usable, level, 1.0).astype(np.float32)
-    images[:, ~usable] = 1.0
+    images -= 1
+    images *= _damping(np.where(usable, level, 0.0) * power / lit, camera)
+    images += 1
     pixel = config.camera.pixel_size_nm or config.optics.wavelength_nm / config.optics.na
     return find_changes(images, spot_of(config.optics.wavelength_nm, config.optics.na, pixel))
+
+
+def _damping(light_e: FloatArray, camera: Camera) -> NDArray[np.float32]:
+    """Give what keeps the noise of dim pixels, as around a round beam, to that of half the light.
+
+    Shapes: `light_e`, result (y, x).
+    """
+    read = camera.read_variance_e2((light_e.shape[0], light_e.shape[1]))
+    half = _DIM * float(np.median(light_e[light_e > 0])) if (light_e > 0).any() else 1.0
+    sharp = light_e / np.sqrt(np.maximum(light_e + read, 1.0))
+    enough = half / math.sqrt(max(half + float(read.mean()), 1.0))
+    return np.minimum(sharp / enough, 1.0).astype(np.float32)
 
 
 def as_landing(changes: Changes, name: str) -> str:

@@ -261,6 +261,7 @@ def calibrate_movie(
 ) -> OpticsCalibration:
     """Measure the optics of an open movie."""
     groups = free_groups(free)
+    movie = movie.channel(config.camera.channels)
     if focus_step_nm is not None:
         _check_step(focus_step_nm, movie.shape[0])
     config, notes = resolve_metadata(config, movie.metadata)

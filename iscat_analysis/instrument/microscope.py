@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -199,11 +198,8 @@ def _centre(
 
     From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
     """
-    starts = [
-        replace(sight, x_nm=sight.x_nm + x, y_nm=sight.y_nm + y)
-        for x in _STARTS_NM
-        for y in _STARTS_NM
-    ]
+    sight = sight.placed(sight.x_nm, sight.y_nm)
+    starts = [sight.placed(sight.x_nm + x, sight.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
 
     def misfit(one: ParticleImage) -> float:
         return goodness(one, model)[0]

@@ -139,6 +139,7 @@ def measure_template(
     notify: Callable[[str], None] | None = None,
 ) -> MeasuredPicture:
     """Measure the picture of a particle in an open movie."""
+    movie = movie.channel(config.camera.channels)
     config, notes = resolve_metadata(config, movie.metadata)
     for note in notes:
         if notify is not None:

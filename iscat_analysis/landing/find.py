@@ -9,7 +9,7 @@ configuration alone, so a finished one can be kept on disk and a resumed run giv
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -68,6 +68,7 @@ def find_landings(ready: Prepared, run: Run) -> DetectionResult:
             lines=ready.lines,
             executor=run.executor,
             opening=ready.opening,
+            stretches=ready.stretches.kept,
         )
     except FloodError as error:  # what seems to be noise is then particles
         raise FloodError(ready.other_kind) if ready.other_kind else error from None
@@ -85,7 +86,7 @@ def with_learned_heights(ready: Prepared, run: Run) -> Config:
     particle = config.particle
     if not particle.height_is_open or config.fit.mode != "mass":
         return config
-    first, last = fitted_frames(ready.movie, config)
+    first, last = ready.stretches.main
     some = config.fit.model_copy(update={"frames": (first, min(last, first + HEIGHT_FRAMES))})
     trial = config.model_copy(update={"fit": some})
     found = analyse_landings(
@@ -132,19 +133,24 @@ def analyse_landings(
     lines: Lines | None = None,
     executor: Executor | None = None,
     opening: NoiseSurvey | None = None,
+    stretches: Sequence[tuple[int, int]] = (),
 ) -> DetectionResult:
-    """Find and fit every particle that lands or leaves."""
+    """Find and fit every particle that lands or leaves, in each stretch of a movie by itself."""
     executor = executor or LocalExecutor()
     first, last = fitted_frames(movie, config)
+    stretches = stretches or ((first, last),)
+    total = sum(stop - start for start, stop in stretches)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     if opening is None:
         reader = reader_of(frames, config, camera, (first, last))
         opening = survey_noise(reader, config)
     reader, noise, window = opening.reader, opening.noise, opening.window
+    if (reader.first, reader.last) != (first, last):  # it was surveyed in one stretch
+        reader = reader_of(frames, config, camera, (first, last))
     for text in noise.messages_of(movie.name):
         warn(text)
     stride = stride_of(window)
-    count = boundaries(last - first, window)
+    count = sum(boundaries(stop - start, window) for start, stop in stretches)
     posterior = config.samples_posterior
     sampling = config.posterior.model_copy(update={"enabled": posterior})
     config = config.model_copy(update={"posterior": sampling})
@@ -153,13 +159,17 @@ def analyse_landings(
             config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
         )
     prepare(context)
-    plan = plan_chunks(reader, config, window, stride)
+    plan = [
+        part
+        for stretch in stretches
+        for part in plan_chunks(reader, config, window, stride, stretch)
+    ]
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
     movie_job = ChunkSetting(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
-    merged = MergedChunks(reader.shape)
+    merged = MergedChunks(reader.shape, [stop for _, stop in stretches])
     interrupted = False
     with threads(executor.threads(config.compute.workers, len(plan))) as pool:
 
@@ -186,8 +196,8 @@ def analyse_landings(
         try:
             with closing(_finished(finish, len(plan), executor, merged, posterior)) as finished:
                 for frames_done, stopped in finished:
-                    if frames_done < last - first:
-                        progress("landing", frames_done, last - first)
+                    if frames_done < total:
+                        progress("landing", frames_done, total)
                     if stopped:
                         interrupted = True
                         break
@@ -196,12 +206,12 @@ def analyse_landings(
             interrupted = True
     forgetting = start_in_thread(reader.forget)
     fits, views, repeats = merged.result()
-    light, drift = merged.light(), merged.drift()
+    light, drift, begin = merged.light(), merged.drift(), stretches[0][0]
     forgetting.result()
     if not interrupted:  # and their memory is free again
-        progress("landing", last - first, last - first)
+        progress("landing", total, total)
     wanted = config.background.follows_pattern
-    for text in frame_warnings(movie.name, merged, drift, light, first, window, corrected=wanted):
+    for text in frame_warnings(movie.name, merged, drift, light, begin, window, corrected=wanted):
         warn(text)
     searched = merged.searched().summary(_median_snr(fits), context.templates.threshold, stride)
     if text := searched_warning(movie.name, searched):
@@ -235,7 +245,7 @@ def analyse_landings(
         image=context.contrasts(merged.image),
         compared=Compared(
             frames_before=(0, 0),
-            frames_after=(first, first + light.size),
+            frames_after=(begin, begin + light.size),
             power_ratio=1.0,
             power=light / np.nanmean(light) if np.isfinite(light).any() else light,
             masked_pixels=merged.masked_pixels,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -52,8 +54,9 @@ class FinishedChunk:
 class MergedChunks:
     """Finished chunks, in order."""
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    def __init__(self, shape: tuple[int, int], ends: Sequence[int] = ()) -> None:
         self._done: list[FinishedChunk] = []
+        self._ends = set(ends)  # of the stretches of the movie
         self._dated: dict[int, NDArray[np.int64]] = {}
         self._strongest = np.zeros((2, *shape))
         self.sampled = 0
@@ -85,7 +88,7 @@ class MergedChunks:
         if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
             kept = tuple(replace(view, clip=None) for view in kept)
         ends = done.ends_e
-        if len(self._done) > 1:
+        if self._done and not self._opens(len(self._done) - 1) and not self._closes(self._done[-1]):
             self._done[-1] = replace(self._done[-1], ends_e=small)
         self._done.append(replace(done, strongest=small, views=kept, ends_e=ends))
 
@@ -128,9 +131,30 @@ class MergedChunks:
         """Which part of field and time was searched."""
         return Searched.joined([d.searched for d in self._done if d.searched is not None])
 
+    def _opens(self, number: int) -> bool:
+        """Whether a stretch begins with this chunk."""
+        return number == 0 or self._closes(self._done[number - 1])
+
+    def _closes(self, done: FinishedChunk) -> bool:
+        """Whether a stretch ends with this chunk."""
+        return done.core[1] in self._ends
+
+    def _in_place(self, values: Sequence[NDArray[Any]], between: Any) -> NDArray[Any]:
+        """Put what each chunk says of its frames in their order, and something between stretches.
+
+        Shapes: result (t,).
+        """
+        if not self._done:
+            return np.empty(0)
+        first = self._done[0].core[0]
+        out = np.full(self._done[-1].core[1] - first, between)
+        for done, own in zip(self._done, values, strict=True):
+            out[done.core[0] - first : done.core[0] - first + len(own)] = own
+        return out
+
     def light(self) -> FloatArray:
         """Light of the finished frames; NaN where one was left out."""
-        return np.concatenate([np.empty(0), *(done.light for done in self._done)])
+        return self._in_place([done.light for done in self._done], np.nan)
 
     def left_out(self) -> int:
         """Frames that are zero or repeat the one before."""
@@ -138,7 +162,7 @@ class MergedChunks:
 
     def repeats(self) -> NDArray[np.int64]:
         """Frames left out, counted from the first of the movie's part that was read."""
-        good = np.concatenate([np.empty(0, dtype=np.bool_), *(d.good for d in self._done)])
+        good = self._in_place([done.good for done in self._done], True)
         return np.flatnonzero(~good.astype(np.bool_))
 
     def trajectory(self) -> Trajectory | None:
@@ -170,13 +194,19 @@ class MergedChunks:
         return [done.core for done in self._done if done.trajectory is None]
 
     def drift(self) -> list[float] | None:
-        """Shift (y, x) of the fixed pattern from the first frames to the last [px]."""
+        """Shift (y, x) of the fixed pattern from the first frames to the last [px].
+
+        It is that of all stretches together: from one to the next there is nothing to follow.
+        """
         if not self._done:
             return None
         way = self.trajectory()
         if way is not None:
             return [float(d) for d in way.shift_px[-1]]
-        dy, dx = measure_drift(self._done[0].ends_e[0], self._done[-1].ends_e[1])
+        first = [done for k, done in enumerate(self._done) if self._opens(k)]
+        last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
+        moved = [measure_drift(a.ends_e[0], b.ends_e[1]) for a, b in zip(first, last, strict=True)]
+        dy, dx = np.sum(moved, axis=0).tolist()
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 
     @property

@@ -8,7 +8,7 @@ short, or whose description announces more than it holds, is refused and never a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from iscat_analysis.movie.mapped import HDF5_SIGNATURE
 from iscat_analysis.movie.mapped_frames import open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
+from iscat_analysis.movie.side_files import with_side_files
 from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
 from iscat_analysis.reading import open_regular
 from iscat_analysis.records import StackMetadata
@@ -149,7 +150,7 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
                 "by one are joined first (in Fiji: File > Import > Image Sequence, then Save As > "
                 "Tiff), and all movies of a folder are analysed by `iscat batch`"
             )
-        return Stack(path, open_zarr(path, part), part=part, files=files_of(path))
+        return _stack(path, open_zarr(path, part), part, files_of(path))
     if is_pipe:  # which would keep whoever opens it waiting
         raise DataError(
             f"{path}: is a pipe or a device, and a movie is read more than once: save it as a "
@@ -167,17 +168,25 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
     if signature == HDF5_SIGNATURE:
         from iscat_analysis.movie.datasets import open_hdf5  # h5py takes long
 
-        return Stack(path, open_hdf5(path, part), part=part)
+        return _stack(path, open_hdf5(path, part), part)
     if part:
-        return Stack(path, open_raw(path, part), part=part)
+        return _stack(path, open_raw(path, part), part)
     if description_of(path) is not None:
         recorded = open_recorded(path)
-        return Stack(path, recorded, files=recorded.files)
+        return _stack(path, recorded, files=recorded.files)
     reader = READERS.get(signature[:4])
     if reader is None:
         raise DataError(f"{path}: {_refusal(path, signature)}")
     frames = reader(path)
-    return Stack(path, frames, files=frames.files if isinstance(frames, FileSet) else None)
+    return _stack(path, frames, files=frames.files if isinstance(frames, FileSet) else None)
+
+
+def _stack(
+    path: Path, frames: Frames, part: str = "", files: Sequence[Path] | None = None
+) -> Stack:
+    """Make the movie of a file, with what is known of its recording."""
+    known = with_side_files(frames.metadata, path)
+    return Stack(path, frames, part=part, files=files, metadata=known)
 
 
 def _refusal(path: Path, signature: bytes) -> str:

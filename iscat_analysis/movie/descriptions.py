@@ -15,6 +15,7 @@ from typing import Any
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.clock import measure_clock
+from iscat_analysis.movie.driver_names import told_by
 from iscat_analysis.records import StackMetadata
 
 TIME_FROM_HEIGHTS = (
@@ -43,7 +44,6 @@ _AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "positi
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
-_DCAM_CONVERSION = ("CONVERSION FACTOR COEFF", "CONVERSION FACTOR OFFSET")  # Hamamatsu's driver
 _STRAIGHT_LINE = "0"  # number of ImageJ's calibration function c0 + c1·stored
 _ELECTRONS = {"e", "e-", "electron", "electrons", "photoelectron", "photoelectrons"}
 _COUNTS = {"", "gray value", "gray values", "count", "counts", "adu", "dn"}
@@ -74,6 +74,7 @@ class Hints:
     wavelength_nm: float | None = None
     na: float | None = None
     magnification: float | None = None
+    binning: float | None = None
 
 
 @dataclass(frozen=True)
@@ -208,17 +209,12 @@ def micro_manager_hints(
     interval = find("Interval_ms")
     if interval is not None and (exposure is None or interval >= exposure) and ticks is None:
         rate = positive(1e3 / interval)
-    gain, offset = conversion_of(begin)
+    told = told_by(begin)
     return Hints(
-        "micromanager", pixel, pixel, exposure_ms=exposure, frame_rate_hz=rate, ticks=ticks,
-        gain_e_per_adu=gain, offset_adu=offset,
+        "micromanager", pixel, pixel, exposure_ms=exposure,
+        frame_rate_hz=rate or told.frame_rate_hz, ticks=ticks,
+        gain_e_per_adu=told.gain_e_per_adu, offset_adu=told.offset_adu, binning=told.binning,
     )  # fmt: skip
-
-
-def conversion_of(properties: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """Read gain and offset that Hamamatsu's driver gives among its properties."""
-    gain, offset = (_driver_number(properties, name) for name in _DCAM_CONVERSION)
-    return gain, offset if gain is not None else None
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
@@ -261,6 +257,7 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
             "wavelength_nm": hint.wavelength_nm,
             "na": hint.na,
             "magnification": hint.magnification,
+            "binning": hint.binning,
         }
         fresh = {key: n for key, n in given.items() if n is not None and key not in found}
         if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
@@ -299,12 +296,6 @@ def _json_object(text: str) -> dict[str, Any]:
 def _mm_value(value: object) -> object:
     """Unwrap a value that Micro-Manager 2 wraps as a property of a device."""
     return value.get("PropVal") if isinstance(value, dict) else value
-
-
-def _driver_number(properties: Mapping[str, Any], name: str) -> float | None:
-    """Read a property of the one camera that has it, as ``Camera-CONVERSION FACTOR COEFF``."""
-    found = [value for key, value in properties.items() if str(key).upper().endswith(name)]
-    return _mm_number(found[0]) if len(found) == 1 else None
 
 
 def _mm_number(value: object) -> float | None:

@@ -23,11 +23,11 @@ from iscat_analysis.movie.descriptions import (
     LENGTH_NM,
     TIME_S,
     Hints,
-    conversion_of,
     inverse,
     positive,
     time_axis,
 )
+from iscat_analysis.movie.driver_names import LARGEST_NA, told_by
 from iscat_analysis.reading import is_file
 
 _OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")
@@ -35,7 +35,6 @@ _AXES = ("T", "Z", "C")
 _LEAST_IMAGE_BYTES = 50  # of the list of tags of an image: four of twelve bytes, and what ends it
 _MOST_DIGITS = 20  # a number of more is beyond every file, and stays so when cut
 _LONGEST = 64_000_000  # characters, some hundred for each frame
-_LARGEST_NA = 2.0  # of any objective, solid immersion aside
 
 
 @dataclass(frozen=True)
@@ -267,23 +266,25 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
     rate, ticks = measure_clock(_times_s(planes, f"The{axis}"))
     if ticks is None:
         rate = inverse(increment) or rate
-    gain, offset = conversion_of(_annotations(root))
+    told = told_by(_annotations(root))  # what other programs knew, and the schema has no place for
+    exposure = next((value for value in exposures if value is not None), None)
     objective = _objective(root, pixels)
     na = None if objective is None else positive(objective.get("LensNA"))
     return Hints(
         "ome",
         pixel_x_nm=_length(pixels, "PhysicalSizeX"),
         pixel_y_nm=_length(pixels, "PhysicalSizeY"),
-        exposure_ms=next((value for value in exposures if value is not None), None),
-        frame_rate_hz=rate,
+        exposure_ms=exposure or told.exposure_ms,
+        frame_rate_hz=rate or told.frame_rate_hz,
         ticks=ticks,
-        gain_e_per_adu=gain,
-        offset_adu=offset,
+        gain_e_per_adu=told.gain_e_per_adu,
+        offset_adu=told.offset_adu,
         wavelength_nm=_wavelength_nm(pixels),
-        na=na if na is not None and na < _LARGEST_NA else None,
+        na=na if na is not None and na < LARGEST_NA else None,
         magnification=None
         if objective is None
         else positive(objective.get("NominalMagnification")),
+        binning=_binning(pixels) or told.binning,
     )
 
 
@@ -301,6 +302,16 @@ def _objective(
     if settings is not None:
         found = [objective for objective in found if objective.get("ID") == settings.get("ID")]
     return found[0] if len(found) == 1 else None
+
+
+def _binning(pixels: ElementTree.Element) -> float | None:
+    """Give how many pixels along a side the camera joined, as in ``Binning="2x2"``."""
+    found = {
+        (settings.get("Binning") or "").partition("x")[0]
+        for channel in _children(pixels, "Channel")
+        for settings in _children(channel, "DetectorSettings")
+    }
+    return positive(found.pop()) if len(found) == 1 else None
 
 
 def _wavelength_nm(pixels: ElementTree.Element) -> float | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.records import FrameSource
+from iscat_analysis.movie.stack import Stack
+from iscat_analysis.records import FrameSource, StackMetadata
 
 S = TypeVar("S", bound=FrameSource)
 
@@ -39,3 +40,18 @@ class SelectedFrames(Generic[S]):
         runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
         parts = [self.source.read(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
         return np.concatenate(parts) if parts else self.source.read(0, 0)
+
+
+class StackFrames(SelectedFrames[Stack]):
+    """Some frames of a movie, which another one can be made of."""
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    metadata: ClassVar[StackMetadata] = StackMetadata()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+        return self.source.dtype
+
+    def close(self) -> None:
+        """Do nothing: the movie has an owner."""

@@ -111,7 +111,9 @@ def not_shared(path: Path) -> DataError:
     )
 
 
-def _reopened(address: Path, identity: str, left_out: LeftOut | None) -> Stack:
+def _reopened(
+    address: Path, identity: str, left_out: LeftOut | None, channel: tuple[int, int] | None
+) -> Stack:
     """Open a movie that another process has open."""
     from iscat_analysis.movie import open_stack
 
@@ -121,6 +123,7 @@ def _reopened(address: Path, identity: str, left_out: LeftOut | None) -> Stack:
     if stack.identity != identity:
         stack.close()
         raise not_shared(address)
+    stack = stack.channel(channel)
     return stack if left_out is None else stack.without(*left_out)
 
 
@@ -137,6 +140,8 @@ class Stack:
         What the movie is of the file, where it is not all: a dataset, or the shape of numbers.
     files : sequence of Path, optional
         The files that hold it; default `path`, none for an array.
+    metadata : StackMetadata, optional
+        What is known of the recording; default what `frames` have of it.
 
     Raises
     ------
@@ -145,10 +150,18 @@ class Stack:
     """
 
     def __init__(
-        self, path: Path, frames: Frames, *, part: str = "", files: Sequence[Path] | None = None
+        self,
+        path: Path,
+        frames: Frames,
+        *,
+        part: str = "",
+        files: Sequence[Path] | None = None,
+        metadata: StackMetadata | None = None,
     ) -> None:
         self._path = path
         self._frames = frames
+        self._metadata = frames.metadata if metadata is None else metadata
+        self._channel: tuple[int, int] | None = None
         self._part = part
         self._files = (path,) if files is None else tuple(files)
         self._states = states_of(self._files)
@@ -168,13 +181,13 @@ class Stack:
 
     def __reduce__(
         self,
-    ) -> tuple[Callable[[Path, str, LeftOut | None], Stack], tuple[Path, str, LeftOut | None]]:
+    ) -> tuple[Callable[..., Stack], tuple[Path, str, LeftOut | None, tuple[int, int] | None]]:
         """Let another process open the same file."""
         if not self._files or not self._own:
             raise TypeError(f"{self.name} is no file that another process could open")
         path = self._path.absolute()
         address = Path(f"{path}{MARK}{self._part}") if self._part else path
-        return _reopened, (address, self.identity, self._left_out)
+        return _reopened, (address, self.identity, self._left_out, self._channel)
 
     def __enter__(self) -> Self:
         return self
@@ -217,8 +230,8 @@ class Stack:
 
     @property
     def metadata(self) -> StackMetadata:
-        """Pixel size, exposure and frame rate, as far as the file gives them."""
-        return self._frames.metadata
+        """What the file, or a text beside it, says of the recording."""
+        return self._metadata
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -242,6 +255,33 @@ class Stack:
         seen._own = False
         return seen
 
+    def channel(self, chosen: tuple[int, int] | None) -> Stack:
+        """Give one of several channels whose frames take turns.
+
+        Parameters
+        ----------
+        chosen : (int, int) or None
+            How many channels there are, and which of them, from 0; None: the movie as it is.
+
+        Returns
+        -------
+        Stack
+            Under the same name; it reads from the same file.
+
+        Raises
+        ------
+        DataError
+            There are no two frames of it.
+        """
+        if chosen is None:
+            return self
+        from iscat_analysis.movie.channels import ChannelFrames
+
+        frames = ChannelFrames(self._frames, self.name, *chosen)
+        seen = self._again(frames, metadata=frames.with_times(self._metadata))
+        seen._own, seen._channel = self._own, chosen
+        return seen
+
     def without(self, pixels: BoolArray, dark: NDArray[Any]) -> Stack:
         """Set some pixels to dark counts, so that all stages leave them out.
 
@@ -258,13 +298,20 @@ class Stack:
             Under the same name; it reads from the same file.
         """
         seen = self._again(self._frames)
-        seen._own = self._own
+        seen._own, seen._channel = self._own, self._channel
+        if self._left_out is not None:  # some are left out already
+            known = np.zeros(pixels.shape, dtype=dark.dtype)
+            for mask, values in ((pixels, dark), self._left_out):
+                known[mask] = values
+            pixels = pixels | self._left_out[0]
+            dark = known[pixels]
         seen._left_out = pixels, dark
         return seen
 
-    def _again(self, frames: Frames) -> Stack:
+    def _again(self, frames: Frames, metadata: StackMetadata | None = None) -> Stack:
         """Give another one of the same file, which is hashed once for both."""
-        seen = Stack(self._path, frames, part=self._part, files=self._files)
+        metadata = metadata or self._metadata
+        seen = Stack(self._path, frames, part=self._part, files=self._files, metadata=metadata)
         seen._hashing, seen._states = self._hashing, self._states
         return seen
 

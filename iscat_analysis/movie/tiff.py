@@ -60,6 +60,7 @@ from iscat_analysis.movie.tiff_checks import (
     refuse_growth,
     refuse_overlap,
     refuse_unread_pixels,
+    refuse_volumes,
 )
 from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
 from iscat_analysis.records import InPlace, StackMetadata
@@ -198,6 +199,7 @@ def _open(
     file: tifffile.TiffFile, data: mmap.mmap, path: Path, member: bool
 ) -> TiffFrames | FileSet:
     images = list(_images(file, data, path))
+    refuse_volumes(file.pages[0], path)
     texts = images[0].texts
     ome_text = next((text for text in texts if is_ome(text)), None)
     notes: tuple[str, ...] = ()

@@ -89,17 +89,21 @@ def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) ->
             raise damaged(path, f"image {number} needs more than the {stored} bytes it stores")
 
 
+def refuse_volumes(page: tifffile.TiffPage, path: Path) -> None:
+    """Refuse images of several planes, which descriptions may count one by one."""
+    if page.imagedepth > 1:
+        raise DataError(
+            f"{path}: holds volumes ({page.imagedepth} planes per image); "
+            "export one plane per frame"
+        )
+
+
 def pixel_type(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
     """Give the type of the pixels, if the movie is of a kind that can be analysed."""
     if page.samplesperpixel > 1:
         raise DataError(
             f"{path}: holds colour images ({page.samplesperpixel} samples per pixel); "
             "export the camera's grey values"
-        )
-    if page.imagedepth > 1:
-        raise DataError(
-            f"{path}: holds volumes ({page.imagedepth} planes per image); "
-            "export one plane per frame"
         )
     if page.compression not in _LOSSLESS:
         name = getattr(page.compression, "name", "unknown")

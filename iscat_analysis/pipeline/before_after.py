@@ -77,7 +77,7 @@ def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
         else:
             found = _fit_together(ready, run, context, windows, noise, summary, pool)
     run.clock.lap("results")
-    return found
+    return found if ready.kept is None else ready.kept.put_back(found)
 
 
 def _sum_frames(ready: Prepared, run: Run) -> tuple[Prepared, Windows]:
@@ -120,8 +120,8 @@ def _background(
         )
     for text in (*noise.messages_of(movie.name), *pixel_warnings(*windows.left_out)):
         run.warn(text)
-    uneven = "" if still else uneven_warning(config, movie.name, windows)
-    for text in (repeats_warning(movie, windows), uneven):
+    uneven = uneven_warning(config, movie.name, windows) if still else ""
+    for text in ("" if still else repeats_warning(movie, windows), uneven):
         if text:
             run.warn(text)
     summary: dict[str, Any] = {}

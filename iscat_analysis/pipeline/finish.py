@@ -26,6 +26,7 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.pipeline.summary import species_of, summary_of
+from iscat_analysis.pipeline.timeline import timeline_of
 from iscat_analysis.records import (
     Analysis,
     Film,
@@ -71,7 +72,7 @@ def make_analysis(
     learned = bool(ready.summary.get("optics", {}).get("calibrated"))
     rows = reported_rows(found, learned_optics=learned)
     table, achieved, budget = rows.table, rows.achieved, rows.budget
-    recorded = ready.movie.metadata.ticks
+    recorded = ready.whole.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)
     if ticks is not None and table["frame"].notna().all():
         table = make_rows(table, {"tick": ticks[table["frame"].to_numpy(int)]})
@@ -137,7 +138,7 @@ def make_analysis(
     summary = summary_of(context, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
-        input_path=printable(str(ready.movie.path)),
+        input_path=printable(str(ready.whole.path)),
         input_sha256=ready.digest.result(),
         versions=versions(),
         seed=config.compute.seed if config.samples_posterior else None,
@@ -145,11 +146,12 @@ def make_analysis(
     )
     summary |= {
         **further,
+        **({"timeline": timeline} if (timeline := timeline_of(ready, found, table)) else {}),
         **({"budget": budget} if budget else {}),
         "input": {
             "path": provenance.input_path,
             "sha256": provenance.input_sha256,
-            "shape": list(ready.movie.shape),
+            "shape": list(ready.whole.shape),
         },
         "seed": provenance.seed,
         "versions": dict(provenance.versions),

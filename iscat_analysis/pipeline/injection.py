@@ -142,8 +142,12 @@ def injected(ready: Prepared, run: Run, found: DetectionResult) -> tuple[dict[st
     if not run.inject or found.interrupted:
         return {}, False
     try:
+        config = found.context.config
+        if ready.stretches.breaks:  # a stretch tells what the others would
+            fit = config.fit.model_copy(update={"frames": ready.stretches.main})
+            config = config.model_copy(update={"fit": fit})
         recovered = inject_and_recover(
-            ready.movie, found.context.config, ready.camera, found, run.inject,
+            ready.movie, config, ready.camera, found, run.inject,
             progress=run.progress, executor=run.executor,
         )  # fmt: skip
     except KeyboardInterrupt:

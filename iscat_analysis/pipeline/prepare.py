@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.calibration.mass import with_standards
+from iscat_analysis.camera.burnt_in import text_message, text_summary, without_text
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
@@ -26,7 +27,10 @@ from iscat_analysis.diagnosis.recognise import (
     changes_summary,
     look_at_changes,
 )
+from iscat_analysis.diagnosis.repeated_frames import without_repeats
 from iscat_analysis.diagnosis.stage import motion_message, with_drift_correction
+from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
+from iscat_analysis.diagnosis.turns import refuse_channels
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode, describe_background_mode
 from iscat_analysis.fitting.ranges import fitted_frames, tracked_frames
@@ -46,6 +50,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     """Load and calibrate a movie."""
     if config.optics.scheme == "darkfield":
         darkfield_photons(config.particle)
+    movie = movie.channel(config.camera.channels)
     config, notes = resolve_metadata(config, movie.metadata)
     for note in (*movie.notes, *notes):
         run.warn(note)
@@ -61,16 +66,39 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             'optics.psf = "measured": bounds are those of the template, and there is no quantum '
             "bound, because a picture does not say what light made it"
         )
+    stretches = Stretches((span,))
+    if mode == "sliding" and config.optics.scheme != "darkfield":
+        stretches = find_stretches(movie, span)
+    asked = config.fit.frames
+    if stretches.breaks:  # all that is learned of the movie is learned within one of its parts
+        run.warn(stretches.message(movie.name))
+        span = stretches.main
+        config = _within(config, span)
     start, stop = config.background.recorded or span
     stored, auto = movie, config.camera.assumed is not config.camera
     stated = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
+    begun = movie.read(start, max(start, min(stop, start + _FIRST_FRAMES, movie.shape[0])))
+    refuse_channels(begun, stated, movie.name)
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
     for text in (*known.messages, *law_messages(known)):
         run.warn(f"{movie.name}: {text}")
+    if known.text is not None:
+        stored = without_text(stored, known.text, camera)
+        run.warn(text_message(known.text, movie.name))
+    if known.padding_message:
+        run.notify(f"{movie.name}: {known.padding_message}")
     if auto:
         run.notify(f"{movie.name}: {known.description}")
+    whole, kept = movie, None
+    if mode == "fixed" and not tracked and config.optics.scheme != "darkfield":
+        kept = without_repeats(movie, config, camera)
+        movie, config = kept.movie, kept.config
+        if kept.message:
+            run.warn(kept.message)
+        span = fitted_frames(movie, config, config.background.recorded)
+        start, stop = config.background.recorded or span
     processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
@@ -135,10 +163,21 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
             run.warn(other_kind)
     if mode != "sliding":
         _refuse_what_only_slides(run, movie.name)
+    if stretches.breaks:
+        config = _within(config, asked)
+    summary["left_out"] = stretches.summary | {
+        "texts": [] if known.text is None else text_summary(known.text)
+    }
     return Prepared(
-        movie, steady, config, camera, mode, lines, noise_survey, other_kind, digest, summary,
-        known.response, processing,
+        whole, movie, steady, config, camera, mode, lines, noise_survey, other_kind, digest,
+        summary, stretches, known.response, processing, kept,
     )  # fmt: skip
+
+
+def _within(config: Config, frames: tuple[int, int] | None) -> Config:
+    """Look at some frames only."""
+    fit = config.fit.model_copy(update={"frames": frames})
+    return config.model_copy(update={"fit": fit})
 
 
 def _with_standards(config: Config, run: Run) -> Config:

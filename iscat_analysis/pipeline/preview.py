@@ -82,6 +82,7 @@ class Preview:
                 f"`movie` is {type(movie).__name__} and `config` {type(config).__name__}: give "
                 "what open_stack and configure return"
             )
+        movie = movie.channel(config.camera.channels)
         config, notes = resolve_metadata(config, movie.metadata)
         shape = (movie.shape[1], movie.shape[2])
         stated = camera_from_config(config.camera, shape, movie.dtype)

@@ -17,11 +17,13 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import refine_power
+from iscat_analysis.camera.burnt_in import find_text, without_text
 from iscat_analysis.camera.counts import Camera, camera_from_config
 from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.camera.response import linear
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.light import judge_light
+from iscat_analysis.diagnosis.repeated_frames import without_repeats
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import make_context
@@ -65,14 +67,21 @@ def redraw(
     summary: Mapping[str, Any],
 ) -> Redraw:
     """Make the function that draws the rows of a result."""
+    movie = movie.channel(config.camera.channels)
+    text = find_text(movie, config.background.recorded or fitted_frames(movie, config))
     movie = linear(movie, config.camera)
     camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
+    movie = movie if text is None else without_text(movie, text, camera)
+    way, additive = background_mode(config), config.optics.scheme == "darkfield"
+    if way == "fixed" and config.fit.mode != "track" and not additive:
+        kept = without_repeats(movie, config, camera)
+        movie, config = kept.movie, kept.config
     judged = judge_light(movie, config, camera)
     movie, lines = judged.movie, judged.lines
-    way = background_mode(config)
     if way == "sliding":
         window = int(summary["landing"]["window_frames"])
-        return _landings(movie, config, camera, lines, table, window)
+        stretches = summary.get("left_out", {}).get("analysed")
+        return _landings(movie, config, camera, lines, table, window, stretches or ())
     seen = steady(movie, lines, camera)
     if way == "tracks":
         blocks = int(summary["blocks"]["number"])
@@ -87,6 +96,7 @@ def _landings(
     lines: Lines | None,
     table: pd.DataFrame,
     window: int,
+    stretches: Sequence[Sequence[int]],
 ) -> Redraw:
     """Draw rows of a landing movie: the windows before and after each step."""
     first, last = fitted_frames(movie, config)
@@ -97,7 +107,9 @@ def _landings(
 
     def draw(row: int) -> EventView:
         frame = int(table["frame"].iloc[row])
-        span = max(frame - HALO * window, first), min(frame + HALO * window, last)
+        held = (span for span in stretches if span[0] <= frame < span[1])
+        begin, end = next(held, (first, last))
+        span = max(frame - HALO * window, begin), min(frame + HALO * window, end)
         with threads(config.compute.workers) as pool:
             chunk = reader.chunk(span, stride, pool)
             wanted = config.background.follows_pattern

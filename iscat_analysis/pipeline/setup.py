@@ -290,6 +290,7 @@ def _metadata_line(stack: Stack) -> str:
             ("wavelength_nm", "wavelength {:.4g} nm"),
             ("na", "NA {:.4g}"),
             ("magnification", "{:.4g}×"),
+            ("binning", "binning {:.4g}"),
             ("exposure_ms", "exposure {:.4g} ms"),
             ("frame_rate_hz", "{:.4g} frames per second"),
             ("gain_e_per_adu", "{:.4g} e per count"),

@@ -37,8 +37,11 @@ class StackMetadata:
         Numerical aperture of the objective.
     magnification : float or None
         Of the objective, as engraved.
+    binning : float or None
+        Pixels of the sensor along a side of one of the movie.
     source : str
-        Source of the metadata: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, ``"none"``…
+        Source of the metadata: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, the name
+        of a file beside it, ``"none"``…
     """
 
     pixel_size_nm: float | None = None
@@ -50,6 +53,7 @@ class StackMetadata:
     wavelength_nm: float | None = None
     na: float | None = None
     magnification: float | None = None
+    binning: float | None = None
     source: str = "none"
 
 

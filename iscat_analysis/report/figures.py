@@ -23,6 +23,7 @@ from iscat_analysis.report.budget import budget_figure
 from iscat_analysis.report.event_figures import HALO, scale_bar
 from iscat_analysis.report.field import field_axes
 from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
+from iscat_analysis.report.movie_figure import movie_figure
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.scales import display_range
 from iscat_analysis.report.spread import counted
@@ -58,7 +59,9 @@ def page_figures(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
     yield "budget", partial(budget_figure, analysis)
     yield "diagnostics", partial(diagnostics, analysis, table)
     power_known = np.isfinite(np.asarray(analysis.power, float))
-    if power_known.size > 1 and power_known.any():
+    if analysis.summary.get("timeline"):  # which has the power of every frame too
+        yield "movie", partial(movie_figure, analysis)
+    elif power_known.size > 1 and power_known.any():
         yield "power", partial(power, analysis)
 
 

@@ -25,6 +25,7 @@ from iscat_analysis.schemas.base import (
     row_model,
 )
 from iscat_analysis.schemas.calibration import OpticsParameter, Twin
+from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.schemas.tracks import Motion, Track
 
 if TYPE_CHECKING:
@@ -414,6 +415,8 @@ class Summary(Document):
     background: Background = maybe("Movies with background frames: noise and drift")
     landing: Landing = maybe("Landing movies: windows, search, noise and drift")
     injection: Injection = maybe("With --inject: known particles added to the movie")
+    left_out: LeftOut = maybe("Frames and pixels that are no measurement")
+    timeline: Timeline = maybe("Light, noise, focus, drift and events against frame")
     processing: Processed = maybe("If the frames were processed after the camera")
     changes: Changes = maybe("Landing movies and mode track: whether particles land or move")
     blocks: Blocks = maybe("Mode track: blocks of frames, each with its own background")

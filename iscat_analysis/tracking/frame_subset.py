@@ -8,7 +8,6 @@ what is left out is one of several frames.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
-from iscat_analysis.movie.selected_frames import SelectedFrames
-from iscat_analysis.records import BoolArray, FloatArray, StackMetadata, Windows
+from iscat_analysis.movie.selected_frames import StackFrames
+from iscat_analysis.records import BoolArray, FloatArray, Windows
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed
 
@@ -28,21 +27,6 @@ _READ = 64  # frames at a time
 _NAMED = 4
 
 IntArray = NDArray[np.int64]
-
-
-class _Frames(SelectedFrames[Stack]):
-    """Attributes as those of `iscat_analysis.camera.lines.SteadyFrames`."""
-
-    notes: ClassVar[tuple[str, ...]] = ()
-    metadata: ClassVar[StackMetadata] = StackMetadata()
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-        return self.source.dtype
-
-    def close(self) -> None:
-        """Do nothing: the movie has an owner."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +67,7 @@ def keep_frames(
     if good.all() or not good.any():
         return FrameSubset(movie, span)
     numbers = span[0] + np.flatnonzero(good)
-    seen = movie.seen_as(_Frames(movie, numbers))
+    seen = movie.seen_as(StackFrames(movie, numbers))
     missing, share = span[0] + np.flatnonzero(~good), float(np.mean(repeats & ~dark))
     many, is_, same = ("s", "are", "repeat") if len(missing) > 1 else ("", "is", "repeats")
     message = (

@@ -21,7 +21,7 @@ from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument import learning
 from iscat_analysis.instrument.learning import LEAST_TESTED, learn_optics
-from iscat_analysis.instrument.microscope import REJECTED_P, median_p
+from iscat_analysis.instrument.microscope import REJECTED_P, median_p, not_alone
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 
@@ -72,6 +72,16 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
         sights, _, _ = make_sights(changes, 8, seed=5, config=config)
         moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
         assert (median_p(moved, config)[0] > REJECTED_P) == fits
+
+
+def test_a_place_far_from_the_centre_of_its_picture_stops_nothing() -> None:
+    """A bright spot between two particles may be half a micron away from either."""
+    config = configuration()
+    sights, _, _ = make_sights({}, 6, seed=5, config=config)
+    far = [replace(sight, x_nm=500.0, y_nm=-500.0) for sight in sights[:2]]
+    pairs, median = not_alone([*sights[2:], *far], config)
+    assert not pairs
+    assert median > REJECTED_P
 
 
 def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage]:

@@ -11,7 +11,7 @@ from scipy.ndimage import shift
 from wanderers import wander
 
 from iscat_analysis import fit_movie
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera.counts import Camera, camera_from_config
 from iscat_analysis.diagnosis.changes import Changes, find_changes, spot_of
 from iscat_analysis.diagnosis.recognise import (
     BLOCK,
@@ -238,3 +238,22 @@ def test_pixels_that_blink_are_no_particles_that_move() -> None:
     changes = find_changes(_noisy(blocks, rng), SPOT)
     assert not as_moving(changes, "movie")
     assert changes.number <= 5  # at the border neighbours are missing
+
+
+def test_a_round_beam_on_a_larger_field_shows_no_motion() -> None:
+    """Where it is dim a contrast has more noise, which comes and goes from block to block."""
+    rng = np.random.default_rng(4)
+    y, x = np.indices((SIDE, SIDE))
+    beam = 1e5 * np.exp(-2 * ((x - 36) ** 2 + (y - 33) ** 2) / 25**2)
+    contrast = np.zeros((SIDE, SIDE))
+    counts = np.empty((600, SIDE, SIDE), dtype=np.uint16)
+    for frame in range(600):
+        if frame % 50 == 25:
+            contrast = contrast + _seen(rng.uniform(24, 48, 2), 480.0)
+        counts[frame] = np.round(rng.poisson(beam * (1 + contrast)) / 4 + 100)
+    config = make_config(background={"method": "sliding", "frames": None}, fit={"frames": None})
+    camera = Camera(4.0, 100.0, 2.0)
+    found = look_at_changes(Stack(counts), config, camera, (0, 600))
+    assert found.number >= 5
+    assert as_moving(found, "movie.tif") == ""
+    assert as_landing(found, "movie.tif") != ""

@@ -242,10 +242,14 @@ def counts_budget(config: Config) -> int:
 
 
 def plan_chunks(
-    reader: Reader, config: Config, window: int, stride: int
+    reader: Reader,
+    config: Config,
+    window: int,
+    stride: int,
+    stretch: tuple[int, int] | None = None,
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Divide a movie; block edges fall on the same frames in every chunk."""
-    first, last = reader.first, reader.last
+    """Divide a movie, or a stretch of it; block edges fall on the same frames in every chunk."""
+    first, last = stretch or (reader.first, reader.last)
     halo = math.ceil(HALO * window / stride) * stride
     budget = counts_budget(config)
     # beside its counts, a block holds its sum and its map (where the pattern's motion is divided
