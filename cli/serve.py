@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import DebugOption, QuietOption
+from iscat_cli.options import command
 
 EXAMPLE = """Example: the movies of a day.
 
@@ -19,8 +19,9 @@ finished, and can be gone on with.
 """
 
 
+@command
 def app(
-    context: typer.Context,
+    messages: Messages,
     folder: Annotated[
         Path, typer.Argument(metavar="[FOLDER]", help="Folder of movies; default this one.")
     ] = Path(),
@@ -31,15 +32,12 @@ def app(
             metavar="N", min=0, max=65535, help="Port to listen at; default a free one from 5006."
         ),
     ] = None,
-    quiet: QuietOption = False,
-    debug: DebugOption = False,
 ) -> None:
     """Open movies, analyse them and export figures in the browser, without programming.
 
     Listens on this machine alone, to whoever has the token in the address that it prints.
     """
-    messages = Messages(context.command_path, quiet=quiet)
-    with failures(messages, debug=debug):
+    with failures(messages):
         from iscat_analysis.errors import ConfigError
 
         try:
@@ -52,4 +50,4 @@ def app(
                 'pip install "iscat-analysis[app]"'
             ) from None
         messages.notify("Ctrl-C ends it")
-        serve(folder, port=port, say=print_result, warn=messages.error, debug=debug)
+        serve(folder, port=port, say=print_result, warn=messages.error, debug=messages.debug)

@@ -16,9 +16,9 @@ from iscat_analysis.camera.drift import measure_drift
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
-from iscat_analysis.fitting.moving_focus import DRIFT_FRAMES
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
+from iscat_analysis.optics.local import DRIFT_FRAMES
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 

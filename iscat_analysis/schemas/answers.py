@@ -115,9 +115,11 @@ class Kd(Document):
     inactive: float = key("Part of monomers, or of A, that does not bind; 0 where not fitted")
     inactive_se: Number = key("Its standard error; null where it was not fitted")
     inactive_p: Share = key("Chance of such a gain by an inactive part if there is none")
-    masses_kda: list[float] = key("Masses at which the species' peaks are highest [kDa], the complex last")
+    masses_kda: list[float] = key(
+        "Masses at which the species' peaks are highest [kDa], the complex last"
+    )
     width_kda: float = key("Width of the lightest species beside the events' own errors [kDa]")
-    tail_kda: float = key("Mean of the peaks' exponential tail, negative towards light ones [kDa]")
+    tail_kda: float = key("Mean of the peaks' exponential tail, negative to low masses [kDa]")
     limit_kda: Number = key(
         "Mass that is detected with probability 1/2, from the edge of the tables [kDa]"
     )
