@@ -173,6 +173,7 @@ def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     monkeypatch.setattr(config_module, "load_config", enough)
     monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", interrupt)
+    monkeypatch.setattr("tornado.platform.asyncio.BaseAsyncIOLoop.start", interrupt)
     return tmp_path
 
 
