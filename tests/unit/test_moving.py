@@ -566,7 +566,8 @@ def _along_paths(
     """Average over paths of variance q, and over a normal spread.
 
     At time t of the exposure, in units of it, a path lies about its mean with the variance
-    6 q (1/3 − t + t²).  Gauss–Hermite points along both axes.
+    6 q (1/3 − t + t²), the same before and after the middle: the second half stands for both.
+    Gauss–Hermite points along both axes.
     """
     points, weights = np.polynomial.hermite_e.hermegauss(9)
     weights = weights / weights.sum()
@@ -580,9 +581,9 @@ def _along_paths(
         )
         return np.asarray(sum(images))
 
-    times, parts = np.polynomial.legendre.leggauss(8)
+    times, parts = (half[4:] for half in np.polynomial.legendre.leggauss(8))
     spreads = 6 * q * (1 / 3 - (times + 1) / 2 + (times + 1) ** 2 / 4)
-    path = sum(part / 2 * normal(v) for v, part in zip(spreads, parts, strict=True))
+    path = sum(part * normal(v) for v, part in zip(spreads, parts, strict=True))
     return path, normal(q)
 
 

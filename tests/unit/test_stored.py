@@ -156,6 +156,7 @@ def test_particles_that_move_are_drawn_over_their_background(tmp_path) -> None:
         "calibration.gradient_per_kda": -3.1e-5,
         "particle.mass_kda": 400.0,
         "fit.mode": "track",
+        "track.free": "mass",
         "fit.roi_nm": 2000.0,
         "posterior.enabled": False,
         "simulation.shape": [36, 36],
