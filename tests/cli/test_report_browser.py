@@ -116,8 +116,8 @@ def written(
     """Let the commands write every kind of page, from small jobs."""
     folder = tmp_path_factory.mktemp("written")
     movie, shade, landing = (folder / f"{name}.tif" for name in ("movie", "dark", "landing"))
-    few = ["--config", str(sample_configs["landing"]), "--set", "simulation.count=12"]
-    few += ["--set", "simulation.frames=400"]
+    few = ["--config", str(sample_configs["landing"]), "--set", "simulation.count=6"]
+    few += ["--set", "simulation.frames=300", "--set", "simulation.shape=[80, 80]"]
     dark = 4 * np.random.default_rng(1).standard_normal((60, 64, 64))
     tifffile.imwrite(shade, np.rint(100 + dark).astype("uint16"))
     mass = np.random.default_rng(1).normal(np.repeat([66.0, 146.0, 480.0], 60), 8.0)

@@ -193,7 +193,7 @@ def test_why_nothing_can_be_followed_is_named(ringed: Wanderers) -> None:
 def test_a_flood_of_places_is_refused_before_all_are_fitted() -> None:
     """The pattern moves by 7 pixels in all, and each of its features looks like a particle."""
     species = ((MASS_KDA, 0.4, 4),)
-    movie = wander((120, 80, 80), seed=3, species=species, drift_nm_per_frame=(5.0, 0.0))
+    movie = wander((60, 80, 80), seed=3, species=species, drift_nm_per_frame=(10.0, 0.0))
     with pytest.raises(DataError, match=r"places in every frame of 45 um2 .* the light changes"):
         ia.fit_movie(movie.counts, settings=SETTINGS)
 
