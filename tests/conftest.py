@@ -34,10 +34,10 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_output", "test_tracked_optics", "test_report_browser", "test_app_browser",
-    "test_day", "test_moving",
-    "test_compilation", "test_equilibrium", "test_landing", "test_pipeline", "test_cluster",
-    "test_stored", "test_crowded", "test_focus_scan", "test_cli_help", "test_cli_contract",
+    "test_output", "test_day", "test_report_browser", "test_tracked_optics", "test_app_browser",
+    "test_moving", "test_compilation", "test_landing", "test_pipeline", "test_cluster",
+    "test_equilibrium", "test_crowded", "test_focus_scan", "test_cli_help", "test_cli_contract",
+    "test_stored",
     "test_report", "test_planes", "test_benchmark", "test_bad_input", "test_fuzz", "test_movers",
     "test_optics_calibration", "test_public", "test_arguments", "test_bounds_laws",
     "test_distribution", "test_posterior", "test_mass_calibration", "test_systematic",

@@ -65,7 +65,7 @@ def sketch(
 
 
 def without_images(*_: object) -> Figure:
-    """Take the place of `triptych`: the images of all events take half of the time of a small run."""
+    """Take the place of `triptych`: the images of events take half of the time of a small run."""
     return Figure()
 
 
