@@ -48,7 +48,7 @@ def _printed(capsys, *arguments: str) -> Any:
 
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
-        "batch", "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "init", "kd",
+        "batch", "benchmark", "bounds", "calibration", "camera", "challenge", "comparison", "fit", "init", "kd",
         "optics", "optics_bounds", "simulate", "species", "species_comparison", "summary",
         "template",
     }  # fmt: skip
