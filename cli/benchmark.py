@@ -24,14 +24,14 @@ from iscat_cli.options import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-EXAMPLE = """Example: a thousand repetitions of one experiment; then the estimators that can be
-named, and one's own simulation on the scale of the bounds.
+EXAMPLE = """Example: a thousand repetitions of one experiment; then the estimators
+that can be named, and your own simulation compared with the bounds.
 
     iscat benchmark --config setup.toml --out benchmark --trials 1000
 
     iscat benchmark --list
 
-    iscat benchmark --config setup.toml --truth truth.csv --results results.csv
+    iscat benchmark --config setup.toml --truth true.csv --results results.csv
 """
 
 MODES = ("mass", "localize", "joint")

@@ -23,7 +23,7 @@ from iscat_cli.options import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-SUMMARY = "Movies with a truth that is withheld, for any program; scores of its results."
+SUMMARY = "Make movies of withheld truth; score any program on them."
 
 MAKE_EXAMPLE = """Example: a hundred stacks of one particle each, and their truth.
 

@@ -43,7 +43,7 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
     power = light.mean(axis=1, keepdims=True)
     fresh = np.array([True, *(not np.array_equal(a, b) for a, b in pairwise(counts))])
     light, power = light[fresh], power[fresh]
-    if len(light) < 2 * _MOST or power.min() <= 0:
+    if len(light) < 2 * _MOST or not (np.isfinite(power) & (power > 0)).all():
         return 1
     light /= power
     apart = [

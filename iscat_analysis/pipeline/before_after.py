@@ -120,7 +120,7 @@ def _background(
         )
     for text in (*noise.messages_of(movie.name), *pixel_warnings(*windows.left_out)):
         run.warn(text)
-    uneven = uneven_warning(config, movie.name, windows) if still else ""
+    uneven = "" if still else uneven_warning(config, movie.name, windows)
     for text in ("" if still else repeats_warning(movie, windows), uneven):
         if text:
             run.warn(text)

@@ -168,7 +168,7 @@ def _experiment(config: Config, highest_nm: float) -> Experiment:
 def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
     config = configure(setup)
     name = config.fit.mode if mode is None else mode
-    if name not in ("mass", "localize", "joint"):
+    if not isinstance(name, str) or name not in ("mass", "localize", "joint"):
         raise ConfigError(f"mode = {name!r}: give mass, localize or joint")
     config = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": name})})
     return config, FREE_PARAMETERS[name]

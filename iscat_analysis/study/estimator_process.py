@@ -6,7 +6,7 @@ to another file as soon as a job is done.  What is there when the time is up cou
 
 from __future__ import annotations
 
-import contextlib
+import json
 import pickle
 import subprocess
 import sys
@@ -51,6 +51,18 @@ class Answer:
     processor_seconds: float = float("nan")
     peak_mb: float = float("nan")
 
+    def line(self) -> str:
+        """Write it as one line of JSON."""
+        columns = {name: values.tolist() for name, values in self.columns.items()}
+        return json.dumps({**vars(self), "columns": columns})
+
+    @classmethod
+    def of_line(cls, line: str) -> Answer:
+        """Read a line."""
+        found = json.loads(line)
+        columns = {name: np.array(values, float) for name, values in found["columns"].items()}
+        return cls(**{**found, "columns": columns})
+
 
 def run_estimator(
     estimator: Estimator,
@@ -87,12 +99,9 @@ def run_estimator(
 
 
 def _read(path: Path) -> list[Answer]:
-    """Read the answers that are whole."""
-    found = []
-    with path.open("rb") as file, contextlib.suppress(EOFError, pickle.UnpicklingError):
-        while True:
-            found.append(pickle.load(file))
-    return found
+    """Read the answers that are whole, of a process that runs what others wrote."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    return [Answer.of_line(line) for line in lines if line.endswith("\n")]
 
 
 def answer(estimate: Estimate, job: Job) -> Answer:
@@ -170,9 +179,9 @@ def main(request: str, answers: str) -> int:
     except Exception as error:
         sys.stderr.write(f"{first_line(error)}\n")
         return 1
-    with Path(answers).open("ab") as file:
+    with Path(answers).open("a", encoding="utf-8") as file:
         for job in jobs:
-            file.write(pickle.dumps(answer(estimate, job)))
+            file.write(f"{answer(estimate, job).line()}\n")
             file.flush()
     return 0
 

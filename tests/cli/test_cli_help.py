@@ -78,7 +78,7 @@ def laboratory(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> Path
     events = json.loads((folder / "challenge/truth.json").read_text(encoding="utf-8"))["events"]
     truth = pd.DataFrame([one for one in events if one["part"] == "stack"])
     truth = truth[["event", "x_nm", "y_nm", "mass_kda"]]
-    truth.to_csv(folder / "truth.csv", index=False)
+    truth.to_csv(folder / "true.csv", index=False)
     noisy = truth.assign(x_nm=truth["x_nm"] + random.normal(0, 9.0, len(truth)))
     noisy.to_csv(folder / "results.csv", index=False)
     (folder / "moving.iscat").mkdir()

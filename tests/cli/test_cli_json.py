@@ -48,9 +48,9 @@ def _printed(capsys, *arguments: str) -> Any:
 
 def test_schemas_are_schemas() -> None:
     assert set(schema_names()) == {
-        "batch", "benchmark", "bounds", "calibration", "camera", "comparison", "fit", "init", "kd",
-        "optics", "optics_bounds", "simulate", "species", "species_comparison", "summary",
-        "template",
+        "batch", "benchmark", "bounds", "calibration", "camera", "challenge", "comparison", "fit",
+        "init", "kd", "optics", "optics_bounds", "simulate", "species", "species_comparison",
+        "summary", "template",
     }  # fmt: skip
     for name in schema_names():
         jsonschema.Draft202012Validator.check_schema(schema(name))

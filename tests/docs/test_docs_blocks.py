@@ -31,7 +31,7 @@ def test_a_block_that_is_not_run_says_why_and_few_are() -> None:
     blocks = [block for page in PAGES for block in BLOCKS.blocks_of(page)]
     left_out = [block for block in blocks if block.not_run is not None]
     assert all(len(block.not_run.split()) > 3 for block in left_out)
-    assert len(left_out) <= 6
+    assert len(left_out) <= 7
     assert len(blocks) > 40
 
 

@@ -161,6 +161,8 @@ def _made() -> dict[str, Call]:
     fits = fits.assign(event=range(5), frame=np.arange(5), status="ok", flags="", particle=[0] * 5)
     small = {"camera.pixel_size_nm": 84.4, "bounds.pixels": 11}
     tiny = {"camera.pixel_size_nm": 84.4, "simulation.frames": 2, "simulation.shape": [8, 8]}
+    bench = {"camera": {"pixel_size_nm": 84.4}, "bounds": {"pixels": 11}}
+    truths = pd.DataFrame(rng.uniform(20, 60, (8, 3)), columns=["x_nm", "y_nm", "mass_kda"])
     absent = {"settings": dict(small), "out": "out", "overwrite": False}
     folder = Path("absent")
     return {
@@ -172,6 +174,10 @@ def _made() -> dict[str, Call]:
         "qcrb": (ia.qcrb, scope | {"photons_per_pixel": 1e4, "n_after": 5, "mode": "joint",
                                    "joint": True, "z_nm": 20.0, "mass_kda": 500.0,
                                    "focus_nm": -300.0}),
+        "bounds_for": (ia.bounds_for, {"setup": bench, "mode": "mass"}),
+        "efficiency": (ia.efficiency, {
+            "estimates": truths + rng.normal(0, 5, truths.shape), "truth": truths, "setup": bench,
+            "mode": "mass", "seed": 1}),
         "fit_rois": (ia.fit_rois, regions | {
             "mode": "mass", "power_ratio": None, "level": None, "masked": None, "saturated": None,
             "corners_px": np.zeros((2, 2)), "calibration": None, "workers": 1}),

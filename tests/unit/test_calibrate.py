@@ -220,9 +220,12 @@ def test_frames_without_information_are_refused() -> None:
     with pytest.raises(DataError, match="frame 1 is saturated throughout"):
         check_counts(counts, 0, "m.tif")
     counts = good()
-    counts[3] += 500
+    counts[3] = 1501
     camera = Camera(gain_e_per_adu=2.0, well_depth_e=2500.0)
     with pytest.raises(DataError, match="frame 3 is saturated throughout"):
+        check_counts(counts, 0, "m.tif", camera=camera)
+    counts[3] = good()[3] + 500
+    with pytest.raises(DataError, match=r"frame 3 has .* counts, all beyond .* but they differ"):
         check_counts(counts, 0, "m.tif", camera=camera)
 
 

@@ -90,7 +90,7 @@ def test_notes_tell_of_chance_and_of_the_scale(first: pd.DataFrame) -> None:
     table = first.assign(systematic_mass_kda=1.0)
     ia.compare_tables([table] * 7, k=2, notify=notes.append)
     assert any("by chance alone" in note for note in notes)
-    assert any("error of the mass scale" in note for note in notes)
+    assert any("that of the mass scale" in note for note in notes)
 
 
 def test_too_few_are_refused(first: pd.DataFrame) -> None:

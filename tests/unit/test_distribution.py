@@ -184,7 +184,7 @@ def test_one_event_apart_is_an_outlier() -> None:
     found = describe(np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=0)
     assert found.species["count"].iloc[-1] == pytest.approx(1)
     assert found.species["outlier"].tolist() == [False, False, True]
-    assert any("at 400 kDa is fewer than 3 events" in note for note in found.notes)
+    assert any("at 400 kDa there are fewer than 3 events" in note for note in found.notes)
     assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
 
 

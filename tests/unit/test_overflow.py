@@ -64,7 +64,7 @@ def test_a_movie_too_dark_to_show_its_particles_says_so() -> None:
     found = ia.fit_movie(dim.counts, settings={**SETTINGS, "camera.gain_e_per_adu": 1.0})
     assert not len(found.table)
     (said,) = (text for text in found.warnings if "no particle was found" in text)
-    numbers = r"over (\d+) e per .* by ([\d.]+) standard deviations, and ([\d.]+) are"
+    numbers = r"with (\d+) e per .* ratio of ([\d.]+) in a frame, and the threshold is ([\d.]+)"
     light, height, needed = map(float, re.findall(numbers, said)[0])
     assert light == pytest.approx(100, rel=0.05)
     assert height < needed
