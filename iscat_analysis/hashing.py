@@ -34,7 +34,7 @@ def states_of(files: Sequence[Path]) -> tuple[tuple[int, ...], ...]:
     for path in files:
         try:
             state = path.stat()
-        except OSError:
+        except (OSError, ValueError):  # of a name with NUL
             found.append(())
         else:
             found.append((state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns))

@@ -19,7 +19,7 @@ from iscat_analysis.bounds.optics_forecast import forecast_optics as _forecast
 from iscat_analysis.config import Config, configure
 from iscat_analysis.config.values import LARGEST_NM
 from iscat_analysis.executors import THREADS, open_executor
-from iscat_analysis.inference.checks import number_in, path_in
+from iscat_analysis.inference.checks import number_in, path_in, truth_in
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.movie import ArrayLike, open_stack
@@ -110,6 +110,7 @@ def fit_movie(
         "workers": workers,
     }
     resolved = _resolved(config, settings, given)
+    overwrite = truth_in("`overwrite`", overwrite)
     folder = None if out is None else path_in("`out`", out)
     if folder is not None:
         check_output(folder, overwrite)
@@ -174,6 +175,7 @@ def calibrate_optics(
         A setting is unknown or impossible, or cannot be calibrated.
     """
     resolved = configure(config, settings=settings)
+    overwrite = truth_in("`overwrite`", overwrite)
     if focus_step_nm is not None:
         number_in("`focus_step_nm`", focus_step_nm, least=-LARGEST_NM, most=LARGEST_NM)
     if out is not None:
@@ -230,7 +232,8 @@ def simulate_movie(
     """
     resolved = configure(config, settings=settings)
     if seed is not None:
-        number_in("`seed`", seed, least=0, whole=True)
+        seed = int(number_in("`seed`", seed, least=0, whole=True))
+    overwrite = truth_in("`overwrite`", overwrite)
     return write_stack(
         resolved, path_in("`path`", path), seed=seed, overwrite=overwrite, progress=progress
     )

@@ -283,7 +283,8 @@ def check_reaction(
         if parts > 1:
             raise ConfigError(f"`{names[1]}`: model ab needs the masses of A and B, as in 40,80")
         return
-    if not isinstance(masses_kda, (list, tuple, np.ndarray)) or len(masses_kda) != parts:
+    listed = isinstance(masses_kda, (list, tuple)) or np.ndim(masses_kda) == 1
+    if not listed or len(masses_kda) != parts:
         wanted = (
             "the mass of the monomer, as in 66" if parts == 1 else "those of A and B, as in 40,80"
         )

@@ -313,6 +313,7 @@ def _checked(fits: pd.DataFrame) -> pd.DataFrame:
     names = [*(name for name in EVENT_COLUMNS if name not in ("status", "flags")), "track"]
     refuse_twice(list(fits.columns), [*names, "status", "particle"], "`fits`")
     checked = fits.copy() if fits.index.is_unique else fits.reset_index(drop=True)
+    checked["status"] = checked["status"].astype(str)
     for name in set(names) & set(fits.columns):
         try:
             values = fits[name].to_numpy(dtype=np.float64, na_value=np.nan)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pandas as pd
 from iscat_analysis.bounds import Experiment, plan
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.study.limits import Limits, limits_at
@@ -119,13 +121,38 @@ def efficiency(
     (1968), section 2.4.2.
     """
     config, free = _resolved(setup, mode)
-    columns, truths = matched(pd.DataFrame(estimates), pd.DataFrame(truth), config, free)
+    seed = int(number_in("`seed`", seed, least=0, whole=True))
+    columns, truths = matched(_table("estimates", estimates), _table("truth", truth), config, free)
     limits = limits_of_many(config, free, truths)
     weights = resamples(len(truths), seed)
     scored = score_estimates(columns, truths, limits, weights)
     if not scored:
         raise DataError(f"estimates: has none of the columns {', '.join(free)}")
     return pd.DataFrame(scored.values(), index=pd.Index(scored.keys(), name="parameter"))
+
+
+def _table(name: str, value: Any) -> pd.DataFrame:
+    """Make a table of what is one, with columns of different names."""
+    if not isinstance(value, (pd.DataFrame, Mapping)):
+        raise ConfigError(f"`{name}`: is {type(value).__name__}; give a table with columns as x_nm")
+    try:
+        table = pd.DataFrame(value)
+    except (TypeError, ValueError) as error:
+        raise DataError(f"{name}: is no table ({error})") from None
+    twice = table.columns[table.columns.duplicated()]
+    if len(twice):
+        raise DataError(f"{name}: has two columns of the name {twice[0]}; rename one")
+    return table
+
+
+def _numbers(table: pd.DataFrame, name: str) -> FloatArray:
+    """Give the numbers of a column, NaN where a cell holds none.
+
+    Shapes: result (n,).
+    """
+    cells = table[name].map(lambda cell: cell if isinstance(cell, (Real, str)) else math.nan)
+    numbers: FloatArray = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
+    return numbers
 
 
 def limits_of_many(
@@ -168,8 +195,7 @@ def _experiment(config: Config, highest_nm: float) -> Experiment:
 def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
     config = configure(setup)
     name = config.fit.mode if mode is None else mode
-    if not isinstance(name, str) or name not in ("mass", "localize", "joint"):
-        raise ConfigError(f"mode = {name!r}: give mass, localize or joint")
+    choice_in("mode", name, ("mass", "localize", "joint"))
     config = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": name})})
     return config, FREE_PARAMETERS[name]
 
@@ -200,7 +226,7 @@ def matched(
     truths = np.empty((len(truth), 4))
     for k, name in enumerate(PARAMETERS):
         if name in truth:
-            truths[:, k] = pd.to_numeric(truth[name], errors="coerce")
+            truths[:, k] = _numbers(truth, name)
         elif name in ("x_nm", "y_nm") and name in estimates:
             raise DataError(f"truth: has no column {name}, which the estimates have")
         elif name == "mass_kda":
@@ -210,7 +236,7 @@ def matched(
     if not np.all(np.isfinite(truths)):
         raise DataError("truth: is not a finite number in every row")
     columns = {
-        name: pd.to_numeric(estimates[name], errors="coerce").to_numpy(dtype=float)
+        name: _numbers(estimates, name)
         for parameter in free
         for name in (parameter, f"sigma_{parameter}")
         if name in estimates

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -243,9 +244,16 @@ def _made() -> dict[str, Call]:
         "batch": (ia.batch, {
             "samples": folder, "out": "day", "settings": dict(small), "standards": [66.0],
             "kd": None, "only": None, "merge": False, "scheduler": "threads"}),
-        "watch": (ia.watch, {"folder": folder, "out": "day", "settings": dict(small),
+        "watch": (_watch, {"folder": folder, "out": "day", "settings": dict(small),
                              "interval_s": 1.0}),
     }  # fmt: skip
+
+
+def _watch(**arguments: Any) -> None:
+    """Watch a folder until the first wait: it would go on for ever, which is what it is for."""
+    stop = threading.Event()
+    stop.set()
+    ia.watch(**arguments, stop=stop)
 
 
 def _likelihood(*, theta: Any, **arguments: Any) -> None:
