@@ -544,6 +544,7 @@ def test_calibrants_of_the_other_sign_say_what_of_the_configuration_is_wrong(
     assert "`landing`" not in why
 
 
+@pytest.mark.large  # others give the bytes of one run with calibrations that are there
 def test_parts_share_the_calibrations(day: Path, tmp_path: Path) -> None:
     lab = tmp_path / "day"
     shutil.copytree(day, lab, ignore=shutil.ignore_patterns("out"))
