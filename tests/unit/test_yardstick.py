@@ -143,7 +143,7 @@ def test_tables_are_matched_by_event_or_refused(config, ideal) -> None:
         ia.efficiency(pd.concat([mixed, mixed]), numbered, config)
     with pytest.raises(ia.DataError, match="none of the columns"):
         ia.efficiency(pd.DataFrame({"event": range(COUNT)}), numbered, config)
-    with pytest.raises(ia.ConfigError, match="mass, localize or joint"):
+    with pytest.raises(ia.ConfigError, match="choose one of mass, localize, joint"):
         ia.efficiency(estimate, truth, config, mode="track")
 
 
