@@ -15,8 +15,8 @@ from iscat_analysis.records import FREE_PARAMETERS
 
 FloatArray = NDArray[np.float64]
 
-LARGEST_REGION = 10_000
-"""No region has more pixels along a side."""
+LARGEST_REGION = 1500
+"""Pixels along a side of a region, whose bounds take half a gigabyte."""
 
 
 def config_of(

@@ -426,7 +426,7 @@ def test_bad_setups_are_refused_by_every_piece(piece: str, changed: dict, messag
         ("psf", {"x_nm": -1e6}, r"x_nm = -1e\+06: give finite numbers of at most 100000"),
         ("psf", {"z_nm": 1e300}, r"z_nm = 1e\+300"),
         ("psf", {"mass_kda": 1e300}, r"mass_kda = 1e\+300: give finite numbers of at most 1e\+15"),
-        ("psf", {"pixels": 10**6}, "pixels = 1000000: give one whole number of at most 10000"),
+        ("psf", {"pixels": 10**6}, "pixels = 1000000: give one whole number of at most 1500"),
         ("crb", {"focus_nm": 1e9}, r"focus_nm = 1e\+09"),
         ("psf", {"optics": DARK}, "particle.photons_per_frame is needed"),
         ("crb", {"photons_per_pixel": 0.0}, "photons_per_pixel = 0"),
