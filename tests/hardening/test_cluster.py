@@ -218,6 +218,7 @@ def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
     assert _content(out) == _content(here)
 
 
+@pytest.mark.large
 def test_posteriors_are_those_of_one_process(cluster: Workers, landing: Path, monkeypatch) -> None:
     """How many are sampled in a chunk follows from those before it."""
     cluster.add(2)

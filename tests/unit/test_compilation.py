@@ -54,6 +54,7 @@ def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
     assert not said
 
 
+@pytest.mark.large
 def test_a_picture_is_compiled_without_those_of_other_kinds(tmp_path):
     code = """
 from iscat_analysis._kernels.lattice_rows import lattice_signal

@@ -531,6 +531,7 @@ def test_a_calibrant_that_fails_leaves_the_scale_as_configured_and_says_so(
     assert "as configured, because the day's calibration failed" in cautions
 
 
+@pytest.mark.large
 def test_calibrants_of_the_other_sign_say_what_of_the_configuration_is_wrong(
     day: Path, tmp_path: Path
 ) -> None:
