@@ -20,6 +20,7 @@ from iminuit.warnings import IMinuitWarning
 from iscat_analysis.records import BoolArray, FloatArray
 
 _FAST = 0  # strategy of Minuit that takes no further second derivatives
+_SILENT = -1  # it would print where a start is no maximum, which is no news
 _TOLERANCE = 0.01  # of Minuit: 1e-5 of a log-likelihood
 _INSIDE = 1e-3  # of its range that a start lies away from a limit, where Minuit sees no slope
 _AT_LIMIT = 1e-4  # of its range from a limit
@@ -92,6 +93,7 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
         )
     search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
     search.errors = _STEP * problem.scale
+    search.print_level = _SILENT
     held = reach == 0
     for place, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
         if held[place]:
