@@ -60,17 +60,10 @@ class Experiment:
         )
 
 
-def plan(
-    config: Config,
-    *,
-    model: ForwardModel | None = None,
-    scale: MassScale | None = None,
-    like: ForwardModel | None = None,
-) -> Experiment:
-    """Set up the experiment of ``[bounds]``."""
-    at, camera = config.bounds, config.camera.assumed
-    pixel_nm = camera.pixel_size_nm
-    if pixel_nm is None:
+def detector(config: Config) -> tuple[float, float]:
+    """Give the pixel [nm] and the read noise [e] of the camera, which bounds need as numbers."""
+    camera = config.camera.assumed
+    if camera.pixel_size_nm is None:
         raise ConfigError(
             "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
         )
@@ -79,6 +72,19 @@ def plan(
             f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
             "camera.read_noise_e = 1.5"
         )
+    return camera.pixel_size_nm, camera.read_noise_e
+
+
+def plan(
+    config: Config,
+    *,
+    model: ForwardModel | None = None,
+    scale: MassScale | None = None,
+    like: ForwardModel | None = None,
+) -> Experiment:
+    """Set up the experiment of ``[bounds]``."""
+    at = config.bounds
+    pixel_nm, read_noise_e = detector(config)
     half = at.pixels * pixel_nm / 2
     if max(abs(at.x_nm), abs(at.y_nm)) > half:
         raise ConfigError(
@@ -118,7 +124,7 @@ def plan(
             per_frame,
             n_before=at.n_before,
             n_after=at.n_after,
-            read_noise_e=camera.read_noise_e,
+            read_noise_e=read_noise_e,
         ),
         theta=theta,
         mass_kda=mass,

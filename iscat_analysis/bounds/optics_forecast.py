@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds.classical import event_bounds
-from iscat_analysis.bounds.experiment import expected_likelihood
+from iscat_analysis.bounds.experiment import detector, expected_likelihood
 from iscat_analysis.bounds.shared import displacement, eliminated, joint_information, shared_sigma
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
@@ -211,16 +211,7 @@ def _names(config: Config, free: str | Sequence[str] | None) -> tuple[str, ...]:
 
 
 def _model(config: Config) -> tuple[ForwardModel, PixelGrid]:
-    pixel, camera = config.camera.pixel_size_nm, config.camera.assumed
-    if pixel is None:
-        raise ConfigError(
-            "camera.pixel_size_nm is missing: give it, as in camera.pixel_size_nm = 84.4"
-        )
-    if isinstance(camera.read_noise_e, str):
-        raise ConfigError(
-            f"camera.read_noise_e = {camera.read_noise_e!r} is a map: bounds need a number, as in "
-            "camera.read_noise_e = 1.5"
-        )
+    pixel, _ = detector(config)
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     reach = grid.diagonal_nm / 2 + pixel
     return forward_model(config, reach, z_max_nm=config.particle.nominal_height_nm), grid

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, find_objects, label
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.movie.selected_frames import ChangedFrames
 from iscat_analysis.movie.stack import Stack
-from iscat_analysis.records import BoolArray, StackMetadata
+from iscat_analysis.records import BoolArray
 
 _FRAMES, _TOGETHER, _COUNTS = 128, 8, 2**24  # that are looked at, in groups all over the movie
 _FEWEST = 16
@@ -32,25 +33,11 @@ _MARGIN = 1  # pixel around a text, for letters that are smooth
 
 
 @dataclass(frozen=True, eq=False)
-class PatchedFrames:
+class PatchedFrames(ChangedFrames):
     """Frames whose text is covered with the rows beside it, which have the light of any."""
 
-    source: Stack
     rows: NDArray[np.int64]
     text: BoolArray
-
-    notes = ()
-    metadata = StackMetadata()
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows, columns."""
-        return self.source.shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-        return self.source.dtype
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
@@ -61,9 +48,6 @@ class PatchedFrames:
         y, x = np.nonzero(self.text)
         counts[:, y, x] = counts[:, self.rows[y, x], x]
         return counts
-
-    def close(self) -> None:
-        """Do nothing: the movie has an owner."""
 
 
 def text_message(text: BoolArray, name: str) -> str:

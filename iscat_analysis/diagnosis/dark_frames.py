@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import StackMetadata, Windows
+from iscat_analysis.movie.selected_frames import ChangedFrames
+from iscat_analysis.records import Windows
 from iscat_analysis.search.sliding import DARK, cut_off, well_lit
 from iscat_analysis.units import listed
 
@@ -21,30 +22,11 @@ _NAMED = 4
 
 
 @dataclass(frozen=True, eq=False)
-class _DarkFramesReplaced:
-    """A movie in which dark frames are replaced; attributes as those of a `Stack`."""
+class _DarkFramesReplaced(ChangedFrames):
+    """A movie in which dark frames are replaced."""
 
-    source: Stack
     frames: NDArray[np.int64]
     dark: NDArray[Any]
-
-    notes: ClassVar[tuple[str, ...]] = ()
-    metadata: ClassVar[StackMetadata] = StackMetadata()
-
-    @property
-    def name(self) -> str:
-        """What messages call it."""
-        return self.source.name
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Frames, rows, columns."""
-        return self.source.shape
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-        return self.source.dtype
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames, those that are dark as the camera sees the dark."""
@@ -54,9 +36,6 @@ class _DarkFramesReplaced:
             counts = counts.copy()
             counts[inside] = self.dark
         return counts
-
-    def close(self) -> None:
-        """Do nothing: the movie has an owner."""
 
 
 def without_cut_off(movie: Stack, camera: Camera, windows: Windows) -> tuple[Stack, str]:

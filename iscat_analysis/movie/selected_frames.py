@@ -1,4 +1,4 @@
-"""A selection of the frames of a movie."""
+"""Frames of a movie that another one is made of: some of them, or all with other counts."""
 
 from __future__ import annotations
 
@@ -12,6 +12,29 @@ from iscat_analysis.movie.stack import Stack
 from iscat_analysis.records import FrameSource, StackMetadata
 
 S = TypeVar("S", bound=FrameSource)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedFrames:
+    """Frames of a movie that another one can be made of; how they are read is added to it."""
+
+    source: Stack
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    metadata: ClassVar[StackMetadata] = StackMetadata()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self.source.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+        return self.source.dtype
+
+    def close(self) -> None:
+        """Do nothing: the movie has an owner."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,16 +65,5 @@ class SelectedFrames(Generic[S]):
         return np.concatenate(parts) if parts else self.source.read(0, 0)
 
 
-class StackFrames(SelectedFrames[Stack]):
+class StackFrames(SelectedFrames[Stack], ChangedFrames):
     """Some frames of a movie, which another one can be made of."""
-
-    notes: ClassVar[tuple[str, ...]] = ()
-    metadata: ClassVar[StackMetadata] = StackMetadata()
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the stored counts."""
-        return self.source.dtype
-
-    def close(self) -> None:
-        """Do nothing: the movie has an owner."""

@@ -16,9 +16,7 @@ from scipy.optimize import least_squares
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.study.setting import Setting
-
-PEAK_REACH_PX = 3.0
-"""The peak is sought this far from the start [pixels]."""
+from iscat_analysis.study.simple_estimators import REACH_PX, gaussian, gaussian_slopes
 
 _EVALUATIONS = 200
 
@@ -76,19 +74,11 @@ class Baselines:
         unit = float(np.max(np.abs(cut))) or 1.0
         cut = cut / unit
 
-        def bell(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-            u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
-            return u, v, np.exp(-(u**2 + v**2) / 2)
-
         def residual(p: FloatArray) -> FloatArray:
-            out: FloatArray = p[0] * bell(p)[2] + p[4] - cut
-            return out.ravel()
+            return (gaussian(x, y, p) - cut).ravel()
 
         def jacobian(p: FloatArray) -> FloatArray:
-            u, v, g = bell(p)
-            slope = p[0] * g / p[3]
-            columns = (g, slope * u, slope * v, slope * (u**2 + v**2), np.ones_like(g))
-            return np.stack([column.ravel() for column in columns], axis=1)
+            return gaussian_slopes(x, y, p).reshape(-1, 5)
 
         pixel = grid.pixel_nm
         begin = np.array([
@@ -108,7 +98,7 @@ class Baselines:
         near = (
             np.hypot(
                 grid.x_nm / pixel - start.x_px, (grid.y_nm / pixel - start.y_px)[:, None]
-            ) <= PEAK_REACH_PX
+            ) <= REACH_PX
         )  # fmt: skip
         image = np.where(near & np.isfinite(image), image, -math.inf)
         row, column = np.unravel_index(np.argmax(image), image.shape)

@@ -15,6 +15,7 @@ from iscat_analysis.bounds import Experiment, plan
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in
+from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.study.limits import Limits, limits_at
@@ -139,9 +140,7 @@ def _table(name: str, value: Any) -> pd.DataFrame:
         table = pd.DataFrame(value)
     except (TypeError, ValueError) as error:
         raise DataError(f"{name}: is no table ({error})") from None
-    twice = table.columns[table.columns.duplicated()]
-    if len(twice):
-        raise DataError(f"{name}: has two columns of the name {twice[0]}; rename one")
+    refuse_twice(list(table.columns), table.columns, name)
     return table
 
 

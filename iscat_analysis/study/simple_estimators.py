@@ -98,6 +98,29 @@ def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> T
     return _fitted(images, setup, fit)
 
 
+def gaussian(x: FloatArray, y: FloatArray, p: FloatArray) -> FloatArray:
+    """Give a round Gaussian of amplitude, centre, width and level.
+
+    Shapes: `x` (nx,), `y` (ny,), `p` (5,), result (ny, nx).
+    """
+    return np.asarray(p[0] * _bell(x, y, p)[2] + p[4])
+
+
+def gaussian_slopes(x: FloatArray, y: FloatArray, p: FloatArray) -> FloatArray:
+    """Give its derivatives with respect to the five.
+
+    Shapes: as `gaussian`, result (ny, nx, 5).
+    """
+    u, v, g = _bell(x, y, p)
+    slope = p[0] * g / p[3]
+    return np.stack((g, slope * u, slope * v, slope * (u**2 + v**2), np.ones_like(g)), axis=-1)
+
+
+def _bell(x: FloatArray, y: FloatArray, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
+    return u, v, np.exp(-(u**2 + v**2) / 2)
+
+
 def fit_gaussian(
     image: FloatArray,
     cut: tuple[slice, slice],
@@ -115,18 +138,11 @@ def fit_gaussian(
     y, x = (np.arange(part.start, part.stop, dtype=float) for part in cut)
     scale = float(np.max(np.abs(image))) or 1.0
 
-    def bell(p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        u, v = (x - p[1]) / p[3], ((y - p[2]) / p[3])[:, None]
-        return u, v, np.exp(-(u**2 + v**2) / 2)
-
     def value(p: FloatArray) -> FloatArray:
-        return np.asarray(scale * (p[0] * bell(p)[2] + p[4]))
+        return scale * gaussian(x, y, p)
 
     def slopes(p: FloatArray) -> FloatArray:
-        u, v, g = bell(p)
-        slope = p[0] * g / p[3]
-        parts = (g, slope * u, slope * v, slope * (u**2 + v**2), np.ones_like(g))
-        return scale * np.stack(parts, axis=-1)
+        return scale * gaussian_slopes(x, y, p)
 
     if counts is None or background is None or unit is None:
 

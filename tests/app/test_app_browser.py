@@ -18,13 +18,11 @@ from urllib.parse import quote
 
 import pandas as pd
 import pytest
+from browsers import BROWSER, DRIVER, open_browser
 from small_movies import LANDING
 
 import iscat_analysis as ia
 from iscat_cli import main
-
-BROWSER = shutil.which("chromium") or shutil.which("chromium-browser")
-DRIVER = shutil.which("chromedriver")
 
 pytestmark = pytest.mark.skipif(
     BROWSER is None or DRIVER is None,
@@ -157,22 +155,11 @@ def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    from selenium import webdriver
-    from selenium.webdriver.chrome.service import Service
-
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(BROWSER)
-    for argument in (
-        "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-        "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        "--disable-dev-shm-usage", "--window-size=1400,1200",
-        f"--user-data-dir={tmp_path_factory.mktemp('profile')}",
-    ):  # fmt: skip
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
-    yield driver
-    driver.quit()
+    profile = tmp_path_factory.mktemp("profile")
+    with open_browser(
+        profile, "--window-size=1400,1200", logs={"browser": "ALL", "performance": "ALL"}
+    ) as driver:
+        yield driver
 
 
 @pytest.fixture
