@@ -23,9 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, median_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
+from iscat_analysis.medians import median_3x3
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 ComplexArray = NDArray[np.complex128]
@@ -297,9 +298,7 @@ class Pattern:
         if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
             return math.nan, math.nan
         y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, self.shape, strict=True))
-        fy, fx = np.meshgrid(
-            fft.fftfreq(self.shape[0]), fft.rfftfreq(self.shape[1]), indexing="ij"
-        )
+        fy, fx = np.meshgrid(fft.fftfreq(self.shape[0]), fft.rfftfreq(self.shape[1]), indexing="ij")
         left = cross * np.exp(2j * np.pi * (fy * y + fx * x))
         weight = np.abs(left) * (np.hypot(fy, fx) < 0.25)
         angle = np.angle(left)
@@ -311,6 +310,6 @@ class Pattern:
 
 def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
-    around = median_filter(image, size=3)
+    around = median_3x3(image)
     out = np.abs(image - around)
     return np.where(out > _SPIKE_SIGMAS * 1.4826 * np.median(out), around, image)
