@@ -40,7 +40,7 @@ from iscat_analysis.study.simulate import write_stack
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"
 CONFIGS = ROOT.parent / "sample_configs"
-HELP_S, WARM_S, FIRST_S, PAGE_S, PAGE_MB = 0.3, 2.0, 15.0, 2.0, 5.0
+HELP_S, WARM_S, FIRST_S, PAGE_S, PAGE_MB = 0.3, 3.0, 60.0, 2.0, 5.0
 EVENTS = 5000
 SMALL = ("simulation.shape=[64, 64]", "posterior.enabled=false")
 BOUND = (

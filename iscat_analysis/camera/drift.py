@@ -23,9 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter, median_filter
+from scipy.ndimage import binary_dilation, distance_transform_edt, gaussian_filter
 
 from iscat_analysis._kernels.drift import extend, mismatch, shift_equations
+from iscat_analysis.medians import median_3x3
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 
 ComplexArray = NDArray[np.complex128]
@@ -249,42 +250,66 @@ def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
 def measure_drift(reference_e: FloatArray, later_e: FloatArray) -> tuple[float, float]:
     """Shift of the fixed pattern between two mean images, by phase correlation.
 
-    Notes
-    -----
-    C. D. Kuglin and D. C. Hines, Proc. IEEE Conf. Cybernetics and Society, 163 (1975).  Below a
-    pixel the phase of the cross-spectrum is fitted by a plane, weighted by its strength.  Of two
-    images of nothing but noise the phases are random, and the highest of N points of their
-    correlation is at some 5/√N: a peak that is no higher says nothing of a shift.  All
-    frequencies count alike, so that two pixels that blink would make such a peak: they are left
-    out.
-
     Shapes: `reference_e, later_e` (y, x).
     """
-    rows, columns = reference_e.shape
+    return pattern_of(later_e).shift_from(pattern_of(reference_e))
+
+
+def pattern_of(image_e: FloatArray) -> Pattern:
+    """Transform a mean image, once for all images with which it is compared.
+
+    Two pixels that blink would make a peak of their correlation: they are left out.
+
+    Shapes: `image_e` (y, x).
+    """
+    rows, columns = image_e.shape
     taper = np.outer(np.hanning(rows), np.hanning(columns))
-    smooth = _without_spikes(reference_e), _without_spikes(later_e)
-    one, two = (fft.rfft2(taper * (image / image.mean() - 1)) for image in smooth)
-    cross = two * np.conj(one)
-    magnitude = np.abs(cross)
-    if not magnitude.max() > 0:
-        return math.nan, math.nan
-    surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=taper.shape)
-    at = np.unravel_index(int(np.argmax(surface)), surface.shape)
-    if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
-        return math.nan, math.nan
-    y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, taper.shape, strict=True))
-    fy, fx = np.meshgrid(fft.fftfreq(rows), fft.rfftfreq(columns), indexing="ij")
-    left = cross * np.exp(2j * np.pi * (fy * y + fx * x))
-    weight = np.abs(left) * (np.hypot(fy, fx) < 0.25)
-    angle = np.angle(left)
-    a = np.array([[np.sum(weight * u * v) for v in (fy, fx)] for u in (fy, fx)])
-    b = np.array([np.sum(weight * u * angle) for u in (fy, fx)])
-    dy, dx = np.linalg.lstsq(a, -b / (2 * np.pi), rcond=None)[0]
-    return float(y + dy), float(x + dx)
+    smooth = _without_spikes(image_e)
+    return Pattern(fft.rfft2(taper * (smooth / smooth.mean() - 1)), (rows, columns))
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """The spectrum of a fixed pattern."""
+
+    spectrum: ComplexArray
+    """Shapes: (v, u)."""
+
+    shape: tuple[int, int]
+    """Of the image."""
+
+    def shift_from(self, reference: Pattern) -> tuple[float, float]:
+        """Shift against another image, in pixels along y and x; NaN where the images do not tell.
+
+        Notes
+        -----
+        C. D. Kuglin and D. C. Hines, Proc. IEEE Conf. Cybernetics and Society, 163 (1975).  Below a
+        pixel the phase of the cross-spectrum is fitted by a plane, weighted by its strength.  Of
+        two images of nothing but noise the phases are random, and the highest of N points of their
+        correlation is at some 5/√N: a peak that is no higher says nothing of a shift.  All
+        frequencies count alike.
+        """
+        cross = self.spectrum * np.conj(reference.spectrum)
+        magnitude = np.abs(cross)
+        if not magnitude.max() > 0:
+            return math.nan, math.nan
+        surface = fft.irfft2(cross / np.maximum(magnitude, 1e-12 * magnitude.max()), s=self.shape)
+        at = np.unravel_index(int(np.argmax(surface)), surface.shape)
+        if surface[at] * math.sqrt(surface.size) < _LEAST_PEAK_RATIO:
+            return math.nan, math.nan
+        y, x = (int((i + n // 2) % n - n // 2) for i, n in zip(at, self.shape, strict=True))
+        fy, fx = np.meshgrid(fft.fftfreq(self.shape[0]), fft.rfftfreq(self.shape[1]), indexing="ij")
+        left = cross * np.exp(2j * np.pi * (fy * y + fx * x))
+        weight = np.abs(left) * (np.hypot(fy, fx) < 0.25)
+        angle = np.angle(left)
+        a = np.array([[np.sum(weight * u * v) for v in (fy, fx)] for u in (fy, fx)])
+        b = np.array([np.sum(weight * u * angle) for u in (fy, fx)])
+        dy, dx = np.linalg.lstsq(a, -b / (2 * np.pi), rcond=None)[0]
+        return float(y + dy), float(x + dx)
 
 
 def _without_spikes(image: FloatArray) -> FloatArray:
     """Replace outlying pixels by the median of their neighbours."""
-    around = median_filter(image, size=3)
+    around = median_3x3(image)
     out = np.abs(image - around)
     return np.where(out > _SPIKE_SIGMAS * 1.4826 * np.median(out), around, image)

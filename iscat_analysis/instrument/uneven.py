@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
+from scipy.special import chdtrc
 
 from iscat_analysis.config import Config
 from iscat_analysis.fitting.ranges import fitted_frames
@@ -182,8 +183,6 @@ def _change(
     view: FieldOfView,
 ) -> Change | None:
     """Give one kind of change, if it is beyond chance, can be, and matters."""
-    from scipy.stats import chi2
-
     names = KINDS[kind]
     step, covariance = asked.step((*shared, *names))
     size, errors = step[len(shared) :], covariance[len(shared) :, len(shared) :]
@@ -191,7 +190,7 @@ def _change(
         return None
     significance = float(size @ np.linalg.solve(errors, size))
     terms = dict(zip(names, size.tolist(), strict=True))
-    if chi2.sf(significance, len(names)) > RANDOM_P or not is_plausible(terms, view.frames):
+    if chdtrc(len(names), significance) > RANDOM_P or not is_plausible(terms, view.frames):
         return None
     changes = [changes_at(terms, sight.spot) for sight in sights]
     largest = {base: max(abs(each[base]) for each in changes) for base in changes[0]}

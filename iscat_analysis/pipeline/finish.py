@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +38,7 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
+from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.tracks import make_films, tracks_of
 from iscat_analysis.trust.budget import explained_kda, width_warning
@@ -135,6 +135,16 @@ def make_analysis(
     if scale.refusal:
         table = flagged(table, Status.UNCALIBRATED_OPTICS)
         tracks = None if tracks is None else flagged(tracks, TrackStatus.UNCALIBRATED_OPTICS)
+    # frames are read and transformed while the species are found
+    timeline_future = start_in_thread(timeline_of, ready, found, table)
+    searched = found.summary.get("searched_share") if found.summary else None
+    described = species_of(context, table, searched)
+    explained = {"explained_kda": explained_kda(budget)}
+    described["across_particles"] = [one | explained for one in described["across_particles"]]
+    wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)
+    if wide:
+        run.warn(wide)
+    timeline = timeline_future.result()
     summary = summary_of(context, table, compared, run.clock.seconds, achieved)
     provenance = Provenance(
         command=printable(command) or "iscat_analysis.pipeline.analyse",
@@ -146,7 +156,7 @@ def make_analysis(
     )
     summary |= {
         **further,
-        **({"timeline": timeline} if (timeline := timeline_of(ready, found, table)) else {}),
+        **({"timeline": timeline} if timeline else {}),
         **({"budget": budget} if budget else {}),
         "input": {
             "path": provenance.input_path,
@@ -157,9 +167,10 @@ def make_analysis(
         "versions": dict(provenance.versions),
         "interrupted": interrupted,
         "warnings": run.warnings,
+        **described,
     }
     frames, first = _unique_frames(compared)
-    analysis = Analysis(
+    return Analysis(
         config_toml=config_to_toml(as_given(config)),
         mode=context.mode,
         scheme=config.optics.scheme,
@@ -176,15 +187,6 @@ def make_analysis(
         films=films,
         response=ready.response.table if ready.response is not None else None,
     )
-    searched = found.summary.get("searched_share") if found.summary else None
-    described = species_of(context, table, searched)
-    explained = {"explained_kda": explained_kda(budget)}
-    described["across_particles"] = [one | explained for one in described["across_particles"]]
-    wide = width_warning(described["across_particles"], calibrated=config.calibration is not None)
-    if wide:
-        run.warn(wide)
-    warned = {"warnings": run.warnings}
-    return replace(analysis, summary=summary | described | warned, warnings=tuple(run.warnings))
 
 
 def _unique_frames(compared: Compared) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

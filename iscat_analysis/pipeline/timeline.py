@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import measure_drift
+from iscat_analysis.camera.drift import Pattern, pattern_of
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
@@ -101,16 +101,16 @@ def _drift(
 ) -> tuple[list[float | None], list[float | None]]:
     """Follow the fixed pattern within each stretch, from where the one before ended."""
     moved = np.full((len(seen), 2), np.nan)
-    reference: FloatArray | None = None
+    reference: Pattern | None = None
     begun: int | None = None
     origin, latest = np.zeros(2), np.zeros(2)
     for number, (one, held) in enumerate(zip(seen, inside, strict=True)):
         if one.image is None or additive:
             continue
-        image = _middle(one.image)
+        pattern = pattern_of(_middle(one.image))
         if held != begun or reference is None:
-            reference, begun, origin = image, held, latest
-        shift = np.array(measure_drift(reference, image))
+            reference, begun, origin = pattern, held, latest
+        shift = np.array(pattern.shift_from(reference))
         if np.isfinite(shift).all():
             moved[number] = latest = origin + shift
     return _numbers(moved[:, 0]), _numbers(moved[:, 1])

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.records import Analysis
+from iscat_analysis.report.drawing import draw
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.report.posterior import write_posterior
 from iscat_analysis.report.tables import write_tables
@@ -73,8 +74,6 @@ def fill_report(
     pictures.mkdir(exist_ok=True)
     write_tables(analysis, folder)
     write_posterior(analysis, folder / "posterior.nc")
-    from iscat_analysis.report.drawing import draw  # Matplotlib takes long to load
-
     nearby = LocalExecutor() if executor is None or executor.distant else executor  # it writes here
     page = draw(analysis, pictures, event_figures, nearby)
     (folder / "report.html").write_text(page, encoding="utf-8")

@@ -1,4 +1,8 @@
-"""The figures and the page of an analysis."""
+"""The figures and the page of an analysis, drawn by two processes where there is a second one.
+
+Matplotlib takes long to load.  The second process has loaded it by now; this one loads it while the
+second one draws.
+"""
 
 from __future__ import annotations
 
@@ -9,33 +13,42 @@ from markupsafe import Markup
 
 from iscat_analysis.executors import Executor
 from iscat_analysis.records import Analysis, Progress, silent
-from iscat_analysis.report.event_figures import event_figures
-from iscat_analysis.report.page import page_context, page_of, page_sketches
-from iscat_analysis.report.style import drawn, publish
 from iscat_analysis.report.tables import event_table
 
-_PARTS = 2  # of all figures, for two processes
+_HERE, _ELSEWHERE = 0, 1
+_SHARE = 3  # one figure of three is drawn here, beside Matplotlib's loading and the page's text
 
 
 def draw(analysis: Analysis, folder: Path, most: int, place: Executor) -> str:
     """Draw all figures into a folder, images of `most` events among them; give the page."""
-    table = event_table(analysis)
-    figures: dict[str, Markup] = {}
     parts = place.each(
-        lambda part: place.call(draw_part, analysis, folder, most, part), range(_PARTS)
+        lambda part: place.call(draw_part, analysis, folder, most, part), (_HERE, _ELSEWHERE)
     )
+    _, figures = next(parts)
+
+    from iscat_analysis.report.page import page_context, page_of, page_sketches
+
+    table = event_table(analysis)
+    about = page_context(analysis, table, folder)
     for _, some in parts:
         figures |= some
     shown = [name for name, _ in page_sketches(analysis, table)]
-    about = page_context(analysis, table, folder)
     return page_of(about, {name: figures[name] for name in shown if name in figures})
 
 
 def draw_part(
     analysis: Analysis, folder: Path, most: int, part: int, *, progress: Progress = silent
 ) -> dict[str, Markup]:
-    """Draw every other figure into a folder."""
+    """Draw a part of the figures into a folder."""
+    from iscat_analysis.report.event_figures import event_figures
+    from iscat_analysis.report.page import page_sketches
+    from iscat_analysis.report.style import drawn, publish
+
     del progress
     sketches = chain(page_sketches(analysis, event_table(analysis)), event_figures(analysis, most))
-    some = [sketch for number, sketch in enumerate(sketches) if number % _PARTS == part]
+    some = [
+        sketch
+        for number, sketch in enumerate(sketches)
+        if (number % _SHARE == 0) == (part == _HERE)
+    ]
     return publish(drawn(some), folder)
