@@ -41,6 +41,18 @@ def make_rows(
     return table.astype(types)
 
 
+def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:
+    """Add the diameters of spheres, and their errors and bounds, to rows with their masses."""
+    mass = table["mass_kda"].to_numpy(dtype=float)
+    diameter = sphere_diameter_nm(1.0, density_kg_m3) * np.cbrt(np.abs(mass))
+    slope = diameter / (3 * np.abs(mass))
+    columns = {"diameter_nm": diameter} | {
+        f"{kind}_diameter_nm": slope * table[f"{kind}_mass_kda"]
+        for kind in ("sigma", "crb", "qcrb")
+    }
+    return make_rows(table, columns)
+
+
 def flagged(
     table: pd.DataFrame, flag: Status | TrackStatus, which: BoolArray | None = None
 ) -> pd.DataFrame:
