@@ -31,6 +31,7 @@ from iscat_analysis.records import (
     flagged,
     make_rows,
     verdict,
+    with_diameters,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
 from iscat_analysis.threads import threads
@@ -80,8 +81,9 @@ def fit_rois(
         Pixel size, samples per pixel and read noise.
     n_after, n_before : int
         Frames in the sums; ``n_before=0`` where the background is known.
-    mode : {"mass", "localize", "joint"}
-        Which parameters are free: x, y and mass; x, y and z; all four.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free: x, y and mass; x, y and z; all four; x, y, z and the diameter
+        of a sphere.
     power_ratio : array_like, optional
         Light after over light before, one number or one for each region, where it is known from a
         larger field; default the ratio of the frames, with `level` fitted.
@@ -157,6 +159,8 @@ def fit_rois(
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, {"event": range(count)})
+    if mode == "size":
+        table = with_diameters(table, particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 

@@ -12,6 +12,7 @@ import pandas as pd
 from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus
+from iscat_analysis.units import sphere_diameter_nm
 
 
 def make_rows(
