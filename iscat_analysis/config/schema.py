@@ -82,12 +82,11 @@ class Config(Section):
     def _sphere_with_its_size(self) -> Config:
         fit, particle, optics = self.fit, self.particle, self.optics
         if fit.mode == "size" and "model" not in particle.model_fields_set:
-            particle = particle.model_copy(update={"model": "mie"})
+            given = particle.model_dump(exclude_unset=True)
+            particle = particle.model_validate({**given, "model": "mie"})
         if particle.is_sphere:
             if "mode" not in fit.model_fields_set:
                 self.__dict__["fit"] = fit = fit.model_copy(update={"mode": "size"})
-            if "height_nm" not in particle.model_fields_set:
-                particle = particle.model_copy(update={"height_nm": "contact"})
             if optics.calibrate == "auto":  # optics are learned from dipoles
                 update = {"calibrate": "never"}
                 self.__dict__["optics"] = optics.model_copy(update=update)
@@ -191,14 +190,14 @@ def sphere_refusal(config: Config) -> str:
             "known diameter"
         )
     for key, set_to in (
-        ("optics.psf = \"measured\"", optics.psf == "measured"),
-        ("optics.convention = \"dong2021\"", optics.convention == "dong2021"),
-        ("optics.emission = \"dong2021\"", optics.emission == "dong2021"),
-        ("optics.calibrate = \"always\"", optics.calibrate == "always"),
+        ('optics.psf = "measured"', optics.psf == "measured"),
+        ('optics.convention = "dong2021"', optics.convention == "dong2021"),
+        ('optics.emission = "dong2021"', optics.emission == "dong2021"),
+        ('optics.calibrate = "always"', optics.calibrate == "always"),
         ("[calibration]", config.calibration is not None),
         ("particle.wiggle_nm", particle.wiggle_nm > 0),
         ("particle.height_sd_nm", particle.height_sd_nm > 0),
-        ("particle.height_nm = \"auto\"", particle.height_nm == "auto"),
+        ('particle.height_nm = "auto"', particle.height_nm == "auto"),
     ):
         if set_to:
             return (

@@ -68,6 +68,7 @@ class ForwardModel:
 
     def at(self, amplitude: float) -> ForwardModel:
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
+        del amplitude  # a dipole has one picture
         return self
 
     @property

@@ -102,11 +102,12 @@ class SizedModel(ForwardModel):
     def derivative_rows(
         self, grid: PixelGrid, theta: FloatArray, height: str = "exact"
     ) -> FloatArray:
-        """As `ForwardModel.derivative_rows`; never between the nodes of a table."""
+        """As `ForwardModel.derivative_rows`; no mass has a table along z."""
+        exact = "exact" if height == "between" else height
         amplitude = float(theta[3])
         step = self.step_of(amplitude)
         below, rows, above = (
-            self.at(a).derivative_rows(grid, np.array([*theta[:3], a]))
+            self.at(a).derivative_rows(grid, np.array([*theta[:3], a]), exact)
             for a in (amplitude - step, amplitude, amplitude + step)
         )
         rows[:, 4] = (above[:, 0] - below[:, 0]) / (2 * step)
@@ -137,13 +138,14 @@ class SizedModel(ForwardModel):
         return self.at(mass_kda).field(dx_nm, dy_nm, z_nm, mass_kda)
 
     def amplitude_contrast(self, z_nm: float, amplitude: float, height: str = "exact") -> float:
-        """As `ForwardModel.amplitude_contrast`; never between the nodes of a table."""
+        """As `ForwardModel.amplitude_contrast`; no mass has a table along z."""
+        del height
         return self.at(amplitude).amplitude_contrast(z_nm, amplitude)
 
     def _along_mass(
         self, grid: PixelGrid, x_nm: float, y_nm: float, z_nm: float, amplitude: float
     ) -> FloatArray:
-        """Derivative of the signal along the mass."""
+        """Differentiate the signal along the mass."""
         step = self.step_of(amplitude)
         below, above = (
             self.amplitude_image(grid, x_nm, y_nm, z_nm, a)

@@ -11,7 +11,8 @@ along and across the plane of the incident and the scattered ray (C. F. Bohren a
 
 π_n and τ_n are polynomials in μ = cos Θ, Θ the angle between the two rays: μ = −cos θ_s in iSCAT,
 which collects what is scattered backwards, and μ = cos θ_s in COBRI and dark field.  Beyond the
-critical angle cos θ_s is imaginary, and the polynomials continue the amplitudes to evanescent waves.
+critical angle cos θ_s is imaginary, and the polynomials continue the amplitudes to evanescent
+waves.
 
 A small sphere of radius a has S₁ = −i x³ (m² − 1)/(m² + 2), x = k_s a, and S₂ = μ S₁: a dipole of
 polarisability 4π a³ (m² − 1)/(m² + 2).  The pattern here is i S/x³, which is the last factor for
@@ -77,7 +78,10 @@ class Sphere:
         core = x - k * self.shell_nm
         s1, s2 = amplitudes(
             coefficients(
-                x, core, self.index / n_sample, self.shell_index / n_sample if self.shell_nm else 0.0
+                x,
+                core,
+                self.index / n_sample,
+                self.shell_index / n_sample if self.shell_nm else 0.0,
             ),
             -direction * cos_s,
         )

@@ -387,9 +387,7 @@ def with_light_of(field: Field, opening: Aperture, factor: complex, oil_nm: floa
     return field
 
 
-def _source(
-    opening: Aperture, factor: complex, oil_nm: float
-) -> tuple[ComplexArray, ComplexArray]:
+def _source(opening: Aperture, factor: complex, oil_nm: float) -> tuple[ComplexArray, ComplexArray]:
     """Light of a round pupil in the sums of F0 and F2, and its phase per height."""
     pupil = opening.pupil
     weight, axial = weight_on(opening, factor, oil_nm)

@@ -160,7 +160,7 @@ def fit_rois(
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, {"event": range(count)})
     if mode == "size":
-        table = with_diameters(table, particle.density)
+        table = with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 

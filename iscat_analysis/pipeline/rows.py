@@ -17,7 +17,14 @@ import pandas as pd
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, flagged, make_rows, with_diameters
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    FloatArray,
+    Status,
+    flagged,
+    make_rows,
+    with_diameters,
+)
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
