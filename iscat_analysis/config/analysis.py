@@ -138,7 +138,7 @@ class Fit(Section):
     ] = Field((0.0, 1000.0), description="bounds of z if it is free")
     diameter_range_nm: tuple[
         Annotated[Positive, length(*DIAMETERS_NM)], Annotated[Positive, length(*DIAMETERS_NM)]
-    ] = Field((20.0, 400.0), description="bounds of the diameter in mode size")
+    ] = Field((10.0, 400.0), description="bounds of the diameter in mode size")
 
     @model_validator(mode="after")
     def _range(self) -> Fit:

@@ -261,7 +261,7 @@ def _followed(likelihood: Likelihood, starts: Sequence[FloatArray], box: Box) ->
     optima: list[Optimum] = []
     best = -math.inf
     for start in starts:
-        found = _follow(likelihood, start, box, best)
+        found = _follow(likelihood, _inside(start, box), box, best)
         optima.append(found)
         if found.converged:
             best = max(best, found.log_likelihood)
