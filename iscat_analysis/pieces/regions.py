@@ -20,6 +20,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import (
@@ -209,7 +210,19 @@ def line_of(
         row[f"sigma_{name}"] = fit.sigma[k]
         row[f"crb_{name}"] = bounds.crb_joint[k]
         row[f"qcrb_{name}"] = bounds.qcrb[k]
-    return row
+    return row | sizes_of(model, fit) if isinstance(model, SizedModel) else row
+
+
+def sizes_of(model: SizedModel, fit: FitResult) -> dict[str, float]:
+    """Give the next likely diameter and its odds; both are empty if there is none."""
+    others = [other for other in fit.alternatives if math.isfinite(other.log_likelihood_gap)]
+    if not others or "mass_kda" not in fit.free:
+        return {"other_diameter_nm": math.nan, "other_odds": math.nan}
+    sphere = model.sphere.of_mass(others[0].mass_kda)
+    return {
+        "other_diameter_nm": sphere.diameter_nm,
+        "other_odds": math.exp(-others[0].log_likelihood_gap),
+    }
 
 
 def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -> dict[str, Any]:

@@ -161,6 +161,15 @@ EVENTS = (
     Column(
         "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
     ),
+    Column(
+        "other_diameter_nm", "positive",
+        "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
+        optional=True,
+    ),
+    Column(
+        "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
+        optional=True,
+    ),
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
 
