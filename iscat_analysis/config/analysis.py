@@ -116,8 +116,8 @@ class Fit(Section):
 
     mode: Mode = Field(
         "mass",
-        description='"mass" | "localize" | "joint" | "size" (spheres) | "track"; absent: "size" '
-        "if particle.model is a sphere",
+        description='"mass" | "localize" | "joint" | "size" (spheres, see particle.model) '
+        '| "track"',
     )
     frames: FrameRange | None = Field(
         None, description="[start, stop); absent: all after the background"

@@ -355,9 +355,9 @@ class Particle(Section):
     )
     height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         USUAL_HEIGHT_NM,
-        description='z if it is fixed, else its start value | "contact" (default of spheres): '
-        'radius of the particle + linker_nm | "auto": 5 nm for optics and mass scale; for the '
-        "particles, mean and spread are learned from the movie",
+        description='z if it is fixed, else its start value | "contact": radius of the particle + '
+        'linker_nm; a sphere that has the default does that too | "auto": 5 nm for optics and mass '
+        "scale; for the particles, mean and spread are learned from the movie",
     )
     linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         0.0, description='between coverslip and particle, for height_nm = "contact"'
@@ -384,9 +384,6 @@ class Particle(Section):
 
     @model_validator(mode="after")
     def _one_of(self) -> Particle:
-        if self.is_sphere and "height_nm" not in self.model_fields_set:
-            # The model is frozen for its users; here it is still being made.
-            self.__dict__["height_nm"] = "contact"
         if self.permittivity is not None and self.index is not None:
             raise ValueError("give permittivity or index, not both")
         if self.mass_kda is not None and self.diameter_nm is not None:
@@ -473,7 +470,8 @@ class Particle(Section):
         return self._seated_nm(mass_kda) + shift
 
     def _seated_nm(self, mass_kda: float) -> float:
-        if self.height_nm == "contact":
+        stands = self.is_sphere and self.height_nm == USUAL_HEIGHT_NM  # which is of proteins
+        if self.height_nm == "contact" or stands:
             return sphere_diameter_nm(abs(mass_kda), self.density) / 2 + self.linker_nm
         return USUAL_HEIGHT_NM if self.height_nm == "auto" else self.height_nm
 

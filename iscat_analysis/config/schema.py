@@ -80,20 +80,13 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _sphere_with_its_size(self) -> Config:
-        fit, particle, optics = self.fit, self.particle, self.optics
-        if fit.mode == "size" and "model" not in particle.model_fields_set:
-            given = particle.model_dump(exclude_unset=True)
-            particle = particle.model_validate({**given, "model": "mie"})
-        if particle.is_sphere:
-            if "mode" not in fit.model_fields_set:
-                self.__dict__["fit"] = fit = fit.model_copy(update={"mode": "size"})
-            if optics.calibrate == "auto":  # optics are learned from dipoles
+        if self.particle.is_sphere:
+            if self.optics.calibrate == "auto":  # optics are learned from dipoles
                 update = {"calibrate": "never"}
-                self.__dict__["optics"] = optics.model_copy(update=update)
-            self.__dict__["particle"] = particle
+                self.__dict__["optics"] = self.optics.model_copy(update=update)
             if refusal := sphere_refusal(self):
                 raise ValueError(refusal)
-        elif fit.mode == "size":
+        elif self.fit.mode == "size":
             raise ValueError(
                 'fit.mode = "size" fits spheres, and particle.model is "dipole": set '
                 'particle.model = "mie" or "shell"'

@@ -235,8 +235,9 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
     out then, unless there is no reference and so no fringes that a scan could follow.
     """
     theta = _inside(theta, box)
-    if likelihood.model.is_sized and box.free[2] and box.free[AMPLITUDE]:
-        starts = size_starts(likelihood, theta, box)
+    model = likelihood.model
+    if isinstance(model, SizedModel) and box.free[2] and box.free[AMPLITUDE]:
+        starts = size_starts(likelihood, model, theta, box)
         return _ranked(_followed(likelihood, starts, box)), True
     if not box.free[2]:
         return [likelihood.maximize(theta, box.free, box.lower, box.upper)], True

@@ -41,10 +41,10 @@ OTHER_SIZE_SHARE = 0.02
 _FOLLOWED = 6  # local maxima that are followed
 
 
-def size_starts(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[FloatArray]:
+def size_starts(
+    likelihood: Likelihood, model: SizedModel, theta: FloatArray, box: Box
+) -> list[FloatArray]:
     """Local maxima of the likelihood over diameter and height, best first."""
-    model = likelihood.model
-    assert isinstance(model, SizedModel)
     masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
     low, high = float(box.lower[2]), float(box.upper[2])
     count = max(math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1, 3)

@@ -135,7 +135,7 @@ def forward_model(
         samples=(points / 2, weights / 2),
     )
     if sphere is not None:
-        model = sized(model, config.fit.diameter_range_nm)
+        model = sized(model, sphere, config.fit.diameter_range_nm)
     if optics.psf == "measured":
         template = Template.read(Path(optics.template or ""))
         template.refuse_mismatch(config.camera.pixel_size_nm, config.fit.roi_nm)

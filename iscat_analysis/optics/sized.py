@@ -10,7 +10,7 @@ their error is 1e-6 of the derivative, and 1e-5 of the second one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 
 import numpy as np
@@ -39,20 +39,16 @@ _SECOND = {pair: 5 + k for k, pair in enumerate(PAIRS)}  # rows of second deriva
 class SizedModel(ForwardModel):
     """Expected images of a sphere in one microscope; its tables are of the nominal mass."""
 
-    mass_range_kda: tuple[float, float] = (0.0, np.inf)
+    sphere: Sphere = field(kw_only=True)
+    """The nominal sphere."""
+
+    mass_range_kda: tuple[float, float] = field(kw_only=True)
     """Masses among which a fit searches."""
 
     @property
     def is_sized(self) -> bool:
         """Whether particles are spheres, whose picture changes its shape with their size."""
         return True
-
-    @property
-    def sphere(self) -> Sphere:
-        """The nominal sphere."""
-        sphere = self.aperture.sphere
-        assert sphere is not None
-        return sphere
 
     def at(self, amplitude: float) -> ForwardModel:
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
@@ -154,10 +150,8 @@ class SizedModel(ForwardModel):
         return np.asarray((above - below) / (2 * step))
 
 
-def sized(model: ForwardModel, diameters_nm: tuple[float, float]) -> SizedModel:
+def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:
     """Make the model of spheres of all masses from that of one, with the diameters to search."""
     given = {each.name: getattr(model, each.name) for each in fields(ForwardModel)}
-    sphere = model.aperture.sphere
-    assert sphere is not None
     low, high = (sphere_mass_kda(diameter, sphere.density_kg_m3) for diameter in diameters_nm)
-    return SizedModel(**given, mass_range_kda=(low, high))
+    return SizedModel(**given, sphere=sphere, mass_range_kda=(low, high))

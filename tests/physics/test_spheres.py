@@ -11,10 +11,12 @@ from typing import Any
 
 import miepython
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.polynomial import Legendre, Polynomial
 from numpy.typing import NDArray
 
+import iscat_analysis as ia
 from iscat_analysis.bounds import event_bounds, quantum_information
 from iscat_analysis.bounds.experiment import bounds_report, plan
 from iscat_analysis.config import Config, configure
@@ -298,3 +300,89 @@ def test_a_bubble_has_the_other_sign() -> None:
         for model in [model_of(of("iscat", particle=bubble | {"index": index}))]
     ]
     assert peaks[0] * peaks[1] < 0
+
+
+OPTICS = ia.Optics(na=1.42, focus_nm=0.0)
+CAMERA = ia.Camera(pixel_size_nm=90.0, gain_e_per_adu=1.0, offset_adu=0.0, read_noise_e=0.0)
+
+
+def counts_of(particle: ia.Particle, count: int, light_e: float, seed: int) -> list[Any]:
+    """Draw counts before and after particles that land, of as much light in all frames."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-45.0, 45.0, (2, count))
+    heights = particle.nominal_height_nm + rng.uniform(0.0, 30.0, count)
+    pictures = ia.psf(
+        OPTICS, particle, CAMERA, pixels=23, x_nm=places[0], y_nm=places[1], z_nm=heights
+    )
+    return [rng.poisson(light_e * light) for light in (np.ones_like(pictures), 1 + pictures)]
+
+
+def fitted(particle: ia.Particle, counts: list[Any], mode: str = "size") -> pd.DataFrame:
+    """Fit particles in regions."""
+    return ia.fit_rois(
+        *counts, OPTICS, particle, CAMERA, n_before=100, n_after=100, mode=mode, power_ratio=1.0,
+        z_range_nm=(0.0, 250.0),
+    )  # fmt: skip
+
+
+def test_the_diameter_is_found_and_a_dipole_does_not_fit() -> None:
+    sphere = ia.Particle(kind="silica", model="mie", diameter_nm=150.0)
+    counts = counts_of(sphere, 2, 1e6, seed=4)
+    table = fitted(sphere, counts)
+    assert set(table["status"]) == {"ok"}
+    assert np.all(np.abs(table["diameter_nm"] - 150.0) < 4 * table["sigma_diameter_nm"])
+    assert np.allclose(table["sigma_diameter_nm"], table["crb_diameter_nm"], rtol=0.05)
+    assert np.all(table["qcrb_diameter_nm"] < table["crb_diameter_nm"])
+    expected = sphere_mass_kda(1.0, 2200.0) * table["diameter_nm"] ** 3
+    assert np.allclose(table["mass_kda"], expected)
+    dipole = ia.Particle(kind="silica", diameter_nm=150.0, height_nm="contact")
+    assert set(fitted(dipole, counts, "joint")["status"]) == {"poor_fit"}
+
+
+@pytest.mark.large
+@pytest.mark.parametrize(
+    ("kind", "diameter"),
+    [("gold", 20.0), ("gold", 80.0), ("gold", 150.0), ("silica", 50.0), ("silica", 150.0),
+     ("silica", 300.0)],
+)  # fmt: skip
+def test_errors_of_the_diameter_are_as_large_as_said(
+    kind: str, diameter: float, share: float
+) -> None:
+    """Pulls of n fits have the mean 0 ± 1/√n and the spread 1 ± 1/√(2n)."""
+    sphere = ia.Particle(kind=kind, model="mie", diameter_nm=diameter)
+    n = max(4, round(40 * share))
+    table = fitted(sphere, counts_of(sphere, n, 1e6, seed=8))
+    pulls = (table["diameter_nm"] - diameter) / table["sigma_diameter_nm"]
+    assert abs(pulls.mean()) < 4 / math.sqrt(n)
+    assert abs(pulls.std() - 1) < 4 / math.sqrt(2 * n)
+    assert (table["status"] == "ok").mean() > 0.8
+
+
+@pytest.mark.large
+def test_two_diameters_that_faint_light_does_not_tell_apart_are_said() -> None:
+    """Of forty photoelectrons per pixel most diameters have another; of a million none has."""
+    sphere = ia.Particle(kind="silica", model="mie", diameter_nm=100.0)
+    few, many = (fitted(sphere, counts_of(sphere, 8, light, seed=2)) for light in (40.0, 1e6))
+    ambiguous = ["ambiguous_size" in flags for flags in few["flags"]]
+    assert sum(ambiguous) >= 2
+    assert np.all(few["other_odds"][ambiguous] > 1e-3)
+    assert not any("ambiguous_size" in flags for flags in many["flags"])
+
+
+@pytest.mark.large
+def test_a_shell_of_the_same_index_is_none() -> None:
+    """And a vesicle is none: water in a shell scatters less than a sphere of the shell's matter."""
+    pytest.importorskip("scattnlay")
+    keys = {"density_kg_m3": 1000.0, "diameter_nm": 120.0}
+    solid = ia.psf(OPTICS, ia.Particle(kind="custom", model="mie", index=1.46, **keys), CAMERA)
+    shell, vesicle = (
+        ia.psf(
+            OPTICS,
+            ia.Particle(kind="custom", model="shell", index=core, shell_nm=5, shell_index=1.46,
+                        **keys),
+            CAMERA,
+        )
+        for core in (1.46, 1.335)
+    )  # fmt: skip
+    assert np.abs(shell - solid).max() < 1e-8 * np.abs(solid).max()
+    assert np.abs(vesicle).max() < 0.7 * np.abs(solid).max()
