@@ -243,7 +243,13 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
     from rich.console import Console
 
     from iscat_analysis.records import FREE_PARAMETERS
-    from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, caution, main_quantity
+    from iscat_analysis.report.headline import (
+        NOT_A_MASS,
+        as_contrasts,
+        as_diameters,
+        caution,
+        main_quantity,
+    )
     from iscat_analysis.report.headline import is_uncalibrated as uncalibrated
     from iscat_analysis.units import count
 
@@ -261,6 +267,8 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
             mass = ("mass, model scale", "kDa")
             if main_quantity(analysis).column == "contrast":
                 shown, mass = as_contrasts(shown), ("contrast", "")
+        if analysis.mode == "size":
+            shown, mass = as_diameters(shown), ("diameter", "nm")
         free = FREE_PARAMETERS[analysis.mode]
         print_result(events_table(shown.to_dict("records"), free, mass=mass, width=width))
     if len(rows) > ROWS_SHOWN:

@@ -21,6 +21,7 @@ class Mode(StrEnum):
     MASS = "mass"
     LOCALIZE = "localize"
     JOINT = "joint"
+    SIZE = "size"
     TRACK = "track"
 
 
@@ -43,6 +44,7 @@ ModeOption = Annotated[
         "--mode",
         metavar="MODE",
         help="Free parameters: mass (x, y, mass), localize (x, y, z), joint (all four), "
+        "size (x, y, z, diameter of a sphere), "
         "track (joint in every frame, linked).",
     ),
 ]

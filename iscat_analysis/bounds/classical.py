@@ -82,7 +82,8 @@ def event_bounds(
     if model.is_measured:  # nothing is known of the light itself
         quantum, collected = np.zeros((4, 4), dtype=complex), 0.0
     if quantum is None:
-        quantum = quantum_information(model, max(theta[2], 0.0))  # a nuisance may be below
+        height = max(theta[2], 0.0)  # a nuisance may be below
+        quantum = quantum_information(model, height, amplitude=float(theta[3]))
     slope = abs(model.scale.slope(theta[3]))
     relative = abs(theta[3]) * slope  # mass for a relative step of 1 [kDa]
     to_kda = np.array([1.0, 1.0, 1.0, 1 / slope])

@@ -11,6 +11,8 @@ where it is not zero, no single measurement is optimal for both parameters (weak
 Moving the particle multiplies ε by −i k n_i sinθ (cosφ, sinφ) and by iκ, κ = k n_s (cosθ_s + ξ);
 beyond the critical angle κ is complex and Im κ is the evanescent decay, which ties z to the mass.
 
+A sphere that grows also changes its pattern: then ∂ε/∂ln m is a difference between two masses.
+
 Aberrations multiply ε by the same phase for every position of the particle and change nothing.  A
 mask and an analyser take light away: what they let through is bounded like what was collected.
 """
@@ -26,6 +28,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, aperture
 from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.sized import MASS_STEP, SizedModel
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -51,8 +54,9 @@ def quantum_information(
     *,
     measure: Measure = "exact",
     light: Light = "collected",
+    amplitude: float | None = None,
 ) -> ComplexArray:
-    """Quantum Fisher information of one scattered photon.
+    """Quantum Fisher information of one scattered photon, for a sphere of some amplitude.
 
     Shapes: result (4, 4).
     """
@@ -61,23 +65,23 @@ def quantum_information(
             'optics.psf = "measured" has no quantum bound, because a picture does not say what '
             'light made it: use optics.psf = "model", or the CRB in the table of the fits'
         )
-    opening, density = _photons(model, z_nm, measure, light)
+    opening, wave, solid = _light(model, z_nm, measure, light, amplitude)
     pupil = opening.pupil
     kappa = pupil.axial
     if measure == "dong2021" and model.optics.scheme != "iscat":
         kappa = kappa / model.optics.n_sample
-    density = density / density.sum()
+    weight = solid[:, None] / (np.abs(wave) ** 2 * solid[:, None]).sum()
     phi = _azimuths()
-    slopes = np.broadcast_arrays(
-        -1j * pupil.transverse[:, None] * np.cos(phi),
-        -1j * pupil.transverse[:, None] * np.sin(phi),
-        1j * kappa[:, None],
-        np.complex128(1.0),
+    slopes = (
+        -1j * pupil.transverse[:, None] * np.cos(phi) * wave,
+        -1j * pupil.transverse[:, None] * np.sin(phi) * wave,
+        1j * kappa[:, None] * wave,
+        _growth(model, amplitude, light, wave),
     )
     out = np.zeros((4, 4), dtype=np.complex128)
     for i in range(4):
         for j in range(i, 4):
-            out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * density)
+            out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * weight)
             out[j, i] = out[i, j].conj()
     out[np.diag_indices(4)] = out.diagonal().real
     # the pupil is symmetric under reflection through its centre: exact zeros, not rounding
@@ -141,18 +145,51 @@ def _photons(
     model: ForwardModel, z_nm: float, measure: Measure, light: Light
 ) -> tuple[Aperture, FloatArray]:
     """Pupil and the photons in each of its directions, shape (angles, AZIMUTHS)."""
+    opening, wave, solid = _light(model, z_nm, measure, light, None)
+    density: FloatArray = (np.abs(wave) ** 2).sum(0) * solid[:, None]
+    return opening, density
+
+
+def _light(
+    model: ForwardModel, z_nm: float, measure: Measure, light: Light, amplitude: float | None
+) -> tuple[Aperture, ComplexArray, FloatArray]:
+    """Pupil, its wave (components, angles, AZIMUTHS), and the weight of each angle."""
     if not z_nm >= 0:
         raise ConfigError(
             f"z_nm = {z_nm:g}: the particle would lie inside the coverslip; give a height >= 0"
         )
-    opening = aperture(model.optics, NODES, NODES)
+    opening = _opening(model, amplitude)
     pupil = opening.pupil
     solid = pupil.weight * np.sin(pupil.theta)
     if measure == "dong2021":
         solid = solid * np.sin(pupil.theta) * np.cos(pupil.theta)
+    solid = solid * np.exp(-2 * pupil.axial.imag * z_nm)
+    return opening, _seen(opening, light), solid
+
+
+def _opening(model: ForwardModel, amplitude: float | None) -> Aperture:
+    """Pupil with the light of a particle; the nominal one without an amplitude."""
+    there = model.at(model.nominal_amplitude if amplitude is None else amplitude)
+    return aperture(model.optics, NODES, NODES, there.aperture.sphere)
+
+
+def _seen(opening: Aperture, light: Light) -> ComplexArray:
+    """Wave in the directions of the pupil, all of it or what mask and analyser let through."""
     wave = opening.polarised(_azimuths())
     if light == "transmitted":
-        wave = wave[: 1 if model.optics.analyzer else 2] * opening.transmission[:, None]
-    solid = solid * np.exp(-2 * pupil.axial.imag * z_nm)
-    density: FloatArray = (np.abs(wave) ** 2).sum(0) * solid[:, None]
-    return opening, density
+        wave = wave[: 1 if opening.optics.analyzer else 2] * opening.transmission[:, None]
+    return wave
+
+
+def _growth(
+    model: ForwardModel, amplitude: float | None, light: Light, wave: ComplexArray
+) -> ComplexArray:
+    """Change of the wave with the logarithm of the mass: itself, unless the pattern changes too."""
+    if not isinstance(model, SizedModel):
+        return wave
+    mass = model.nominal_amplitude if amplitude is None else amplitude
+    below, above = (
+        (1 + step) * _seen(_opening(model, mass * (1 + step)), light)
+        for step in (-MASS_STEP, MASS_STEP)
+    )
+    return np.asarray((above - below) / (2 * MASS_STEP))

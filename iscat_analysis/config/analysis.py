@@ -23,6 +23,9 @@ from iscat_analysis.config.values import (
 LOWEST_VISCOSITY_MPA_S = 0.1
 """Half the viscosity of ether, the thinnest liquid near room temperature."""
 
+DIAMETERS_NM = (2.0, 2000.0)
+"""Range of diameters of the spheres that mode size may search."""
+
 TEMPERATURES_C = (-100.0, 250.0)
 """Temperatures of liquids in a microscope; the upper end is below their values in kelvin."""
 
@@ -111,7 +114,11 @@ class Detection(Section):
 class Fit(Section):
     """The maximum-likelihood fit."""
 
-    mode: Mode = Field("mass", description='"mass" | "localize" | "joint" | "track"')
+    mode: Mode = Field(
+        "mass",
+        description='"mass" | "localize" | "joint" | "size" (spheres, see particle.model) '
+        '| "track"',
+    )
     frames: FrameRange | None = Field(
         None, description="[start, stop); absent: all after the background"
     )
@@ -129,11 +136,16 @@ class Fit(Section):
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
     ] = Field((0.0, 1000.0), description="bounds of z if it is free")
+    diameter_range_nm: tuple[
+        Annotated[Positive, length(*DIAMETERS_NM)], Annotated[Positive, length(*DIAMETERS_NM)]
+    ] = Field((10.0, 400.0), description="bounds of the diameter in mode size")
 
     @model_validator(mode="after")
     def _range(self) -> Fit:
         if not self.z_range_nm[0] < self.z_range_nm[1]:
             raise ValueError(f"z_range_nm = {list(self.z_range_nm)} is empty")
+        if not self.diameter_range_nm[0] < self.diameter_range_nm[1]:
+            raise ValueError(f"diameter_range_nm = {list(self.diameter_range_nm)} is empty")
         return self
 
     def roi_px(self, pixel_nm: float) -> int:

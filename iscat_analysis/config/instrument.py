@@ -47,6 +47,9 @@ UNKNOWN_SD_NM = 20.0
 TYPICAL_DIAMETER_NM = 30.0
 """Diameter of a particle if none is given, unless it is a protein."""
 
+TYPICAL_SPHERE_NM = 100.0
+"""Diameter of a sphere that is not small beside the wavelength, if none is given."""
+
 TYPICAL_PROTEIN_KDA = 150.0
 """Mass of a protein if none is given."""
 
@@ -328,11 +331,22 @@ class Particle(Section):
     kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = Field(
         "protein", description='"gold" | "silica" | "polystyrene" | "protein" | "custom"'
     )
+    model: Literal["dipole", "mie", "shell"] = Field(
+        "dipole",
+        description='"dipole" | "mie": a sphere of any size | "shell": a sphere in a shell',
+    )
     permittivity: tuple[float, float] | None = Field(
         None, description="relative, [re, im]; replaces that of the kind"
     )
     index: Positive | None = Field(None, description="refractive index, in place of permittivity")
-    density_kg_m3: Positive | None = Field(None, description="replaces that of the kind")
+    shell_nm: Annotated[Positive, length(0.1, 1e3)] | None = Field(
+        None, description="thickness of the shell, a part of the diameter; for model shell"
+    )
+    shell_index: Index | None = Field(None, description="refractive index of the shell")
+    density_kg_m3: Positive | None = Field(
+        None,
+        description="replaces that of the kind; for model shell, of core and shell together",
+    )
     mass_kda: Positive | None = Field(
         None, description="start value, and the true mass in a simulation"
     )
@@ -342,8 +356,8 @@ class Particle(Section):
     height_nm: Literal["contact", "auto"] | Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         USUAL_HEIGHT_NM,
         description='z if it is fixed, else its start value | "contact": radius of the particle + '
-        'linker_nm | "auto": 5 nm for optics and mass scale; for the particles, mean and spread '
-        "are learned from the movie",
+        'linker_nm; a sphere that has the default does that too | "auto": 5 nm for optics and mass '
+        "scale; for the particles, mean and spread are learned from the movie",
     )
     linker_nm: Annotated[NonNegative, length(0.0, LARGEST_NM)] = Field(
         0.0, description='between coverslip and particle, for height_nm = "contact"'
@@ -379,6 +393,23 @@ class Particle(Section):
                 raise ValueError('kind = "custom" needs permittivity or index')
             if self.density_kg_m3 is None:
                 raise ValueError('kind = "custom" needs density_kg_m3')
+        shell = {"shell_nm": self.shell_nm, "shell_index": self.shell_index}
+        for name, value in shell.items():
+            if (value is None) == (self.model == "shell"):
+                raise ValueError(
+                    f'model = "shell" needs {name}' if value is None
+                    else f'{name} = {value:g} needs model = "shell", and model is "{self.model}"'
+                )  # fmt: skip
+        if self.model == "shell" and self.density_kg_m3 is None:
+            raise ValueError(
+                'model = "shell" needs density_kg_m3, the mean density of core and shell, because '
+                "the mass is that of both"
+            )
+        if self.shell_nm is not None and self.shell_nm > self.nominal_diameter_nm / 2:
+            raise ValueError(
+                f"shell_nm = {self.shell_nm:g} is more than the radius of a particle of "
+                f"{self.nominal_diameter_nm:g} nm: the shell is a part of the diameter"
+            )
         if self.linker_nm and self.height_nm != "contact":
             raise ValueError(
                 f'linker_nm = {self.linker_nm:g} needs height_nm = "contact", and height_nm is '
@@ -401,9 +432,20 @@ class Particle(Section):
         """Mass that is given, as a mass or a diameter, else a typical one."""
         if self.mass_kda is not None:
             return self.mass_kda
-        if self.diameter_nm is None and self.kind == "protein":
+        if self.diameter_nm is None and self.kind == "protein" and self.model == "dipole":
             return TYPICAL_PROTEIN_KDA
-        return sphere_mass_kda(self.diameter_nm or TYPICAL_DIAMETER_NM, self.density)
+        typical = TYPICAL_DIAMETER_NM if self.model == "dipole" else TYPICAL_SPHERE_NM
+        return sphere_mass_kda(self.diameter_nm or typical, self.density)
+
+    @property
+    def nominal_diameter_nm(self) -> float:
+        """Diameter of a sphere of the nominal mass [nm]."""
+        return sphere_diameter_nm(self.nominal_mass_kda, self.density)
+
+    @property
+    def is_sphere(self) -> bool:
+        """Whether it is a sphere of any size, and no dipole."""
+        return self.model != "dipole"
 
     @property
     def nominal_height_nm(self) -> float:
@@ -428,7 +470,8 @@ class Particle(Section):
         return self._seated_nm(mass_kda) + shift
 
     def _seated_nm(self, mass_kda: float) -> float:
-        if self.height_nm == "contact":
+        stands = self.is_sphere and self.height_nm == USUAL_HEIGHT_NM  # which is of proteins
+        if self.height_nm == "contact" or stands:
             return sphere_diameter_nm(abs(mass_kda), self.density) / 2 + self.linker_nm
         return USUAL_HEIGHT_NM if self.height_nm == "auto" else self.height_nm
 

@@ -21,6 +21,7 @@ from iscat_analysis.config.instrument import CameraConfig, Optics, Particle
 from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
+from iscat_analysis.units import sphere_diameter_nm
 
 
 class Config(Section):
@@ -74,6 +75,21 @@ class Config(Section):
             raise ValueError(
                 'background.method = "tracks" needs an interferometric scheme: dark field needs '
                 "background.frames"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _sphere_with_its_size(self) -> Config:
+        if self.particle.is_sphere:
+            if self.optics.calibrate == "auto":  # optics are learned from dipoles
+                update = {"calibrate": "never"}
+                self.__dict__["optics"] = self.optics.model_copy(update=update)
+            if refusal := sphere_refusal(self):
+                raise ValueError(refusal)
+        elif self.fit.mode == "size":
+            raise ValueError(
+                'fit.mode = "size" fits spheres, and particle.model is "dipole": set '
+                'particle.model = "mie" or "shell"'
             )
         return self
 
@@ -148,5 +164,78 @@ class Config(Section):
         if self.fit.mode == "track":
             return False
         if self.posterior.enabled == "auto":
-            return self.background.method != "sliding"
+            return self.background.method != "sliding" and self.fit.mode != "size"
         return self.posterior.enabled
+
+
+INVISIBLE = 1e-3
+"""Relative difference between the indices of a particle and of the sample below which the particle
+is not seen."""
+
+
+def sphere_refusal(config: Config) -> str:
+    """Say why a configuration does not go together with a sphere; else nothing."""
+    particle, optics, fit = config.particle, config.optics, config.fit
+    if fit.mode not in ("size", "localize"):
+        return (
+            f'fit.mode = "{fit.mode}" is for dipoles, whose picture has one shape, and '
+            f'particle.model is "{particle.model}": use fit.mode = "size", or "localize" for a '
+            "known diameter"
+        )
+    for key, set_to in (
+        ('optics.psf = "measured"', optics.psf == "measured"),
+        ('optics.convention = "dong2021"', optics.convention == "dong2021"),
+        ('optics.emission = "dong2021"', optics.emission == "dong2021"),
+        ('optics.calibrate = "always"', optics.calibrate == "always"),
+        ("[calibration]", config.calibration is not None),
+        ("particle.wiggle_nm", particle.wiggle_nm > 0),
+        ("particle.height_sd_nm", particle.height_sd_nm > 0),
+        ('particle.height_nm = "auto"', particle.height_nm == "auto"),
+    ):
+        if set_to:
+            return (
+                f'{key} is for dipoles, and particle.model is "{particle.model}": leave it out, or '
+                'set particle.model = "dipole"'
+            )
+    diameter = particle.nominal_diameter_nm
+    if max(diameter, fit.diameter_range_nm[1]) > fit.roi_nm:
+        what = (
+            f"particle.diameter_nm = {diameter:.4g}" if diameter > fit.roi_nm
+            else f"fit.diameter_range_nm = {list(fit.diameter_range_nm)}"
+        )  # fmt: skip
+        return (
+            f"{what} is larger than the square that is fitted, fit.roi_nm = {fit.roi_nm:g}: give "
+            "the diameter in nanometres, or a larger square"
+        )
+    if particle.shell_nm is not None and fit.diameter_range_nm[0] < 2 * particle.shell_nm:
+        return (
+            f"fit.diameter_range_nm = {list(fit.diameter_range_nm)} begins below twice "
+            f"particle.shell_nm = {particle.shell_nm:g}, where the shell has no core"
+        )
+    parts = {"particle.index": particle.index, "particle.shell_index": particle.shell_index}
+    known = {name: index for name, index in parts.items() if index is not None}
+    if (
+        known and (particle.index is not None or particle.model == "shell")
+        and all(abs(index / optics.n_sample - 1) < INVISIBLE for index in known.values())
+    ):  # fmt: skip
+        name, index = next(iter(known.items()))
+        return (
+            f"{name} = {index:g} is that of the sample, optics.n_sample = {optics.n_sample:g}: "
+            "such a particle scatters no light"
+        )
+    lowest = particle.nominal_height_nm
+    if lowest < diameter / 2 * (1 - 1e-9):
+        return (
+            f"particle.height_nm = {lowest:g} is less than the radius of a sphere of "
+            f'{diameter:.4g} nm, which would reach into the coverslip: set height_nm = "contact"'
+        )
+    for number, event in enumerate(config.simulation.events):
+        radius = sphere_diameter_nm(
+            event.mass_kda or particle.nominal_mass_kda, particle.density
+        ) / 2  # fmt: skip
+        if event.z_nm is not None and event.z_nm < radius * (1 - 1e-9):
+            return (
+                f"simulation.events[{number}].z_nm = {event.z_nm:g} is less than the radius of a "
+                f"sphere of {2 * radius:.4g} nm, which would reach into the coverslip"
+            )
+    return ""

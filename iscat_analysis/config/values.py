@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
-Mode = Literal["mass", "localize", "joint", "track"]
+Mode = Literal["mass", "localize", "joint", "size", "track"]
 
 
 def _lower(value: Any) -> Any:

@@ -97,7 +97,8 @@ def lines_of(
     """Make the rows of ``fits.csv`` as plain records."""
     heights = {event.fit.estimate[2] for event in events}
     known = {}
-    if len(heights) == 1 and not context.model.is_measured:  # of heights that are not fitted
+    alike = not context.model.is_measured and not context.model.is_sized
+    if len(heights) == 1 and alike:  # of heights that are not fitted
         (height,) = heights
         known[height] = quantum_information(context.model, height)
     return list(mapper(lambda event: _line(context, event, known), events))

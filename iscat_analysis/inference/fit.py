@@ -28,6 +28,9 @@ from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.inference.reach import reach, reaches_far
+from iscat_analysis.inference.sizes import OTHER_SIZE_SHARE, has_other_size, size_starts
+from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     PARAMETERS,
@@ -99,14 +102,18 @@ def _box_around(
     reach, half = window_nm(grid.pixel_nm), grid.pixel_nm / 2
     x, y, _, amplitude, _ = fixed = theta.tolist()
     largest = 100 * max(abs(amplitude), abs(likelihood.model.nominal_amplitude))
-    signed = "z_nm" not in names and likelihood.model.rho > 0
+    smallest = 0.0
+    if isinstance(likelihood.model, SizedModel):
+        smallest, largest = likelihood.model.mass_range_kda
+    signed = "z_nm" not in names and likelihood.model.rho > 0 and not smallest
     if prior is not None:
         names, z_range_nm = (*names, "z_nm"), _searched(prior, likelihood.model.z_range_nm)
     free = [name in names for name in PARAMETERS] + [level]
     left, right = grid.x_nm.item(0) - half, grid.x_nm.item(-1) + half
     top, bottom = grid.y_nm.item(0) - half, grid.y_nm.item(-1) + half
     lower = (
-        max(x - reach, left), max(y - reach, top), z_range_nm[0], -largest if signed else 0.0, -1.0,
+        max(x - reach, left), max(y - reach, top), z_range_nm[0],
+        -largest if signed else smallest, -1.0,
     )  # fmt: skip
     upper = min(x + reach, right), min(y + reach, bottom), z_range_nm[1], largest, 1.0
     return Box(np.array(free), _where(free, lower, fixed), _where(free, upper, fixed))
@@ -149,7 +156,7 @@ def fit_particle(
         found = wider
     best, known, sigma, bias = found.best, found.known, found.sigma, found.bias
     model = likelihood.model
-    alternatives = _alternatives(optima, model.fringe_nm)
+    alternatives = _alternatives(optima, model)
     flags = []
     if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
@@ -157,6 +164,8 @@ def fit_particle(
         flags.append(Status.AT_BOUND)
     if alternatives and alternatives[0].log_likelihood_gap < math.log(AMBIGUITY_ODDS):
         flags.append(Status.AMBIGUOUS_Z)
+    if model.is_sized and has_other_size(alternatives, best, float(sigma[AMPLITUDE])):
+        flags.append(Status.AMBIGUOUS_SIZE)
     if found.p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     estimate = best.theta
@@ -226,6 +235,10 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
     out then, unless there is no reference and so no fringes that a scan could follow.
     """
     theta = _inside(theta, box)
+    model = likelihood.model
+    if isinstance(model, SizedModel) and box.free[2] and box.free[AMPLITUDE]:
+        starts = size_starts(likelihood, model, theta, box)
+        return _ranked(_followed(likelihood, starts, box)), True
     if not box.free[2]:
         return [likelihood.maximize(theta, box.free, box.lower, box.upper)], True
     optima: list[Optimum] = []
@@ -242,6 +255,18 @@ def _optima(likelihood: Likelihood, theta: FloatArray, box: Box) -> tuple[list[O
     if not enough:
         optima.append(_follow(likelihood, theta, box, best))
     return _ranked(optima), not enough
+
+
+def _followed(likelihood: Likelihood, starts: Sequence[FloatArray], box: Box) -> list[Optimum]:
+    """Fit from every start, the best first."""
+    optima: list[Optimum] = []
+    best = -math.inf
+    for start in starts:
+        found = _follow(likelihood, _inside(start, box), box, best)
+        optima.append(found)
+        if found.converged:
+            best = max(best, found.log_likelihood)
+    return optima
 
 
 def _inside(theta: FloatArray, box: Box) -> FloatArray:
@@ -335,14 +360,21 @@ def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[
     return starts
 
 
-def _alternatives(optima: list[Optimum], fringe_nm: float) -> tuple[Alternative, ...]:
-    """Optima at other heights than the best one and than each other."""
+def _alternatives(optima: list[Optimum], model: ForwardModel) -> tuple[Alternative, ...]:
+    """Optima at other heights, or of other sizes, than the best one and than each other."""
     best = optima[0].log_likelihood
-    places = [(float(o.theta[2]), max(best - o.log_likelihood, 0.0)) for o in optima]
+    places = [
+        (float(o.theta[2]), max(best - o.log_likelihood, 0.0), float(o.theta[AMPLITUDE]))
+        for o in optima
+    ]
     kept = places[:1]
-    for z, gap in places[1:]:
-        if all(abs(z - other) > fringe_nm / 8 for other, _ in kept):
-            kept.append((z, gap))
+    for z, gap, amplitude in places[1:]:
+        if all(
+            abs(z - other) > model.fringe_nm / 8
+            or (model.is_sized and abs(amplitude - size) > OTHER_SIZE_SHARE * size)
+            for other, _, size in kept
+        ):
+            kept.append((z, gap, amplitude))
     return tuple(
         sorted((Alternative(*one) for one in kept[1:]), key=lambda a: a.log_likelihood_gap)
     )

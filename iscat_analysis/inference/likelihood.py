@@ -37,7 +37,8 @@ from iscat_analysis._kernels.support import box_supported, supported
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import vector_of
 from iscat_analysis.inference.heights import HeightPrior
-from iscat_analysis.inference.noise_models import NoiseModel
+from iscat_analysis.inference.noise_models import NoiseModel, PixelTerms
+from iscat_analysis.inference.slow_scoring import maximize_slowly
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 from iscat_analysis.optics.stamp import margin_nm
 
@@ -111,6 +112,9 @@ class Likelihood:
         out = np.full(len(points), -np.inf)
         if not inside.any():
             return out
+        if self.model.is_sized:  # each mass has its own picture
+            out[inside] = [self._terms(point).value for point in points[inside]]
+            return out
         if inside.all():
             value_batch(self._table(points[:, 2]), *self._arguments, points, out)
         else:
@@ -138,6 +142,8 @@ class Likelihood:
         point = vector_of("theta", theta, (5,))
         if not self.supports(point[None])[0]:
             return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
+        if self.model.is_sized:
+            return self._score_of_sphere(point)
         score, fisher = np.empty(5), np.empty((5, 5))
         profile = self.model.profile(point[2])
         value = score_pass(profile, *self._arguments, point, score, fisher)
@@ -166,6 +172,12 @@ class Likelihood:
         if free.shape != (5,):
             raise DataError(f"free: has shape {free.shape} where (5,) is needed")
         self._require_box(theta, free, lower, upper)
+        if self.model.is_sized:
+            found = maximize_slowly(
+                self.score_fisher, theta, free, lower, upper, self._farthest,
+                tolerance=tolerance, passes=passes, least=least,
+            )  # fmt: skip
+            return Optimum(*found)
         fisher = np.empty((5, 5))
         lens, pixels, kind, data = self._arguments
         if free[2]:
@@ -214,6 +226,23 @@ class Likelihood:
         """
         height = "exact" if free is None else "between" if free[2] else "fixed"
         return self.model.derivative_rows(self.grid, self._supported(theta), height)
+
+    def _terms(self, point: FloatArray) -> PixelTerms:
+        """Value, score and information of the pixels at θ."""
+        x, y, z, amplitude, level = (float(value) for value in point)
+        signal = self.model.amplitude_image(self.grid, x, y, z, amplitude)
+        return self.noise.terms(self.data, signal, level)
+
+    def _score_of_sphere(self, point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """`score_fisher` of a model whose picture is not proportional to the amplitude."""
+        x, y, z, amplitude, level = (float(value) for value in point)
+        signal, own = self.model.amplitude_gradient(self.grid, x, y, z, amplitude)
+        terms = self.noise.terms(self.data, signal, level)
+        if not math.isfinite(terms.value):
+            return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
+        rows = np.concatenate([own * terms.by_signal, terms.by_level[None]]).reshape(5, -1)
+        score = rows @ terms.score.ravel()
+        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
 
     def observed_information(self, theta: FloatArray) -> FloatArray:
         """Negative Hessian of the log-likelihood.

@@ -7,7 +7,7 @@ quadrature of polar angles θ and azimuths φ; the field is computed from a Four
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
 from iscat_analysis._kernels.zernike import orders, zernike
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.spheres import Sphere
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -35,6 +36,7 @@ class Aperture:
 
     optics: Optics
     pupil: Pupil
+    sphere: Sphere | None = None
 
     @property
     def wavenumber(self) -> float:
@@ -141,30 +143,44 @@ def critical_angle(optics: Optics) -> float | None:
     return math.asin(optics.n_sample / optics.n_immersion) if near else None
 
 
-def aperture_on(optics: Optics, theta: FloatArray, weight: FloatArray) -> Aperture:
-    """Make the pupil on given angles.
+def aperture_on(
+    optics: Optics, theta: FloatArray, weight: FloatArray, sphere: Sphere | None = None
+) -> Aperture:
+    """Make the pupil on given angles, with the light of a dipole or of a sphere.
 
     Shapes: `theta, weight` (n,).
     """
+    wavenumber, direction = 2 * math.pi / optics.wavelength_nm, _direction(optics)
     pupil = make_pupil(
         theta,
         weight,
-        wavenumber=2 * math.pi / optics.wavelength_nm,
+        wavenumber=wavenumber,
         n_immersion=optics.n_immersion,
         n_glass=optics.n_glass,
         n_sample=optics.n_sample,
-        direction=1.0 if optics.scheme == "iscat" else -1.0,
+        direction=direction,
         reciprocal=optics.emission == "reciprocal",
     )
-    return Aperture(optics, pupil)
+    if sphere is not None:
+        cos_s = pupil.axial / (wavenumber * optics.n_sample) - direction
+        along, across = sphere.pattern(cos_s, direction, optics.n_sample, wavenumber)
+        pupil = replace(pupil, t_p_cos=pupil.t_p_cos / cos_s * along, t_s=pupil.t_s * across)
+    return Aperture(optics, pupil, sphere)
 
 
-def aperture(optics: Optics, nodes: int, nodes_above: int) -> Aperture:
+def _direction(optics: Optics) -> float:
+    """1 where the light that is scattered backwards is collected, −1 forwards."""
+    return 1.0 if optics.scheme == "iscat" else -1.0
+
+
+def aperture(
+    optics: Optics, nodes: int, nodes_above: int, sphere: Sphere | None = None
+) -> Aperture:
     """Make the pupil on panels that end at the mask's edge and at the critical angle."""
     alpha = math.asin(optics.na / optics.n_immersion)
     edge = math.asin(optics.mask_na / optics.n_immersion)
     theta, weight = gauss_legendre(alpha, critical_angle(optics), nodes, nodes_above, edge)
-    return aperture_on(optics, theta, weight)
+    return aperture_on(optics, theta, weight, sphere)
 
 
 def weight_on(

@@ -17,13 +17,14 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
     """
     if model.is_measured:
         return math.nan
-    p = model.aperture.pupil
+    amplitude = model.scale.amplitude(mass_kda)
+    p = model.at(amplitude).aperture.pupil
     decay = np.exp(-2 * p.axial.imag * z_nm)
     density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
     pupil_integral = math.pi * float(np.sum(p.weight * density))
     medium = 1.0 if model.optics.emission == "reciprocal" else 1 / model.optics.n_immersion**2
     over = model.reference**2 if model.rho else 1.0
-    e1 = abs(model.strength) * model.scale.amplitude(mass_kda)
+    e1 = abs(model.strength) * amplitude
     return e1**2 * medium * pupil_integral / over
 
 

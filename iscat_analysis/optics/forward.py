@@ -25,19 +25,9 @@ from iscat_analysis.optics.aperture import (
     aperture,
     aperture_on,
     critical_angle,
-    harmonics,
-    weight_on,
 )
 from iscat_analysis.optics.blur import wiggled
-from iscat_analysis.optics.coherence import (
-    Ray,
-    band_of,
-    cone_of,
-    factor_at,
-    is_coherent,
-    over_spectrum,
-    spectrum,
-)
+from iscat_analysis.optics.coherence import is_coherent, spectrum
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import material
@@ -45,13 +35,9 @@ from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.scale import MassScale, carry_refusal
-from iscat_analysis.optics.waves import (
-    Field,
-    LatticeField,
-    RadialField,
-    check_table,
-    radial_field,
-)
+from iscat_analysis.optics.sized import sized
+from iscat_analysis.optics.spheres import Sphere, sphere_of
+from iscat_analysis.optics.waves import RadialField, check_table, field_of
 from iscat_analysis.units import KILODALTON_KG, NM
 
 __all__ = [
@@ -100,7 +86,8 @@ def forward_model(
     oil_nm = height - optics.focus_nm - height * ni / ns
     if z_max_nm is None:
         z_max_nm = max(config.fit.z_range_nm[1], height)
-    opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes)
+    sphere = sphere_of(config.particle, matter.permittivity, matter.mass_kda)
+    opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes, sphere)
     reflection = (ng - ns) / (ng + ns)
     transmission = math.sqrt(1 - reflection**2) if paper else 2 * ng / (ng + ns)
     if optics.scheme == "darkfield":
@@ -110,10 +97,9 @@ def forward_model(
     else:
         forward = 2 * ns / (ns + ng) if reciprocal else transmission
         reference = optics.attenuation * forward
-    polarizability_nm3 = (
-        3 * (KILODALTON_KG / matter.density_kg_m3) / NM**3
-        * (matter.permittivity - ns**2) / (matter.permittivity + 2 * ns**2)
-    )  # fmt: skip
+    polarizability_nm3 = complex(3 * (KILODALTON_KG / matter.density_kg_m3) / NM**3)
+    if sphere is None:  # that of a sphere is in its pattern
+        polarizability_nm3 *= (matter.permittivity - ns**2) / (matter.permittivity + 2 * ns**2)
     if reciprocal:
         incident = transmission if optics.scheme == "iscat" else 1.0
         strength = (ns * k) ** 2 * polarizability_nm3 * incident / (4 * math.pi)
@@ -128,7 +114,10 @@ def forward_model(
     if reference:
         factor *= cmath.exp(-1j * math.radians(optics.reference_phase_deg))
     fixed_oil_nm = -optics.focus_nm if optics.axial == "refocus" else oil_nm
-    wave = _wave(opening, factor, fixed_oil_nm, reach_nm, like)
+    before = like.wave if like else None
+    wave = field_of(
+        opening, factor, fixed_oil_nm, reach_nm, before if isinstance(before, RadialField) else None
+    )
     points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,
@@ -145,6 +134,8 @@ def forward_model(
         z_range_nm=(min(config.fit.z_range_nm[0], height, _lowest_nm(config)), z_max_nm),
         samples=(points / 2, weights / 2),
     )
+    if sphere is not None:
+        model = sized(model, sphere, config.fit.diameter_range_nm)
     if optics.psf == "measured":
         template = Template.read(Path(optics.template or ""))
         template.refuse_mismatch(config.camera.pixel_size_nm, config.fit.roi_nm)
@@ -175,7 +166,12 @@ def signed_peak(model: ForwardModel) -> float:
 
 
 def _pupil(
-    optics: Optics, reach_nm: float, sample_nm: float, oil_nm: float, nodes: int | None
+    optics: Optics,
+    reach_nm: float,
+    sample_nm: float,
+    oil_nm: float,
+    nodes: int | None,
+    sphere: Sphere | None,
 ) -> Aperture:
     """Pupil with enough nodes for its phase; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
@@ -189,52 +185,13 @@ def _pupil(
     intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
     check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
     if optics.convention == "dong2021":
-        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES))
+        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES), sphere)
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,
         nodes or 16 + math.ceil(0.45 * k * path),
         nodes or 14 + math.ceil(0.45 * k * path * beyond),
-    )
-
-
-def _wave(
-    opening: Aperture,
-    factor: complex,
-    oil_nm: float,
-    reach_nm: float,
-    like: ForwardModel | None,
-) -> Field:
-    """Tabulate the field of a pupil, as the pupil's symmetry and the light allow."""
-    optics, pupil = opening.optics, opening.pupil
-    if not (opening.is_round and is_coherent(optics)):
-        phi = opening.azimuths()
-        rays = []
-        for each in spectrum(optics):
-            there = opening if each is optics else aperture_on(each, pupil.theta, pupil.weight)
-            weight, axial = weight_on(there, factor_at(factor, each, optics), oil_nm)
-            rays.append(Ray(there.seen(phi)[None], weight, axial, there.pupil.transverse))
-        whole = over_spectrum(rays)
-        series = harmonics(whole.waves[0], np.abs(whole.weight)) * whole.weight
-        return LatticeField(
-            series, whole.axial, whole.transverse, band_of(optics), reach_nm, cone_of(optics)
-        )
-    weight, axial = weight_on(opening, factor, oil_nm)
-    band = opening.wavenumber * optics.na
-    turn = np.exp(1j * opening.wavenumber * opening.path_nm(np.zeros(1))[:, 0])
-    common = weight / 2 * turn * opening.transmission
-    source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
-    before = like.wave if like else None
-    return radial_field(
-        source,
-        axial,
-        pupil.transverse,
-        band=band,
-        reach_nm=reach_nm,
-        psi=math.radians(optics.polarization_deg),
-        circular=optics.polarization == "circular",
-        analyzer=optics.analyzer,
-        like=before if isinstance(before, RadialField) else None,
+        sphere,
     )
 
 

@@ -62,6 +62,16 @@ class ForwardModel:
     scale: MassScale = field(default_factory=MassScale)
 
     @property
+    def is_sized(self) -> bool:
+        """Whether particles are spheres, whose picture changes its shape with their size."""
+        return False
+
+    def at(self, amplitude: float) -> ForwardModel:
+        """Give the model whose pictures grow in proportion to the amplitude near this one."""
+        del amplitude  # a dipole has one picture
+        return self
+
+    @property
     def wavenumber(self) -> float:
         """2π over the vacuum wavelength [rad/nm]."""
         return 2 * math.pi / self.optics.wavelength_nm

@@ -103,7 +103,8 @@ def _changes(
     rim, edge = (math.asin(na / optics.n_immersion) for na in (optics.na, optics.mask_na))
     # two more directions, with zero weight except where an edge moves
     theta = np.concatenate([opening.pupil.theta, [rim, edge]])
-    whole = aperture_on(optics, theta, np.concatenate([opening.pupil.weight, [1.0, 1.0]]))
+    weights = np.concatenate([opening.pupil.weight, [1.0, 1.0]])
+    whole = aperture_on(optics, theta, weights, opening.sphere)
     weight, axial = weight_on(whole, factor, oil_nm)
     weight = weight * np.exp(1j * axial * z_nm)
     inner = np.ones(theta.size)

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +39,17 @@ from iscat_analysis._kernels.radial import (
     radial_profile,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.coherence import Cone
+from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics, weight_on
+from iscat_analysis.optics.coherence import (
+    Cone,
+    Ray,
+    band_of,
+    cone_of,
+    factor_at,
+    is_coherent,
+    over_spectrum,
+    spectrum,
+)
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.memoize import memoize
 
@@ -336,28 +347,24 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
     return AxialTable(heights, low, step, kappa)
 
 
-def radial_field(
-    source: ComplexArray,
-    axial: ComplexArray,
-    transverse: FloatArray,
-    *,
-    band: float,
+def field_of(
+    opening: Aperture,
+    factor: complex,
+    oil_nm: float,
     reach_nm: float,
-    psi: float,
-    circular: bool,
-    analyzer: bool,
-    like: RadialField | None,
-) -> RadialField:
-    """Tabulate a round pupil.
-
-    Shapes: `transverse` (n,).
-    """
-    step = STEP / band
+    like: RadialField | None = None,
+) -> RadialField | LatticeField:
+    """Tabulate the field of a pupil, as the pupil's symmetry and the light allow."""
+    optics = opening.optics
+    if not (opening.is_round and is_coherent(optics)):
+        whole, series = _series(opening, factor, oil_nm)
+        return LatticeField(
+            series, whole.axial, whole.transverse, band_of(optics), reach_nm, cone_of(optics)
+        )
+    source, axial = _source(opening, factor, oil_nm)
+    transverse = _in_fours(opening.pupil.transverse, "edge")
+    step = STEP / (opening.wavenumber * optics.na)
     intervals = math.ceil(reach_nm / step) + 1
-    padding = -axial.size % 4  # the radial kernel takes the nodes in fours
-    source = np.pad(source, ((0, 0), (0, padding)))
-    axial = np.pad(axial, (0, padding), mode="edge")
-    transverse = np.pad(transverse, (0, padding), mode="edge")
     same = (
         like is not None
         and like.step_nm == step
@@ -365,4 +372,47 @@ def radial_field(
         and np.array_equal(like.transverse, transverse)
     )
     table = like.table if same and like else bessel_table(transverse, step, intervals)
-    return RadialField(source, axial, transverse, table, step, psi, circular, analyzer)
+    return RadialField(
+        source, axial, transverse, table, step, math.radians(optics.polarization_deg),
+        optics.polarization == "circular", optics.analyzer,
+    )  # fmt: skip
+
+
+def with_light_of(field: Field, opening: Aperture, factor: complex, oil_nm: float) -> Field:
+    """Give the table of a field the light of another particle in the same pupil."""
+    if isinstance(field, RadialField):
+        return replace(field, source=_source(opening, factor, oil_nm)[0])
+    if isinstance(field, LatticeField):
+        return replace(field, harmonics=_series(opening, factor, oil_nm)[1])
+    return field
+
+
+def _source(opening: Aperture, factor: complex, oil_nm: float) -> tuple[ComplexArray, ComplexArray]:
+    """Light of a round pupil in the sums of F0 and F2, and its phase per height."""
+    pupil = opening.pupil
+    weight, axial = weight_on(opening, factor, oil_nm)
+    turn = np.exp(1j * opening.wavenumber * opening.path_nm(np.zeros(1))[:, 0])
+    common = weight / 2 * turn * opening.transmission
+    source = np.stack([common * (pupil.t_s + pupil.t_p_cos), common * (pupil.t_s - pupil.t_p_cos)])
+    return _in_fours(source), _in_fours(axial, "edge")
+
+
+def _series(opening: Aperture, factor: complex, oil_nm: float) -> tuple[Ray, ComplexArray]:
+    """Light of any pupil at all its wavelengths, and its harmonics along the azimuth."""
+    optics, pupil = opening.optics, opening.pupil
+    phi = opening.azimuths()
+    rays = []
+    for each in spectrum(optics):
+        there = opening
+        if each is not optics:
+            there = aperture_on(each, pupil.theta, pupil.weight, opening.sphere)
+        weight, axial = weight_on(there, factor_at(factor, each, optics), oil_nm)
+        rays.append(Ray(there.seen(phi)[None], weight, axial, there.pupil.transverse))
+    whole = over_spectrum(rays)
+    return whole, harmonics(whole.waves[0], np.abs(whole.weight)) * whole.weight
+
+
+def _in_fours(values: Any, mode: Literal["constant", "edge"] = "constant") -> Any:
+    """Pad the angles, the last axis: the radial kernel takes them in fours."""
+    padding = [(0, 0)] * (values.ndim - 1) + [(0, -values.shape[-1] % 4)]
+    return np.pad(values, padding, mode=mode)

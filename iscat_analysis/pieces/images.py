@@ -76,7 +76,8 @@ def psf(
     >>> ia.psf(optics, protein, camera, z_nm=np.linspace(0, 400, 5)).shape
     (5, 33, 33)
     """
-    config = config_of(optics, particle, camera, calibration=calibration)
+    mode = "size" if isinstance(particle, Particle) and particle.is_sphere else "joint"
+    config = config_of(optics, particle, camera, mode=mode, calibration=calibration)
     side = int(number_in("pixels", pixels, least=1, most=LARGEST_REGION, whole=True))
     pixel_nm = float(config.camera.pixel_size_nm or 0.0)
     height = particle.nominal_height_nm if z_nm is None else z_nm

@@ -177,7 +177,7 @@ def log_likelihood(
         Pixel size, samples per pixel and read noise.
     n_after, n_before : int
         Frames in the sums; ``n_before=0`` where the background is known.
-    mode : {"mass", "localize", "joint"}
+    mode : {"mass", "localize", "joint", "size"}
         Which parameters are free.
     power_ratio : float, optional
         Light after over light before; by default the ratio of the frames, with `level` free.

@@ -57,8 +57,8 @@ def crb(
         Frames with the particle.
     n_before : array_like
         Frames of background; 0 where the background is known.
-    mode : {"mass", "localize", "joint"}
-        Which parameters are free.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
     joint : bool
         Whether all free parameters are unknown at once; False gives each with the others known.
     level : bool
@@ -154,8 +154,8 @@ def qcrb(
         Background per pixel and frame [e]; it has no effect in dark field.
     n_after : array_like
         Frames with the particle.
-    mode : {"mass", "localize", "joint"}
-        Which parameters are free.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
     joint : bool
         Whether all free parameters are unknown at once; by default each with the others known,
         since height and mass cannot both be measured so well.

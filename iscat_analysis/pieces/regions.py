@@ -20,6 +20,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import (
@@ -31,6 +32,7 @@ from iscat_analysis.records import (
     flagged,
     make_rows,
     verdict,
+    with_diameters,
 )
 from iscat_analysis.search.templates import Templates, make_templates, signal_to_noise
 from iscat_analysis.threads import threads
@@ -80,8 +82,9 @@ def fit_rois(
         Pixel size, samples per pixel and read noise.
     n_after, n_before : int
         Frames in the sums; ``n_before=0`` where the background is known.
-    mode : {"mass", "localize", "joint"}
-        Which parameters are free: x, y and mass; x, y and z; all four.
+    mode : {"mass", "localize", "joint", "size"}
+        Which parameters are free: x, y and mass; x, y and z; all four; x, y, z and the diameter
+        of a sphere.
     power_ratio : array_like, optional
         Light after over light before, one number or one for each region, where it is known from a
         larger field; default the ratio of the frames, with `level` fitted.
@@ -157,6 +160,8 @@ def fit_rois(
     with threads(n_threads) as pool:
         rows = list(pool.map(lambda i: _row(counts, templates, i, corners[i]), range(count)))
     table = make_rows(rows, {"event": range(count)})
+    if mode == "size":
+        table = with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
 
@@ -205,7 +210,19 @@ def line_of(
         row[f"sigma_{name}"] = fit.sigma[k]
         row[f"crb_{name}"] = bounds.crb_joint[k]
         row[f"qcrb_{name}"] = bounds.qcrb[k]
-    return row
+    return row | sizes_of(model, fit) if isinstance(model, SizedModel) else row
+
+
+def sizes_of(model: SizedModel, fit: FitResult) -> dict[str, float]:
+    """Give the next likely diameter and its odds; both are empty if there is none."""
+    others = [other for other in fit.alternatives if math.isfinite(other.log_likelihood_gap)]
+    if not others or "mass_kda" not in fit.free:
+        return {"other_diameter_nm": math.nan, "other_odds": math.nan}
+    sphere = model.sphere.of_mass(others[0].mass_kda)
+    return {
+        "other_diameter_nm": sphere.diameter_nm,
+        "other_odds": math.exp(-others[0].log_likelihood_gap),
+    }
 
 
 def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -> dict[str, Any]:

@@ -17,7 +17,14 @@ import pandas as pd
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, flagged, make_rows
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    FloatArray,
+    Status,
+    flagged,
+    make_rows,
+    with_diameters,
+)
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
@@ -79,6 +86,8 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = make_rows(fits, columns)
+    if mode == "size":
+        table = with_diameters(table, config.particle.density)
     budget = budget_of(
         table, shared, achieved,
         calibrated=config.calibration is not None, scaled=config.fit.sigma == "measured",

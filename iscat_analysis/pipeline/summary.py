@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.bounds import holevo_over_quantum
+from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
@@ -56,7 +57,7 @@ def summary_of(
         "scheme": context.model.optics.scheme,
         "emission": context.model.optics.emission,
         "convention": context.model.optics.convention,
-        "mass_scale": "calibration" if context.config.calibration else "absolute model",
+        "mass_scale": mass_scale_of(context.config),
         **_scale_transfer(context),
         "events": int((table["status"] != Status.SIDELOBE).sum()),
         "status": dict(sorted(Counter(table["status"]).items())),
@@ -191,3 +192,10 @@ def _spread(power: FloatArray) -> float:
     """Give the standard deviation of the light of the frames in which it is known."""
     known = power[np.isfinite(power)]
     return float(np.std(known)) if known.size else 0.0
+
+
+def mass_scale_of(config: Config) -> str:
+    """Say where the masses come from: standards, the volume of spheres, or the model alone."""
+    if config.fit.mode == "size":
+        return "volume and density"
+    return "calibration" if config.calibration else "absolute model"

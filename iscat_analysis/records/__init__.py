@@ -46,7 +46,7 @@ from iscat_analysis.records.frames import (
     StackMetadata,
     Windows,
 )
-from iscat_analysis.records.rows import flagged, make_rows
+from iscat_analysis.records.rows import flagged, make_rows, with_diameters
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
@@ -90,4 +90,5 @@ __all__ = [
     "silent",
     "track_numbers",
     "verdict",
+    "with_diameters",
 ]

@@ -19,6 +19,7 @@ FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "mass": ("x_nm", "y_nm", "mass_kda"),
     "localize": ("x_nm", "y_nm", "z_nm"),
     "joint": PARAMETERS,
+    "size": PARAMETERS,
     "track": PARAMETERS,
 }
 """What each mode fits."""
@@ -144,6 +145,30 @@ EVENTS = (
         "Standard error from eight disjoint parts of the event's own frames, known to 19 %; in "
         "mode track, from the empty places of its frame [{}]",
         "repeats", optional=True,
+    ),
+    Column(
+        "diameter_nm", "positive",
+        "Diameter of the sphere; in mode size, which has mass_kda from it [nm]", "diameter", "nm",
+        optional=True,
+    ),
+    Column(
+        "sigma_diameter_nm", "positive", "Its standard deviation, as that of the mass [nm]", "σ",
+        optional=True,
+    ),
+    Column(
+        "crb_diameter_nm", "positive", "Its joint Cramér–Rao bound [nm]", "CRB", optional=True
+    ),
+    Column(
+        "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
+    ),
+    Column(
+        "other_diameter_nm", "positive",
+        "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
+        optional=True,
+    ),
+    Column(
+        "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
+        optional=True,
     ),
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 from iscat_analysis.records.arrays import BoolArray, FloatArray
@@ -44,10 +45,13 @@ class Alternative:
         The height [nm].
     log_likelihood_gap : float
         Log-likelihood of the best height minus that of this one, ≥ 0.
+    mass_kda : float
+        The mass [kDa]: in mode size, another diameter may have another mass.
     """
 
     z_nm: float
     log_likelihood_gap: float
+    mass_kda: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import pandas as pd
 from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus
+from iscat_analysis.units import sphere_diameter_nm
 
 
 def make_rows(
@@ -39,6 +40,18 @@ def make_rows(
     if table["frame"].isna().any():  # sums do not say when
         types["frame"] = "Int64"
     return table.astype(types)
+
+
+def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:
+    """Add the diameters of spheres, and their errors and bounds, to rows with their masses."""
+    mass = table["mass_kda"].to_numpy(dtype=float)
+    diameter = sphere_diameter_nm(1.0, density_kg_m3) * np.cbrt(np.abs(mass))
+    slope = diameter / (3 * np.abs(mass))
+    columns = {"diameter_nm": diameter} | {
+        f"{kind}_diameter_nm": slope * table[f"{kind}_mass_kda"]
+        for kind in ("sigma", "crb", "qcrb")
+    }
+    return make_rows(table, columns)
 
 
 def flagged(

@@ -13,6 +13,7 @@ class Status(StrEnum):
     NOT_CONVERGED = "not_converged"
     AT_BOUND = "at_bound"
     AMBIGUOUS_Z = "ambiguous_z"
+    AMBIGUOUS_SIZE = "ambiguous_size"
     POOR_FIT = "poor_fit"
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
@@ -37,6 +38,8 @@ _ADVICE = {
     "particle there, or wrong optics), or of a mass (below a calibration.offset).",
     Status.AMBIGUOUS_Z: "Another height explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.z_range_nm.",
+    Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
+    "another focus, or a narrower fit.diameter_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
     "neighbours.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
@@ -65,6 +68,7 @@ SEVERITY = (
     Status.POOR_FIT,
     Status.CHANGING,
     Status.EXTENDED,
+    Status.AMBIGUOUS_SIZE,
     Status.AMBIGUOUS_Z,
     Status.TOO_CLOSE,
     Status.SATURATED,
@@ -73,7 +77,8 @@ SEVERITY = (
     Status.PROCESSED,
 )
 """Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; a
-model that does not describe the data, their change in time or their width; one of several heights;
+model that does not describe the data, their change in time or their width; one of several diameters
+or heights;
 a mass shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that
 are not in proportion to the light; frames that were processed."""
 

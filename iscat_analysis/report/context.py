@@ -43,6 +43,7 @@ _MODES = {
     "mass": "position and mass, height fixed",
     "localize": "position in three dimensions, mass fixed",
     "joint": "position in three dimensions and mass",
+    "size": "position in three dimensions and diameter of a sphere",
     "track": "position and mass in every frame, linked into tracks",
 }
 _SIGNS = {

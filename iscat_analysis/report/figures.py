@@ -160,8 +160,10 @@ def _main_values(analysis: Analysis, table: pd.DataFrame) -> tuple[FloatArray, F
     """Give the main quantity of every row, its σ, and the label of its axis."""
     main = main_quantity(analysis)
     values = table[main.column].to_numpy(float)
-    named = table if main.column in UNITS else as_contrasts(table.assign(contrast=values))
-    sigma = named[f"sigma_{main.column if main.column in UNITS else 'mass_kda'}"].to_numpy(float)
+    if f"sigma_{main.column}" in table:
+        sigma = table[f"sigma_{main.column}"].to_numpy(float)
+    else:
+        sigma = as_contrasts(table.assign(contrast=values))["sigma_mass_kda"].to_numpy(float)
     return values, sigma, f"{main.label} [{main.unit}]" if main.unit else main.label
 
 

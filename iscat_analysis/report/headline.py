@@ -78,13 +78,18 @@ class Precision:
 def is_uncalibrated(analysis: Analysis) -> bool:
     """Tell whether masses were fitted on the model's own scale."""
     fitted = "mass_kda" in FREE_PARAMETERS[analysis.mode]
-    return fitted and analysis.summary.get("mass_scale") != "calibration"
+    return fitted and analysis.summary.get("mass_scale") not in (
+        "calibration",
+        "volume and density",
+    )
 
 
 def main_quantity(analysis: Analysis) -> Quantity:
     """Choose the main quantity."""
     if "mass_kda" not in FREE_PARAMETERS[analysis.mode]:
         return Quantity("z_nm", "height", "nm")
+    if analysis.mode == "size":
+        return Quantity("diameter_nm", "diameter", "nm")
     if not is_uncalibrated(analysis):
         return Quantity("mass_kda", "mass", "kDa")
     if analysis.scheme == "darkfield":
@@ -100,6 +105,13 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
     if "systematic_contrast" in table:
         scaled["systematic_mass_kda"] = table["systematic_contrast"]
     return table.assign(**scaled, mass_kda=table["contrast"])
+
+
+def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
+    """Put the diameters of spheres in the place of their masses."""
+    names = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
+    sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in names}
+    return table.assign(**sizes, mass_kda=table["diameter_nm"])
 
 
 def label_of(analysis: Analysis, name: str) -> str:

@@ -18,7 +18,7 @@ Share = Annotated[float, Field(ge=0, le=1)] | None
 Interval = tuple[Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
-Mode = Literal["mass", "localize", "joint", "track"]
+Mode = Literal["mass", "localize", "joint", "size", "track"]
 Scheme = Literal["iscat", "cobri", "darkfield"]
 Emission = Literal["dong2021", "reciprocal"]
 Convention = Literal["exact", "dong2021"]

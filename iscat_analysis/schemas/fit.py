@@ -394,7 +394,10 @@ class Summary(Document):
     scheme: Scheme = key("Optical scheme")
     emission: Emission = key("Emission model")
     convention: Convention = key("Formulas")
-    mass_scale: str = key("Where the mass scale comes from: a calibration, or the model")
+    mass_scale: str = key(
+        "Where the mass scale comes from: a calibration, the volume and density of spheres, or the "
+        "model"
+    )
     scale: Scale = maybe("With a calibration: its conversion to the optics of the movie")
     status: dict[str, Count] = key("Events by status")
     frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")

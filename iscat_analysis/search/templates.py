@@ -102,6 +102,7 @@ def make_templates(
         check_table("the family of templates", float(count) * (2 * half + 1) ** 2)
         heights = np.linspace(low, high, count)
     bare = replace(model, scale=MassScale())
+    bare = bare.at(bare.nominal_amplitude)
     weak = _weak_amplitude(bare)
     images, roughness = [], []
     for z in heights:

@@ -1,0 +1,93 @@
+"""Starts of a fit of a sphere: every branch of its diameter and height.
+
+The contrast of a sphere rises with the diameter, turns, and may change its sign, so that several
+diameters have about the same picture, each at a height of its own.  Diameters and heights are
+therefore scanned together, and every local maximum of the likelihood starts a fit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.inference.likelihood import Likelihood, Optimum
+from iscat_analysis.optics.sized import SizedModel
+from iscat_analysis.records import Alternative, Box
+
+FloatArray = NDArray[np.float64]
+
+LIGHT_RATIO = 1.5
+"""Ratio of the scattered amplitudes of neighbouring diameters of the scan, of small spheres."""
+
+FRINGE_SHARE = 1 / 16
+"""Largest step of the diameter in the scan over the fringe λ/(2 n_s): an eighth of a turn of the
+phase of the light scattered backwards."""
+
+HEIGHTS_PER_FRINGE = 8
+"""Heights scanned per interference fringe."""
+
+SURE_ODDS = 1000.0
+"""Another diameter whose odds against the best are shorter than this is reported as ambiguous."""
+
+OTHER_SIZE = 3.0
+"""Standard errors of the mass beyond which another maximum has another size."""
+
+OTHER_SIZE_SHARE = 0.02
+"""Share of the mass by which two maxima at one height differ at least."""
+
+_FOLLOWED = 6  # local maxima that are followed
+
+
+def size_starts(
+    likelihood: Likelihood, model: SizedModel, theta: FloatArray, box: Box
+) -> list[FloatArray]:
+    """Local maxima of the likelihood over diameter and height, best first."""
+    masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
+    low, high = float(box.lower[2]), float(box.upper[2])
+    count = max(math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1, 3)
+    heights = np.linspace(low, high, count)
+    x, y, level = float(theta[0]), float(theta[1]), float(theta[4])
+    values = np.empty((masses.size, heights.size))
+    for i, mass in enumerate(masses.tolist()):
+        linear = model.at(mass)
+        for j, z in enumerate(heights.tolist()):
+            signal = linear.amplitude_image(likelihood.grid, x, y, z, mass)
+            values[i, j] = likelihood.noise.terms(likelihood.data, signal, level).value
+    around = np.pad(values, 1, constant_values=-np.inf)
+    neighbours = [
+        around[1 + i : 1 + i + masses.size, 1 + j : 1 + j + heights.size]
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+    ]
+    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(neighbours, axis=0)))
+    ranked = sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])
+    starts = []
+    for i, j in ranked[:_FOLLOWED]:
+        begin = theta.copy()
+        begin[2], begin[3] = heights[j], masses[i]
+        starts.append(begin)
+    return starts or [theta.copy()]
+
+
+def scanned_masses(model: SizedModel, low_kda: float, high_kda: float) -> FloatArray:
+    """Masses of a scan from one end of a range to the other [kDa], shape (n,)."""
+    low, high = (model.sphere.of_mass(mass).diameter_nm for mass in (low_kda, high_kda))
+    ratio, step = LIGHT_RATIO ** (1 / 3), FRINGE_SHARE * model.fringe_nm
+    diameters = [low]
+    while diameters[-1] < high:
+        diameters.append(min(diameters[-1] * ratio, diameters[-1] + step))
+    diameters[-1] = high
+    return high_kda * (np.array(diameters) / high) ** 3
+
+
+def has_other_size(alternatives: Sequence[Alternative], best: Optimum, sigma_kda: float) -> bool:
+    """Whether another maximum, almost as likely, has another diameter."""
+    mass = float(best.theta[3])
+    return any(
+        other.log_likelihood_gap < math.log(SURE_ODDS)
+        and abs(other.mass_kda - mass) > OTHER_SIZE * sigma_kda
+        for other in alternatives
+    )

@@ -1,0 +1,388 @@
+"""Spheres of any size: Mie's amplitudes, their pictures, and what they become where they are small.
+
+The judges know nothing of the program: amplitudes of two libraries, and a sum over all rays of the
+pupil that follows each electric field through space, glass and lens as a vector.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import miepython
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.polynomial import Legendre, Polynomial
+from numpy.typing import NDArray
+
+import iscat_analysis as ia
+from iscat_analysis.bounds import event_bounds, quantum_information
+from iscat_analysis.bounds.experiment import bounds_report, plan
+from iscat_analysis.config import Config, configure
+from iscat_analysis.optics.collected import collected_area_nm2
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients
+from iscat_analysis.records import PARAMETERS
+from iscat_analysis.units import sphere_mass_kda
+
+ComplexArray = NDArray[np.complex128]
+
+GRID = PixelGrid.centred(15, 130.0)
+SILICA, GOLD = 1.46, 0.5423 + 2.2667j
+
+SCATTNLAY = {
+    # size parameter, relative index: S1 and S2 at the cosines −1, −0.5, 0 and 0.9 (scattnlay 2.4)
+    (0.4, 1.46 / 1.33 + 0j): (
+        [
+            1.0641004251655e-05 - 0.0038650017868708j,
+            1.0643376405872e-05 - 0.0039298419369331j,
+            1.0645748696715e-05 - 0.0039954408035622j,
+            1.0650019164541e-05 - 0.0041154525977057j,
+        ],
+        [
+            -1.0641004251655e-05 + 0.0038650017868708j,
+            -5.3205365944968e-06 + 0.0019609816194613j,
+            1.5355349262679e-09 - 5.2950341730575e-06j,
+            9.5853090192202e-06 - 0.0037049280940655j,
+        ],
+    ),
+    (2.5, 1.1 + 0j): (
+        [
+            -0.024309217224205 + 0.11110828875271j,
+            0.012492041321626 + 0.024525045126045j,
+            0.055044245666593 - 0.16577363277229j,
+            0.14694749656427 - 0.94669625478217j,
+        ],
+        [
+            0.024309217224205 - 0.11110828875271j,
+            0.014784893349061 - 0.023281041079974j,
+            0.030736983297985 - 0.026700077457318j,
+            0.139054671276 - 0.86292485150994j,
+        ],
+    ),
+    (1.2, 0.4 + 1.7j): (
+        [
+            0.59395226234912 + 0.30980776312346j,
+            0.83223149162037 + 0.26077948567819j,
+            1.0808812279691 + 0.21338470072277j,
+            1.5569947014234 + 0.13472489262698j,
+        ],
+        [
+            -0.59395226234912 - 0.30980776312346j,
+            -0.71909810444167 + 0.13208878554816j,
+            -0.41373326205127 + 0.38719480525591j,
+            1.3192005980913 + 0.20867019735797j,
+        ],
+    ),
+}
+COSINES = np.array([-1.0, -0.5, 0.0, 0.9])
+
+
+def of(scheme: str, **changes: Any) -> Config:
+    """Make a configuration of a sphere, changed by section."""
+    sections: dict[str, dict[str, Any]] = {
+        "optics": {"scheme": scheme, "attenuation": 0.7, "focus_nm": 150.0},
+        "camera": {"pixel_size_nm": 90.0},
+        "particle": {"kind": "silica", "model": "mie", "diameter_nm": 150.0, "height_nm": 130.0},
+        "fit": {"mode": "size"},
+        "bounds": {"pixels": 25, "n_before": 50, "n_after": 50},
+    }
+    for section, keys in changes.items():
+        sections[section] = {k: v for k, v in (sections[section] | keys).items() if v is not None}
+    return configure(sections)
+
+
+def model_of(config: Config) -> ForwardModel:
+    """Make the model of a configuration, for the pixels of `GRID`."""
+    return forward_model(config, 2200.0)
+
+
+@pytest.mark.parametrize("case", SCATTNLAY)
+def test_amplitudes_agree_with_a_second_library(case: tuple[float, complex]) -> None:
+    found = amplitudes(coefficients(case[0], case[0], case[1], 0.0), COSINES.astype(complex))
+    expected = np.array(SCATTNLAY[case])
+    assert np.abs(np.array(found) - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+def slow_amplitudes(x: float, m: complex, mu: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
+    """S₁ and S₂ at complex angles, from derivatives of Legendre polynomials."""
+    a, b = miepython.an_bn(np.conj(np.complex128(m)), x, 18)
+    s1, s2 = np.zeros((2, *mu.shape), dtype=complex)
+    for n in range(1, a.size + 1):
+        p: Any = Legendre.basis(n).convert(kind=Polynomial).deriv()
+        slope = mu * p(mu) - (1 - mu**2) * p.deriv()(mu)
+        share = (2 * n + 1) / (n * (n + 1))
+        s1 += share * (a[n - 1] * p(mu) + b[n - 1] * slope)
+        s2 += share * (a[n - 1] * slope + b[n - 1] * p(mu))
+    return s1, s2
+
+
+def slow_picture(config: Config, index: complex, x_nm: float, y_nm: float) -> NDArray[np.float64]:
+    """Signal by a sum over rays, each with its field as a vector in space."""
+    o, height = config.optics, config.particle.nominal_height_nm
+    k, ns, n = 2 * math.pi / o.wavelength_nm, o.n_sample, o.n_immersion
+    x = ns * k * config.particle.nominal_diameter_nm / 2
+    down = o.scheme == "iscat"  # the light comes from below and is scattered back
+    grazing = math.asin(min(ns / n, o.na / n))
+    rim, t = math.asin(o.na / n), np.polynomial.legendre.leggauss(120)
+    nodes, weights = [], []
+    for low, high in ((0.0, grazing), (grazing, rim)):
+        u = math.sqrt(high - low) * (t[0] + 1) / 2  # a square root begins where light grazes
+        inner = low == 0.0
+        nodes.append(high - u**2 if inner else low + u**2)
+        weights.append(math.sqrt(high - low) * t[1] * u)
+    theta, w = np.concatenate(nodes), np.concatenate(weights)
+    phi = np.arange(96) * (2 * math.pi / 96)
+    cos_s = np.sqrt(1 - (n * np.sin(theta) / ns) ** 2 + 0j)
+    sin_s, cos_g = n * np.sin(theta) / ns, np.cos(theta)
+    s1, s2 = slow_amplitudes(x, index / ns, -cos_s if down else cos_s)
+    c, s = np.cos(phi), np.sin(phi)
+    ahead = 1.0 if down else -1.0  # the incident ray along z
+    zeros = np.zeros_like(c)
+    across = np.array([-s, c, zeros])  # unit vector across the plane of scattering
+    incident_along = np.array([c, s, zeros])
+    # vectors of the scattered ray (angles, 3, azimuths): e_along × ray stays as for the incident
+    ray = np.stack([sin_s[:, None] * c, sin_s[:, None] * s, -cos_s[:, None] * np.ones_like(c)], 1)
+    turn = ahead * (-cos_s)  # cosine of the angle between the two rays
+    along = (turn[:, None, None] * incident_along - sin_s[:, None, None]
+             * np.array([zeros, zeros, ahead + zeros]))  # fmt: skip
+    assert np.abs(np.einsum("icj,icj->ij", along, ray)).max() < 1e-12
+    far = 1j / (ns * k) * (s2[:, None, None] * along * c - s1[:, None, None] * across * s)
+    # the coverslip: p along the vector that lies in the plane of incidence, s across it
+    p_vector = np.stack([cos_s[:, None] * c, cos_s[:, None] * s, sin_s[:, None] + 0 * c], 1)
+    p = np.einsum("icj,icj->ij", far, p_vector)
+    q = np.einsum("icj,cj->ij", far, across)
+    front = 2 * n * cos_g
+    p = p * (front / (n * cos_s + ns * cos_g))[:, None]
+    q = q * (front / (n * cos_g + ns * cos_s))[:, None]
+    ex, ey = p * c - q * s, p * s + q * c
+    oil = height - o.focus_nm - height * n / ns
+    path = ns * height * (cos_s + (1 if down else -1)) + n * oil * (np.cos(theta) - 1)
+    weight = np.sin(theta) * np.sqrt(np.cos(theta)) * w * np.exp(1j * k * path)
+    r = (n - ns) / (n + ns)
+    come, reference = (2 * n / (n + ns), r) if down else (1.0, 2 * ns / (ns + n))
+    reference *= o.attenuation
+    factor = -1j * k * n / (2 * math.pi) * come * (2 * math.pi / phi.size)
+    out = np.empty(GRID.shape)
+    for i, y in enumerate(GRID.y_nm - y_nm):
+        for j, dx in enumerate(GRID.x_nm - x_nm):
+            wave = weight[:, None] * np.exp(1j * k * n * np.sin(theta)[:, None] * (dx * c + y * s))
+            along_x, along_y = (factor * np.sum(wave * e) / reference for e in (ex, ey))
+            out[i, j] = abs(1 + along_x) ** 2 + abs(along_y) ** 2 - 1
+    return out
+
+
+@pytest.mark.parametrize(
+    ("scheme", "index", "diameter", "na"),
+    [("iscat", SILICA, 200.0, 1.42), ("cobri", GOLD, 100.0, 1.2)],
+)
+def test_the_picture_is_a_sum_over_rays(
+    scheme: str, index: complex, diameter: float, na: float
+) -> None:
+    permittivity = [float((index**2).real), float(np.imag(index**2))]
+    particle = {"kind": "custom", "permittivity": permittivity, "density_kg_m3": 2000.0,
+                "diameter_nm": diameter}  # fmt: skip
+    config = of(scheme, optics={"na": na}, particle=particle)
+    model = model_of(config)
+    signal = model.image(GRID, 40.0, -70.0, 130.0, model.material.mass_kda)
+    slow = slow_picture(config, index, 40.0, -70.0)
+    assert np.abs(signal - slow).max() < 1e-6 * np.abs(slow).max()
+
+
+@pytest.mark.parametrize("scheme", ["iscat", "cobri"])
+def test_a_small_sphere_is_a_dipole(scheme: str) -> None:
+    """The difference falls with the square of the diameter; what is left without it is nothing."""
+    dipole = model_of(of(scheme, particle={"model": "dipole"}, fit={"mode": "joint"}))
+    sphere = model_of(of(scheme))
+    differences = []
+    for diameter in (1.0, 2.0):
+        mass = sphere_mass_kda(diameter, 2200.0)
+        as_dipole = dipole.image(GRID, 30.0, 20.0, 130.0, mass)
+        difference = sphere.image(GRID, 30.0, 20.0, 130.0, mass) - as_dipole
+        differences.append(difference / np.abs(as_dipole).max())
+    one, two = differences
+    assert 1e-7 < np.abs(one).max() < 1e-4  # the control: a sphere is no dipole
+    assert np.abs(4 * one - two).max() / 3 < 1e-6
+
+
+def test_derivatives_are_those_of_the_picture() -> None:
+    model = model_of(of("iscat"))
+    mass = model.material.mass_kda
+    theta = np.array([35.0, -20.0, 130.0, mass])
+    _, gradient, hessian = model.amplitude_hessian(GRID, *map(float, theta))
+    _, first = model.amplitude_gradient(GRID, *map(float, theta))
+    for k, step in enumerate((2.0, 2.0, 2.0, 0.01 * mass)):
+        moved = []
+        for times in (-2, -1, 1, 2):
+            at = theta.copy()
+            at[k] += times * step
+            moved.append(model.amplitude_image(GRID, *map(float, at)))
+        expected = (moved[0] - 8 * moved[1] + 8 * moved[2] - moved[3]) / (12 * step)
+        for found in (gradient[k], first[k]):
+            assert np.abs(found - expected).max() < 1e-5 * np.abs(expected).max()
+        pairs = [(k, 0), (k, 3)]
+        for i, j in pairs:
+            below, above = theta.copy(), theta.copy()
+            below[i] -= step / 2
+            above[i] += step / 2
+            slopes = [
+                model.amplitude_gradient(GRID, *map(float, at))[1][j] for at in (below, above)
+            ]
+            bend = (slopes[1] - slopes[0]) / step
+            assert np.abs(hessian[i, j] - bend).max() < 1e-3 * np.abs(bend).max()
+
+
+def test_the_quantum_bound_is_of_the_same_light() -> None:
+    """It is that of a dipole for a small sphere, and below the camera's bound for a large one."""
+    dipole = model_of(of("iscat", particle={"model": "dipole"}, fit={"mode": "joint"}))
+    sphere = model_of(of("iscat"))
+    small = sphere_mass_kda(2.0, 2200.0)
+    expected = quantum_information(dipole, 130.0)
+    found = quantum_information(sphere, 130.0, amplitude=small)
+    assert np.abs(found - expected).max() < 1e-3 * np.abs(expected).max()
+    large = quantum_information(sphere, 130.0)[3, 3].real
+    mass = sphere.material.mass_kda
+    photons = [collected_area_nm2(sphere, 130.0, m) for m in (0.999 * mass, 1.001 * mass)]
+    assert large > (math.log(photons[1] / photons[0]) / 0.002) ** 2  # of their number alone
+    assert large < 0.6 * expected[3, 3].real  # light that a dipole would scatter back is lost
+    experiment = plan(of("iscat"))
+    bounds = event_bounds(experiment.likelihood, experiment.theta, PARAMETERS, experiment.collected)
+    assert np.all(bounds.crb_single > bounds.qcrb)
+    assert bounds_report(of("iscat"))["at"]["mode"] == "size"
+
+
+def test_light_is_counted_where_it_falls() -> None:
+    """What the pupil collects arrives on the camera, all but what falls beside the pixels."""
+    experiment = plan(of("iscat", camera={"samples_per_pixel": 2}, bounds={"pixels": 81}))
+    assert 0.97 < experiment.on_camera / experiment.collected < 1.0
+
+
+def test_a_sphere_that_grows_is_no_longer_proportional_to_its_mass() -> None:
+    sphere = Sphere(1.0, 2200.0, SILICA)
+    cos_s, k = np.array([1.0 + 0j]), 2 * math.pi / 525.0
+    small, large = (
+        sphere.of_mass(sphere_mass_kda(d, 2200.0)).pattern(cos_s, 1.0, 1.33, k)[1][0]
+        for d in (2.0, 250.0)
+    )
+    assert abs(large / small) < 0.5
+
+
+BAD = [
+    ({"particle": {"diameter_nm": 5000.0}}, "larger than the square"),
+    ({"particle": {"height_nm": 20.0}}, "reach into the coverslip"),
+    ({"particle": {"kind": "custom", "index": 1.33, "density_kg_m3": 1000.0}}, "scatters no light"),
+    ({"particle": {"model": "shell", "shell_nm": 90.0, "shell_index": 1.48,
+                   "density_kg_m3": 1000.0}}, "more than the radius"),
+    ({"particle": {"model": "shell", "shell_nm": 5.0}}, "needs shell_index"),
+    ({"particle": {"shell_nm": 5.0}}, 'needs model = "shell"'),
+    ({"particle": {"model": "dipole"}}, "fits spheres"),
+    ({"fit": {"mode": "mass"}}, "is for dipoles"),
+    ({"fit": {"diameter_range_nm": [300.0, 200.0]}}, "is empty"),
+    ({"optics": {"calibrate": "always"}}, "is for dipoles"),
+    ({"optics": {"n_sample": [1.33, 0.01]}}, "n_sample"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changes", "message"), BAD)
+def test_what_cannot_be_is_said(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(Exception, match=message) as caught:
+        of("iscat", **changes)
+    assert type(caught.value).__name__ == "ConfigError"
+
+
+def test_a_bubble_has_the_other_sign() -> None:
+    """An index below that of the sample is no error: such particles exist."""
+    bubble = {"kind": "custom", "density_kg_m3": 1000.0, "diameter_nm": 40.0}
+    peaks = [
+        model.peak_contrast(130.0, model.material.mass_kda)
+        for index in (1.30, 1.36)
+        for model in [model_of(of("iscat", particle=bubble | {"index": index}))]
+    ]
+    assert peaks[0] * peaks[1] < 0
+
+
+OPTICS = ia.Optics(na=1.42, focus_nm=0.0)
+CAMERA = ia.Camera(pixel_size_nm=90.0, gain_e_per_adu=1.0, offset_adu=0.0, read_noise_e=0.0)
+
+
+def counts_of(particle: ia.Particle, count: int, light_e: float, seed: int) -> list[Any]:
+    """Draw counts before and after particles that land, of as much light in all frames."""
+    rng = np.random.default_rng(seed)
+    places = rng.uniform(-45.0, 45.0, (2, count))
+    heights = particle.nominal_height_nm + rng.uniform(0.0, 30.0, count)
+    pictures = ia.psf(
+        OPTICS, particle, CAMERA, pixels=23, x_nm=places[0], y_nm=places[1], z_nm=heights
+    )
+    return [rng.poisson(light_e * light) for light in (np.ones_like(pictures), 1 + pictures)]
+
+
+def fitted(particle: ia.Particle, counts: list[Any], mode: str = "size") -> pd.DataFrame:
+    """Fit particles in regions."""
+    return ia.fit_rois(
+        *counts, OPTICS, particle, CAMERA, n_before=100, n_after=100, mode=mode, power_ratio=1.0,
+        z_range_nm=(0.0, 250.0),
+    )  # fmt: skip
+
+
+def test_the_diameter_is_found_and_a_dipole_does_not_fit() -> None:
+    sphere = ia.Particle(kind="silica", model="mie", diameter_nm=150.0)
+    counts = counts_of(sphere, 2, 1e6, seed=4)
+    table = fitted(sphere, counts)
+    assert set(table["status"]) == {"ok"}
+    assert np.all(np.abs(table["diameter_nm"] - 150.0) < 4 * table["sigma_diameter_nm"])
+    assert np.allclose(table["sigma_diameter_nm"], table["crb_diameter_nm"], rtol=0.05)
+    assert np.all(table["qcrb_diameter_nm"] < table["crb_diameter_nm"])
+    expected = sphere_mass_kda(1.0, 2200.0) * table["diameter_nm"] ** 3
+    assert np.allclose(table["mass_kda"], expected)
+    dipole = ia.Particle(kind="silica", diameter_nm=150.0, height_nm="contact")
+    assert set(fitted(dipole, counts, "joint")["status"]) == {"poor_fit"}
+
+
+@pytest.mark.large
+@pytest.mark.parametrize(
+    ("kind", "diameter"),
+    [("gold", 20.0), ("gold", 80.0), ("gold", 150.0), ("silica", 50.0), ("silica", 150.0),
+     ("silica", 300.0)],
+)  # fmt: skip
+def test_errors_of_the_diameter_are_as_large_as_said(
+    kind: str, diameter: float, share: float
+) -> None:
+    """Pulls of n fits have the mean 0 ± 1/√n and the spread 1 ± 1/√(2n)."""
+    sphere = ia.Particle(kind=kind, model="mie", diameter_nm=diameter)
+    n = max(4, round(40 * share))
+    table = fitted(sphere, counts_of(sphere, n, 1e6, seed=8))
+    pulls = (table["diameter_nm"] - diameter) / table["sigma_diameter_nm"]
+    assert abs(pulls.mean()) < 4 / math.sqrt(n)
+    assert abs(pulls.std() - 1) < 4 / math.sqrt(2 * n)
+    assert (table["status"] == "ok").mean() > 0.8
+
+
+@pytest.mark.large
+def test_two_diameters_that_faint_light_does_not_tell_apart_are_said() -> None:
+    """Of forty photoelectrons per pixel most diameters have another; of a million none has."""
+    sphere = ia.Particle(kind="silica", model="mie", diameter_nm=100.0)
+    few, many = (fitted(sphere, counts_of(sphere, 8, light, seed=2)) for light in (40.0, 1e6))
+    ambiguous = ["ambiguous_size" in flags for flags in few["flags"]]
+    assert sum(ambiguous) >= 2
+    assert np.all(few["other_odds"][ambiguous] > 1e-3)
+    assert not any("ambiguous_size" in flags for flags in many["flags"])
+
+
+@pytest.mark.large
+def test_a_shell_of_the_same_index_is_none() -> None:
+    """And a vesicle is none: water in a shell scatters less than a sphere of the shell's matter."""
+    pytest.importorskip("scattnlay")
+    keys = {"density_kg_m3": 1000.0, "diameter_nm": 120.0}
+    solid = ia.psf(OPTICS, ia.Particle(kind="custom", model="mie", index=1.46, **keys), CAMERA)
+    shell, vesicle = (
+        ia.psf(
+            OPTICS,
+            ia.Particle(kind="custom", model="shell", index=core, shell_nm=5, shell_index=1.46,
+                        **keys),
+            CAMERA,
+        )
+        for core in (1.46, 1.335)
+    )  # fmt: skip
+    assert np.abs(shell - solid).max() < 1e-8 * np.abs(solid).max()
+    assert np.abs(vesicle).max() < 0.7 * np.abs(solid).max()
