@@ -7,7 +7,7 @@ c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +85,15 @@ class Camera:
             if not np.all(most < self.well_depth_e):
                 full |= self.to_electrons(counts) >= self.well_depth_e
         return full
+
+    def part(self, here: tuple[Any, ...]) -> Camera:
+        """Give the camera of some pixels."""
+        maps = {
+            name: value[here]
+            for name in ("gain_e_per_adu", "offset_adu", "read_noise_e")
+            if isinstance(value := getattr(self, name), np.ndarray)
+        }
+        return replace(self, **maps) if maps else self
 
     def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:
         """Variance of the read noise of one frame.
