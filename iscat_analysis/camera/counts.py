@@ -7,6 +7,7 @@ c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -88,12 +89,15 @@ class Camera:
 
     def part(self, here: tuple[Any, ...]) -> Camera:
         """Give the camera of some pixels."""
-        maps = {
-            name: value[here]
-            for name in ("gain_e_per_adu", "offset_adu", "read_noise_e")
-            if isinstance(value := getattr(self, name), np.ndarray)
-        }
-        return replace(self, **maps) if maps else self
+        return self.mapped(lambda image: image[here])
+
+    def mapped(self, cut: Callable[[FloatArray], FloatArray]) -> Camera:
+        """Give the camera of pixels that are cut out of its maps."""
+        gain, offset, read = (
+            cut(value) if isinstance(value, np.ndarray) else value
+            for value in (self.gain_e_per_adu, self.offset_adu, self.read_noise_e)
+        )
+        return replace(self, gain_e_per_adu=gain, offset_adu=offset, read_noise_e=read)
 
     def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:
         """Variance of the read noise of one frame.

@@ -248,6 +248,7 @@ def analyse_landings(
         "noise_frames": list(opening.curve.frames),
         "noise_variance_over_shot": list(opening.curve.variance_over_shot),
         "noise_spectrum": noise.summary,
+        **({"judged_by": opening.sample} if opening.sample else {}),
         **searched,
         "frames_left_out": merged.left_out(),
         "drift_px": drift,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.camera.field_sample import sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import (
@@ -102,6 +104,18 @@ class Reader:
         The system can take such pages back, but would have to read them again.
         """
         return self.frame_bytes // 2 if self._placed else self.frame_bytes
+
+    @cached_property
+    def sampled(self) -> Reader:
+        """A reader of a sample of the pixels, by which noise is judged; itself of a small field."""
+        movie, camera = sampled(self._movie, self.camera)
+        if movie is self._movie:
+            return self
+        return Reader(movie, camera, self.first, self.last, self._room_bytes, dark_e=self._dark_e)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames of the movie, without keeping them."""
+        return self._movie.read(start, stop)
 
     @property
     def name(self) -> str:
@@ -309,8 +323,9 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
     dark_e = -math.inf
     if config.optics.scheme != "darkfield" and span[0] < span[1]:
         numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
-        some = np.concatenate([movie.read(k, k + 1) for k in numbers])
-        light = measure_frames(some, camera)[0]
+        seen, theirs = sampled(movie, camera)
+        some = np.concatenate([seen.read(k, k + 1) for k in numbers])
+        light = measure_frames(some, theirs)[0]
         lit = light[well_lit(light)]
         if lit.size and np.median(lit) > 0:
             dark_e = DARK * float(np.median(lit))
