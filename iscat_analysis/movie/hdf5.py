@@ -125,7 +125,7 @@ class Hdf5Reader:
     def __init__(self, path: Path) -> None:
         self._path = path
         with self._believing_nothing():
-            self._file = h5py.File(path, "r", locking=False)
+            self._file = _opened(path)
         try:
             with self._believing_nothing():
                 if self._file.userblock_size:
@@ -318,6 +318,16 @@ class Hdf5Reader:
             f"{self._path}: {name} is incomplete ({how}); "
             "the recording or the copy was interrupted: export it again"
         )
+
+
+def _opened(path: Path) -> h5py.File:
+    """Open a file for reading, also one that a program goes on writing so that others may read."""
+    try:
+        return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        if "already open for write" not in str(error):
+            raise
+        return h5py.File(path, "r", locking=False, swmr=True)
 
 
 def _single(dataset: h5py.Dataset) -> bool:
