@@ -23,15 +23,14 @@ import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from _memory import Memory
 from _peer import peer_python
 
 from iscat_analysis._kernels.sliding import contrast_map
@@ -47,8 +46,6 @@ RESULTS = ROOT / "results"
 CONFIG = ROOT.parent / "sample_configs" / "landing.toml"
 JOB_MB_PER_S, GROWTH_MB_PER_S, RATIO, MEMORY_MB = 90.0, 300.0, 5.0, 1000.0
 WINDOW = 100
-LOOK_S = 0.1
-"""Between two looks at how much memory a job has."""
 PROGRAM = "import sys; sys.argv[0] = 'iscat'; from iscat_cli import main; sys.exit(main())"
 INSTALLED = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
 """The environment of a job: Python keeps the modules that it has compiled, as an installer does."""
@@ -84,7 +81,7 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
         start = time.perf_counter()
         with answer.open("w", encoding="utf-8") as out:
             job = subprocess.Popen(command, stdout=out, env=INSTALLED)
-            watch = _Memory(job.pid, movie)
+            watch = Memory(job.pid, movie)
             if watched:
                 watch.start()
             _, status, usage = os.wait4(job.pid, 0)
@@ -106,49 +103,6 @@ def whole_job(folder: Path, settings: list[str], seed: int) -> dict[str, float]:
         "steps": int(len(truth) + truth["leave"].notna().sum()),
         "found": len(summary["events"]),
     }
-
-
-class _Memory(threading.Thread):
-    """Looks at the memory of a process and of those it has made, until it ends.
-
-    What several of them share is divided among them.  Pages of the movie are left out: they are the
-    system's, which keeps them for whoever reads the file, and does not charge for them a group of
-    processes that finds them there.
-    """
-
-    def __init__(self, pid: int, movie: Path) -> None:
-        super().__init__(daemon=True)
-        self._pid = pid
-        self._movie = str(movie)
-        self.peak_mb = 0.0
-
-    def run(self) -> None:
-        """Keep the largest sum."""
-        while Path(f"/proc/{self._pid}/status").exists():
-            held = sum(_memory_mb(pid, self._movie) for pid in _family(self._pid))
-            self.peak_mb = max(self.peak_mb, held)
-            time.sleep(LOOK_S)
-
-
-def _family(pid: int) -> list[int]:
-    found = [pid]
-    with suppress(OSError):
-        for task in Path(f"/proc/{pid}/task").iterdir():
-            for child in (task / "children").read_text().split():
-                found += _family(int(child))
-    return found
-
-
-def _memory_mb(pid: int, movie: str) -> float:
-    total, counted = 0.0, True
-    with suppress(OSError):
-        for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
-            name, *rest = line.split()
-            if not name.endswith(":"):  # of the next mapping, which ends with its file
-                counted = not line.endswith(movie)
-            elif name == "Pss:" and counted:
-                total += float(rest[0]) * 1024 / 1e6
-    return total
 
 
 def growth(whole: dict[str, float], half: dict[str, float]) -> dict[str, float]:

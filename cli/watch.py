@@ -1,4 +1,4 @@
-"""`iscat watch`: movies are analysed as they are saved."""
+"""`iscat watch`: movies are analysed as they are saved, and one while it is being recorded."""
 
 from __future__ import annotations
 
@@ -35,6 +35,13 @@ EXAMPLE = """Example: a folder that the microscope writes to.
 Movies that samples.csv or samples.toml in the folder names are what it says,
 as for iscat batch; it may grow as well. The others are samples.
 
+One movie that is still being recorded, a TIFF, HDF5 or Zarr that grows:
+
+    iscat watch movie.tif --config setup.toml
+
+What is there is analysed as it grows, with a histogram of the masses; once it
+rests, the result is that of iscat fit, in movie.iscat or --out.
+
 Exit status, after Ctrl-C: 0 everything is analysed; 3 some movies or
 calibrations failed, which are listed; 130 a movie was interrupted, and the
 same command goes on; 2 usage, table or configuration.
@@ -45,14 +52,19 @@ same command goes on; 2 usage, table or configuration.
 def watch(
     messages: Messages,
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder that movies are saved in.")
+        Path,
+        typer.Argument(
+            metavar="FOLDER|MOVIE",
+            help="Folder that movies are saved in, or one movie that is being recorded.",
+        ),
     ],
     *,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of the batch; default FOLDER/batch; an earlier one is brought up to date.",
+            help="Folder of the batch; default FOLDER/batch; an earlier one is brought up to date. "
+            "Of one movie: default its name with .iscat.",
         ),
     ] = None,
     config: ConfigOption = None,
@@ -63,7 +75,7 @@ def watch(
     scheduler: SchedulerOption = "threads",
     scheduler_file: SchedulerFileOption = None,
     interval: Annotated[
-        float, typer.Option(metavar="S", help="Seconds between two checks of the folder.")
+        float, typer.Option(metavar="S", help="Seconds between two checks.")
     ] = 10.0,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
@@ -74,6 +86,11 @@ def watch(
     it changes. Results are those of iscat batch, which may go on with them.
     """
     with failures(messages):
+        from iscat_analysis.movie.folders import is_movie
+
+        if is_movie(folder):
+            _watch_one(messages, folder, out, config, settings, workers, interval, as_json=as_json)
+            return
         from iscat_analysis.day.watch import FOLDER
         from iscat_analysis.day.watch import watch as run
 
@@ -112,3 +129,37 @@ def watch(
             raise typer.Exit(INTERRUPTED)
         if failed:
             raise typer.Exit(INCOMPLETE)
+
+
+def _watch_one(
+    messages: Messages,
+    movie: Path,
+    out: Path | None,
+    config: Path | None,
+    settings: list[str] | None,
+    workers: int | None,
+    interval: float,
+    *,
+    as_json: bool,
+) -> None:
+    """Watch one movie that is being recorded."""
+    from iscat_analysis.config import configure
+    from iscat_analysis.day.growing import watch_movie
+    from iscat_analysis.movie.addresses import path_beside
+
+    folder = path_beside(movie, ".iscat") if out is None else out
+    with messages.progress() as progress:
+        found = watch_movie(
+            movie,
+            configure(config, settings=with_workers(settings, workers)),
+            out=folder,
+            interval_s=interval,
+            progress=progress,
+            notify=lambda line: messages.notify(with_options(line)),
+            command=messages.command,
+        )
+    rows = found.table.to_dict("records")
+    if as_json:
+        print_json("fit", {**found.summary, "events": rows, "out": str(folder)})
+    else:
+        print_result(f"{len(rows)} events; results in {folder}")

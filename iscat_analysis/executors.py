@@ -231,18 +231,26 @@ class DaskExecutor:
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
         """Say which workers are missing or have too little memory; see `Executor`."""
+        link = self._dashboard()
+        shown = [f"the dashboard of the cluster is {link}"] if link else []
         if not self._memory:
-            return [f"{self._address} has no workers yet; the work begins with the first"]
+            return [*shown, f"{self._address} has no workers yet; the work begins with the first"]
         needed = memory_limit_mb + _BASE_MB
         least = min(self._memory, key=lambda worker: self._memory[worker] or float("inf"))
         megabytes = self._memory[least] / 1e6
         if not 0 < megabytes < needed:
-            return []
+            return shown
         return [
+            *shown,
             f"worker {least} may use {megabytes:.0f} MB of memory, and "
             f"compute.memory_limit_mb = {memory_limit_mb} with the program itself may take "
-            f"{needed}: start workers with more, or lower compute.memory_limit_mb"
+            f"{needed}: start workers with more, or lower compute.memory_limit_mb",
         ]
+
+    def _dashboard(self) -> str:
+        """Give the page that shows what workers do; empty where the cluster has none."""
+        services = self._client.scheduler_info().get("services", {})
+        return str(self._client.dashboard_link or "") if "dashboard" in services else ""
 
     def call(
         self,

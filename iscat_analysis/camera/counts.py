@@ -7,7 +7,8 @@ c = o + (N + σ_r·n)/g counts, n standard normal.  `Camera` undoes it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -85,6 +86,18 @@ class Camera:
             if not np.all(most < self.well_depth_e):
                 full |= self.to_electrons(counts) >= self.well_depth_e
         return full
+
+    def part(self, here: tuple[Any, ...]) -> Camera:
+        """Give the camera of some pixels."""
+        return self.mapped(lambda image: image[here])
+
+    def mapped(self, cut: Callable[[FloatArray], FloatArray]) -> Camera:
+        """Give the camera of pixels that are cut out of its maps."""
+        gain, offset, read = (
+            cut(value) if isinstance(value, np.ndarray) else value
+            for value in (self.gain_e_per_adu, self.offset_adu, self.read_noise_e)
+        )
+        return replace(self, gain_e_per_adu=gain, offset_adu=offset, read_noise_e=read)
 
     def read_variance_e2(self, shape: tuple[int, int]) -> FloatArray:
         """Variance of the read noise of one frame.

@@ -202,11 +202,12 @@ def _sample(
     total = movie.shape[0]
     looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
     levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
-    opening = _finite(movie.read(0, min(_FIRST_FRAMES, total)))
-    if not levels or not len(opening):
-        return opening, None
+    first = min(_FIRST_FRAMES, total)
+    looked = [(k, float(one.mean())) for k in range(first) for one in _finite(movie.read(k, k + 1))]
+    if not levels or not looked:
+        return movie.read(0, 0), None
     usual = float(np.quantile(levels, 0.75))
-    means = opening.mean(axis=(1, 2))
+    means = np.array([mean for _, mean in looked])
     dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
     dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
     most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
@@ -216,7 +217,9 @@ def _sample(
     counts = counts[lit & ~repeats]
     if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
         return counts, None
-    dark = opening[dim]
+    dark = np.concatenate(
+        [movie.read(k, k + 1) for (k, _), d in zip(looked, dim, strict=True) if d]
+    )
     return counts, dark if _is_dark(dark, counts) else None
 
 

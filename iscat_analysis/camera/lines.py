@@ -128,6 +128,34 @@ class Lines:
         """
         return (1 + signal) / self.taken(signal) - 1
 
+    def part(self, here: tuple[slice, slice]) -> PartOfLines:
+        """Give what is done to signals in some pixels of the field."""
+        return PartOfLines(self, here)
+
+
+@dataclass(frozen=True, eq=False)
+class PartOfLines:
+    """What the division by unsteady light of the whole field does to signals in a part of it."""
+
+    whole: Lines
+    here: tuple[slice, slice]
+
+    def taken(self, signal: FloatArray) -> FloatArray:
+        """Give the change of the divisor that a signal makes.
+
+        Shapes: `signal` (y, x), result (y, x).
+        """
+        field = np.zeros(self.whole.light_e.shape)
+        field[self.here] = signal
+        return self.whole.taken(field)[self.here]
+
+    def left(self, signal: FloatArray) -> FloatArray:
+        """Give what is left of a signal after the division.
+
+        Shapes: `signal` (y, x), result (y, x).
+        """
+        return (1 + signal) / self.taken(signal) - 1
+
 
 def _divided_type(dtype: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(np.float32 if dtype.itemsize <= 2 else np.float64)

@@ -9,7 +9,7 @@ Neighbouring frames tell: in their difference nothing is left but noise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,17 @@ class NoiseSpectrum:
         out = np.zeros_like(template)
         out[..., rows, columns] = seen[..., :high, :wide]
         return out
+
+    def on(self, shape: tuple[int, int]) -> NoiseSpectrum:
+        """Give the same noise for images of another, smaller shape."""
+        size = (shape[0] + 2 * MARGIN_PX, shape[1] + 2 * MARGIN_PX)
+        lags = np.ix_(*(np.arange(n) - n * (2 * np.arange(n) > n) for n in size))
+        power, information = (
+            fft.rfft2(fft.irfft2(spectrum, s=self.shape)[lags]).real
+            for spectrum in (self.power, self.information)
+        )
+        least = _LEAST_VARIANCE * self.variance
+        return replace(self, shape=size, power=np.maximum(power, least), information=information)
 
     @property
     def summary(self) -> dict[str, Any]:

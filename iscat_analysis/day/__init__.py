@@ -27,6 +27,7 @@ from iscat_analysis.day.table import Table, read_standards, read_table
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import path_in, shown
+from iscat_analysis.movie.folders import files_of
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
 from iscat_analysis.text import from_table
@@ -199,11 +200,14 @@ def batch(
             )
             day = calibrate_day(plan, runner)
             wanted = part_of(plan.movies, only)
+            queue = wanted
+            if executor.distant:  # the longest first, so that none is left over at the end
+                queue = tuple(sorted(wanted, key=lambda movie: -_bytes_of(movie.row.path)))
             progress("movies", 0, len(wanted))
-            analysed = executor.each(lambda movie: _analyse(plan, day, movie, runner), wanted)
+            analysed = executor.each(lambda movie: _analyse(plan, day, movie, runner), queue)
             with closing(analysed):
                 for index, outcome in analysed:
-                    name = wanted[index].name
+                    name = queue[index].name
                     outcomes[name] = outcome
                     if outcome.ran:
                         which = f"{len(outcomes)} of {len(wanted)}: " if len(wanted) > 1 else ""
@@ -229,6 +233,14 @@ def batch(
         movies = pd.DataFrame(rows, columns=["movie", "state", "why"])
         return Batch(folder, movies, pd.DataFrame(), pd.DataFrame(), ran, tuple(failed))
     return _gathered(plan, day, outcomes, reaction, runner, ran, tuple(failed))
+
+
+def _bytes_of(address: Path) -> int:
+    """Give the size of a movie's files; 0 where they cannot be read, which is said later."""
+    try:
+        return sum(file.stat().st_size for file in files_of(address))
+    except OSError:
+        return 0
 
 
 def _flats(plan: Plan) -> list[str]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.field_sample import LARGEST_PX, whole_frames
 from iscat_analysis.camera.lighting import find_surface
 from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
 from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
@@ -23,7 +24,10 @@ from iscat_analysis.search.sliding import good_frames, longest_window, measure_f
 from iscat_analysis.threads import over_frames, threads
 
 PAIRS = 12
-"""Places in a movie at which the light of some frames is compared with that of later ones."""
+"""Places in a movie at which the light of some frames is compared with that of later ones.
+
+Half as many tell more of a large field, by the light of all its pixels.
+"""
 
 _LEAST_PAIRS = 3  # of a range of frames
 _FRAMES_SUMMED = 8  # frames that are summed there
@@ -32,6 +36,7 @@ _SINGLE_PAIRS = 24  # places where particles are followed
 _SHORTER_GAP = 0.62
 # Every how many-th place in the background is also compared with the frames after it.
 _BACKGROUND_STRIDE = 2
+_FEWEST_OF_LARGE = 3  # frames that tell unsteady pixels, of so few places
 _SAMPLE_BYTES = 96_000_000  # of counts that are read for it
 
 
@@ -90,7 +95,8 @@ def judge_lines(
     ):
         return None
     first, last = background.recorded or config.fit.frames or (0, movie.shape[0])
-    counts = movie.read(first, max(first, min(last, movie.shape[0], first + SPECTRUM_FRAMES)))
+    frames = whole_frames(movie.shape[1:], SPECTRUM_FRAMES)
+    counts = movie.read(first, max(first, min(last, movie.shape[0], first + frames)))
     counts = counts[good_frames(counts, camera)]
     if not len(counts):
         return None
@@ -122,6 +128,9 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     are compared one by one, half the movie apart: what they have in common is their background.
     """
     total, mode, pairs_wanted = movie.shape[0], background_mode(config), PAIRS
+    large = math.prod(movie.shape[1:]) > LARGEST_PX
+    if large:
+        pairs_wanted //= 2
     given = config.background.recorded, config.fit.frames
     frames_each = _FRAMES_SUMMED
     if mode != "fixed":
@@ -136,7 +145,8 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
         spans = [(before[0], min(before[1], total)), (first, min(last, total))]
         window = max(stop - start for start, stop in spans)
     frame_bytes = math.prod(movie.shape[1:]) * np.dtype(movie.dtype).itemsize
-    most = min(frames_each, _SAMPLE_BYTES // (2 * pairs_wanted * frame_bytes) or 1)
+    fewest = min(_FEWEST_OF_LARGE, frames_each) if large else 1
+    most = min(frames_each, max(_SAMPLE_BYTES // (2 * pairs_wanted * frame_bytes), fewest))
     pairs_read: list[tuple[int, int]] = []
     parts: list[NDArray[Any]] = []
     for start, stop in spans:
@@ -156,10 +166,10 @@ def _pairs(movie: Stack, config: Config, camera: Camera) -> tuple[list[Pair], in
     measured = [measure_frames(part, camera) for part in parts]
     lit = well_lit(np.concatenate([light for light, _ in measured]))  # a shutter may hide a part
     cuts = np.cumsum([len(part) for part in parts])[:-1]
-    good = [
-        part[seen & ~repeats]
-        for part, seen, (_, repeats) in zip(parts, np.split(lit, cuts), measured, strict=True)
+    kept = [
+        seen & ~repeats for seen, (_, repeats) in zip(np.split(lit, cuts), measured, strict=True)
     ]
+    good = [part if used.all() else part[used] for part, used in zip(parts, kept, strict=True)]
     read = [
         Pair(frame, before, later, after)
         for (frame, later), before, after in zip(pairs_read, good[::2], good[1::2], strict=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.calibration import find_zero
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.field_sample import FieldSample, whole_frames
 from iscat_analysis.camera.metadata import diagnose_gain, with_pattern_jitter
 from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
@@ -34,6 +35,7 @@ from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     NoiseCurve,
     choose_window,
+    good_frames,
     longest_window,
     measure_frames,
     measure_noise,
@@ -100,12 +102,17 @@ def judge_counts(
     additive: bool = False,
     follows: bool | None = None,
     mapper: Mapper = map,
+    whole: tuple[NDArray[Any], Camera] | None = None,
 ) -> Noise:
     """Compare the noise between neighbouring frames with the camera's.
 
+    Where `counts` are those of a sample of the pixels, frames of the `whole` field tell what its
+    pixels have in common.
+
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
-    spectrum = measure_spectrum(counts, camera, masked=masked, mapper=mapper)
+    seen, theirs = whole or (counts, camera)
+    spectrum = measure_spectrum(seen, theirs, masked=masked, mapper=mapper)
     try:
         gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
     except DataError:  # too dark to tell
@@ -114,7 +121,9 @@ def judge_counts(
     gain = with_pattern_jitter(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
         still = without_pattern_jitter(counts, camera, masked=masked)
-        return judge_counts(still, camera, masked=masked, additive=additive, mapper=mapper)
+        return judge_counts(
+            still, camera, masked=masked, additive=additive, mapper=mapper, whole=whole
+        )
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
@@ -212,23 +221,35 @@ def judge_beside(
 
 @dataclass(frozen=True)
 class NoiseSurvey:
-    """The noise of the first frames of a landing movie, and a reader of all frames."""
+    """The noise of the first frames of a landing movie, and a reader of all frames.
+
+    `sample` is what ``summary.json`` says of the pixels that were looked at, None of all.
+    """
 
     reader: Reader
     noise: Noise
     curve: NoiseCurve
     window: int
+    sample: dict[str, Any] | None = None
 
 
 def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     """Judge the noise of a landing movie, and choose the window."""
     additive = config.optics.scheme == "darkfield"
+    judged, field = reader.sampled, FieldSample.of(reader.shape)
+    sample: dict[str, Any] | None = None
     with threads(config.compute.workers) as pool:
         mapper = over_frames(pool, reader.shape)
-        opening, curve, window = judge_window(reader, config, mapper)
+        opening, curve, window = judge_window(judged, config, mapper)
+        whole = None
+        if field is not None:
+            sample = field.summary(*field.scatter(opening[:_GAIN_FRAMES], judged.camera))
+            frames = whole_frames(reader.shape, SPECTRUM_FRAMES)
+            counts = reader.read(reader.first, min(reader.first + frames, reader.last))
+            whole = counts[good_frames(counts, reader.camera)], reader.camera
         noise = judge_counts(
-            opening, reader.camera, additive=additive,
-            follows=config.background.follows_pattern, mapper=mapper,
+            opening, judged.camera, additive=additive,
+            follows=config.background.follows_pattern, mapper=mapper, whole=whole,
         )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)
@@ -238,7 +259,7 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
             "many bright particles; lower background.window_frames, which helps against all"
         )
         noise = replace(noise, excess=ExcessNoise(ratio, message))
-    return NoiseSurvey(reader, noise, curve, window)
+    return NoiseSurvey(reader, noise, curve, window, sample)
 
 
 def judge_window(

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.special import bdtrc
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.field_sample import sampled
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import NO_CHANGES, Changes, find_changes, spot_of
-from iscat_analysis.records import FloatArray, FrameSource
+from iscat_analysis.records import CountSource, FloatArray
 from iscat_analysis.search.sliding import summed
 
 MOST_FRAMES = 2000
@@ -38,9 +39,10 @@ LARGEST_CHANCE = 0.03
 
 
 def look_at_changes(
-    movie: FrameSource, config: Config, camera: Camera, span: tuple[int, int]
+    movie: CountSource, config: Config, camera: Camera, span: tuple[int, int]
 ) -> Changes:
-    """Find changes in the first frames of a movie."""
+    """Find changes in the first frames of a movie, at a sample of the pixels of a large field."""
+    movie, camera = sampled(movie, camera)
     last = min(span[1], span[0] + MOST_FRAMES, movie.shape[0])
     starts = range(span[0], last - BLOCK + 1, BLOCK)
     # noise is a thousand times what single precision rounds away

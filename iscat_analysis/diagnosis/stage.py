@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
-from iscat_analysis.records import FrameSource
 from iscat_analysis.search.sliding import good_frames, measure_motion
 
 # Share of the variance of averages that motion must add; noise alone adds 1e-3.
@@ -17,12 +16,12 @@ def with_drift_correction(config: Config, *, moves: bool) -> Config:
     return config.model_copy(update={"background": background})
 
 
-def motion_message(movie: FrameSource, opening: NoiseSurvey) -> str:
+def motion_message(opening: NoiseSurvey) -> str:
     """Say that the fixed pattern of a landing movie moves; empty where it does not."""
     if opening.noise.shakes:
         return "the fixed pattern shakes"
-    reader, length = opening.reader, opening.curve.frames[-1]
-    last = movie.read(max(reader.first, reader.last - 2 * length), reader.last)
+    reader, length = opening.reader.sampled, opening.curve.frames[-1]
+    last = reader.read(max(reader.first, reader.last - 2 * length), reader.last)
     last = last[good_frames(last, reader.camera)]
     share = max(
         measure_motion(counts, reader.camera, min(length, len(counts) // 2))

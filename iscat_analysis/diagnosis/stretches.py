@@ -25,6 +25,7 @@ from iscat_analysis.search.sliding import SHORTEST_MOVIE
 
 _GROUP, _READ = 16, 4  # frames from one group to the next, and how many of them are looked at
 _CELLS, _SMALLEST = 32, 4  # cells along the longer side, and their least side [px]
+_ROWS = 16  # of a cell, up to which all of them are looked at
 _FEWEST = 8  # groups that tell what is usual
 _LIT = 0.5  # of the usual light, without which a group says nothing
 _CLEAR = 5.0  # standard deviations of a cell
@@ -147,13 +148,18 @@ def _cells(movie: Stack, start: int, stop: int, *, each: bool = False) -> FloatA
 
     Shapes: result (y, x) or (t, y, x).
     """
-    counts = movie.read(start, stop)
-    rows, columns = counts.shape[1:]
+    rows, columns = movie.shape[1:]
     side = max(_SMALLEST, math.ceil(max(rows, columns) / _CELLS))
     high, wide = max(rows // side, 1), max(columns // side, 1)
     tall, broad = min(side, rows), min(side, columns)
-    part = counts[:, : high * tall, : wide * broad].astype(np.float64)
-    means = part.reshape(-1, high, tall, wide, broad).mean(axis=(2, 4))
+    every = max(1, tall // _ROWS)
+    placed = movie.in_place(start, stop)
+    counts = movie.read(start, stop) if placed is None else placed.counts
+    part = counts[:, : high * tall, : wide * broad].reshape(-1, high, tall, wide * broad)
+    part = part[:, :, ::every].astype(np.float64)
+    if placed is not None:
+        placed.let_go()
+    means = part.reshape(len(part), high, -1, wide, broad).mean(axis=(2, 4))
     out: FloatArray = means if each else np.median(means, axis=0)
     return out
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 from typing import Any
 
@@ -38,8 +39,10 @@ def channels_of(counts: NDArray[Any], camera: Camera) -> int:
 
     Shapes: `counts` (t, y, x).
     """
-    light = camera.to_electrons(counts).reshape(len(counts), -1)
-    light = light[:, :: max(1, -(-light.shape[1] // _PIXELS))]
+    shape = counts.shape[1:]
+    every = max(1, -(-math.prod(shape) // _PIXELS))
+    cut = camera.mapped(lambda image: np.broadcast_to(image, shape).reshape(-1)[::every])
+    light = cut.to_electrons(counts.reshape(len(counts), -1)[:, ::every])
     power = light.mean(axis=1, keepdims=True)
     fresh = np.array([True, *(not np.array_equal(a, b) for a, b in pairwise(counts))])
     light, power = light[fresh], power[fresh]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera.lines import Lines, PartOfLines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
@@ -15,10 +15,15 @@ from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.forward import ForwardModel, forward_model
-from iscat_analysis.optics.local import LocalModels, refuse_moving_focus, refuse_uneven_field
+from iscat_analysis.optics.local import (
+    LocalModels,
+    ModelsFrom,
+    refuse_moving_focus,
+    refuse_uneven_field,
+)
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
-from iscat_analysis.search.sliding import CORRELATION
+from iscat_analysis.search.sliding import CORRELATION, Tile
 from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templates
 
 SPREAD_NM = 10_000.0
@@ -41,8 +46,8 @@ class AnalysisContext:
     templates: Templates
     mode: str
     searches: int = 1
-    lines: Lines | None = None
-    local: tuple[LocalModels, LocalModels] | None = None
+    lines: Lines | PartOfLines | None = None
+    local: tuple[LocalModels | ModelsFrom, LocalModels | ModelsFrom] | None = None
 
     def model_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
         """Give the model for fitted regions at a place, in a frame of the movie."""
@@ -51,6 +56,20 @@ class AnalysisContext:
     def wide_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
         """Give the model for signals far away of a particle at a place, in a frame of the movie."""
         return self.wide if self.local is None else self.local[1].at(x_nm, y_nm, frame)
+
+    def on_tile(self, tile: Tile) -> AnalysisContext:
+        """Give the same for a tile, whose places count from its own corner."""
+        local, lines, noise = self.local, self.lines, self.templates.noise
+        if isinstance(local, tuple):
+            corner_nm = tile.corner[0] * self.pixel_nm, tile.corner[1] * self.pixel_nm
+            near, wide = (ModelsFrom(m, corner_nm) for m in local if isinstance(m, LocalModels))
+            local = near, wide
+        if isinstance(lines, Lines):
+            lines = lines.part(tile.here)
+        if noise is not None:
+            noise = noise.on(tile.shape)
+        templates = replace(self.templates, noise=noise)
+        return replace(self, local=local, lines=lines, templates=templates)
 
     def height_nm(self, mass_kda: float) -> float:
         """Height at which a particle is expected, where its height is not free."""

@@ -37,8 +37,8 @@ from iscat_analysis.search.bright import (
     find_bright_places,
     find_bright_steps,
 )
-from iscat_analysis.search.sliding import stride_of
-from iscat_analysis.search.sliding.chunks import Reader, plan_chunks, reader_of
+from iscat_analysis.search.sliding import FieldSums, Tile, stride_of
+from iscat_analysis.search.sliding.chunks import Reader, plan_parts, reader_of
 from iscat_analysis.threads import over_frames
 
 APART_NM = 2000.0
@@ -77,7 +77,7 @@ def bright_particle_images(
                 opening.reader, opening.window, config, pool, rings, whole
             )
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
-        window = judge_window(reader, config, pool.map)[2]
+        window = judge_window(reader.sampled, config, pool.map)[2]
         return landing_particle_images(reader, window, config, pool, rings, whole)
     if heights_free(config) and background_mode(config) == "fixed":
         return [], []
@@ -102,14 +102,21 @@ def landing_particle_images(
     stride = stride_of(window)
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
-    spans = [span for _, span in plan_chunks(reader, config, window, stride)]
+    parts = [part for chunk in plan_parts(reader, config, window, stride) for part in chunk]
     most = enough = MOST_SIGHTS if rings else TESTED
     if whole:
-        chosen = np.linspace(0, len(spans) - 1, min(len(spans), _PARTS)).round().astype(int)
-        spans = [spans[k] for k in chosen]
-        most = math.ceil(MOST_SIGHTS / len(spans))
-    for span in spans:
-        chunk = reader.chunk(span, stride, pool)
+        chosen = np.linspace(0, len(parts) - 1, min(len(parts), _PARTS)).round().astype(int)
+        parts = [parts[k] for k in chosen]
+        most = math.ceil(MOST_SIGHTS / len(parts))
+    bright: list[BrightStep] = []
+    sums: FieldSums | None = None
+    for part in parts:
+        if part.tile is None:
+            chunk = reader.chunk(part.span, stride, pool)
+        else:
+            if sums is None or sums.span != part.span:
+                sums = reader.field_sums(part.span, pool)
+            chunk = reader.tile_chunk(sums.part(part.tile.here), part.tile, stride, pool)
         wanted = config.background.follows_pattern
         chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         alone, every = find_bright_steps(
@@ -123,8 +130,12 @@ def landing_particle_images(
             motion=pattern,
             mapper=over_frames(pool, reader.shape),
         )
-        found += alone
-        rest += every
+        if part.tile is not None:
+            found += _in_field(alone, part.tile)
+            rest += _in_field(every, part.tile)
+        else:
+            found += alone
+            rest += every
         bright = [step for step in found if step.snr > FAINTEST]
         if len(bright) >= enough and not whole:
             break
@@ -143,6 +154,20 @@ def landing_particle_images(
         for steps in (unique[:MOST_SIGHTS], others)
     ]
     return sights[0], sights[1]
+
+
+def _in_field(steps: Sequence[BrightStep], tile: Tile) -> list[BrightStep]:
+    """Keep the steps of the core of a tile, and count their places from the corner of the field."""
+    y, x = tile.corner
+    moved = [
+        replace(
+            step, y_px=step.y_px + y, x_px=step.x_px + x,
+            rows=(step.rows[0] + y, step.rows[1] + y),
+            columns=(step.columns[0] + x, step.columns[1] + x),
+        )
+        for step in steps
+    ]  # fmt: skip
+    return [step for step in moved if tile.holds(np.array(step.y_px), np.array(step.x_px))]
 
 
 def _neighbours(

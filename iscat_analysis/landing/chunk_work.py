@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lines import Lines
@@ -17,18 +19,20 @@ from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
-from iscat_analysis.landing.merging import CLIPS, VIEWS, FinishedChunk
-from iscat_analysis.landing.steps import ChunkFitter
+from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
+from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
+    EventView,
     FloatArray,
     PosteriorResult,
     Progress,
     make_rows,
     silent,
 )
-from iscat_analysis.search.sliding import STRIDES, Chunk, stride_of
-from iscat_analysis.search.sliding.chunks import Reader, reader_of
+from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
+from iscat_analysis.search.sliding.chunks import Part, Reader, reader_of
+from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
 
@@ -63,39 +67,73 @@ class ChunkSetting:
 
 def chunk_job(
     setting: ChunkSetting,
-    core: tuple[int, int],
-    span: tuple[int, int],
+    part: Part,
+    sums: FieldSums | None,
     posteriors: int,
     earlier: int,
     *,
     progress: Progress = silent,
 ) -> FinishedChunk:
-    """Open the movie and analyse one chunk."""
+    """Open the movie and analyse one chunk, or one tile of it."""
     with threads(setting.config.compute.workers) as pool:
-        chunk = setting.reader.chunk(span, stride_of(setting.window), pool)
-        progress("landing", 0, 1)
-        return analyse_chunk(
-            setting.context, chunk, core, setting.window, pool, posteriors, setting.excess_noise,
-            earlier,
+        return analyse_part(
+            setting.reader, setting.context, part, sums, setting.window, pool, posteriors,
+            setting.excess_noise, earlier, progress=progress,
         )  # fmt: skip
+
+
+def field_job(
+    setting: ChunkSetting, span: tuple[int, int], *, progress: Progress = silent
+) -> FieldSums:
+    """Open the movie and sum the frames of a chunk over the field."""
+    del progress
+    with threads(setting.config.compute.workers) as pool:
+        return setting.reader.field_sums(span, pool)
+
+
+def analyse_part(
+    reader: Reader,
+    context: AnalysisContext,
+    part: Part,
+    sums: FieldSums | None,
+    window: int,
+    pool: ThreadPoolExecutor,
+    posteriors: int,
+    excess_noise: ExcessNoise | None,
+    earlier: int,
+    *,
+    progress: Progress = silent,
+) -> FinishedChunk:
+    """Read and analyse a chunk, or one tile of it, of which `sums` say what the field has."""
+    if part.tile is None or sums is None:
+        chunk = reader.chunk(part.span, stride_of(window), pool)
+    else:
+        chunk = reader.tile_chunk(sums, part.tile, stride_of(window), pool)
+        context = context.on_tile(part.tile)
+    progress("landing", 0, 1)
+    return analyse_chunk(context, chunk, part, window, pool, posteriors, excess_noise, earlier)
 
 
 def analyse_chunk(
     context: AnalysisContext,
     chunk: Chunk,
-    core: tuple[int, int],
+    part: Part,
     window: int,
     pool: ThreadPoolExecutor,
     posteriors: int,
     excess_noise: ExcessNoise | None,
     earlier: int,
 ) -> FinishedChunk:
-    """Find and fit every step of a chunk."""
+    """Find and fit every step of a chunk, or of a tile of one; places are those of the field."""
+    core, tile = part.core, part.tile
     wanted = context.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
-    fitter = ChunkFitter(context, still, window, pool, pattern, excess_noise=excess_noise)
+    own = EVERYWHERE if tile is None else tile.inner
+    fitter = ChunkFitter(context, still, window, pool, pattern, excess_noise=excess_noise, own=own)
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam), core)
+    if tile is not None:
+        steps = _near_core(steps, tile, context.pixel_nm)
     events = [step.event for step in steps]
     chains: dict[int, PosteriorResult] = {}
     stopped = False
@@ -111,22 +149,26 @@ def analyse_chunk(
             break
     shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
-    light = np.where(chunk.good, chunk.power, np.nan) * float(chunk.mean_e.mean())
+    light = np.where(chunk.good, chunk.power, np.nan) * chunk.level_e
+    lines = make_rows(lines_of(context, events, mapper=pool.map))
+    corner = (0, 0) if tile is None else tile.corner
     return FinishedChunk(
         core=core,
-        lines=make_rows(lines_of(context, events, mapper=pool.map)),
+        lines=_moved(lines, corner, context.pixel_nm),
         repeats=np.array([step.repeats for step in steps]),
         evidence=evidence_beside(context, events, mapper=pool.map),
         views=tuple(
-            view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip)
+            _view_moved(
+                view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip), corner
+            )
             for n, (trace, clip) in enumerate(shown)
         ),
         good=chunk.good[inside].copy(),
         light=light[inside],
-        masked=~chunk.usable,
-        saturated=chunk.saturated,
-        strongest=fitter.strongest,
-        ends_e=_ends(chunk, inside),
+        masked=~chunk.usable[own],
+        saturated=chunk.saturated[own],
+        strongest=fitter.strongest[(slice(None), *own)],
+        ends_e=_ends(chunk, inside)[(slice(None), *own)],
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
@@ -134,6 +176,29 @@ def analyse_chunk(
         empty=fitter.empty,
         searched=fitter.searched,
     )
+
+
+def _near_core(steps: list[StepEvent], tile: Tile, pixel_nm: float) -> list[StepEvent]:
+    """Keep the steps of the core of a tile, and those on a seam, which its neighbour may miss."""
+    y, x = tile.corner
+    places = np.array([(s.event.fit.y_nm, s.event.fit.x_nm) for s in steps]).reshape(-1, 2)
+    kept = tile.holds(places[:, 0] / pixel_nm + y, places[:, 1] / pixel_nm + x, SEAM_PX)
+    return list(compress(steps, kept))
+
+
+def _moved(lines: pd.DataFrame, corner: tuple[int, int], pixel_nm: float) -> pd.DataFrame:
+    """Count the places of rows from the corner of the field, and not of the tile."""
+    if corner == (0, 0) or not len(lines):
+        return lines
+    y, x = corner
+    shifts = {"y_px": y, "x_px": x, "y_nm": y * pixel_nm, "x_nm": x * pixel_nm}
+    return lines.assign(**{name: lines[name] + shift for name, shift in shifts.items()})
+
+
+def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
+    """Count the pixels of a view from the corner of the field."""
+    y, x = corner
+    return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)
 
 
 def _ends(chunk: Chunk, inside: slice) -> FloatArray:

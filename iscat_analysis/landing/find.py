@@ -9,6 +9,8 @@ configuration alone, so a finished one can be kept on disk and a resumed run giv
 
 from __future__ import annotations
 
+import threading
+from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -31,13 +33,14 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.landing.chunk_store import Store
-from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_chunk, chunk_job
+from iscat_analysis.landing.chunk_work import ChunkSetting, analyse_part, chunk_job, field_job
+from iscat_analysis.landing.joining import joined
 from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.records import CountSource, Progress, Status, silent
-from iscat_analysis.search.sliding import boundaries, stride_of
-from iscat_analysis.search.sliding.chunks import plan_chunks, reader_of
+from iscat_analysis.search.sliding import FieldSums, boundaries, stride_of
+from iscat_analysis.search.sliding.chunks import Part, plan_parts, reader_of
 from iscat_analysis.threads import one_thread_algebra, start_in_thread, threads
 
 HEIGHT_FRAMES = 2000
@@ -45,6 +48,8 @@ HEIGHT_FRAMES = 2000
 
 LEAST_SD_NM = 0.1
 """Least spread that is learned: with none the height would be held again."""
+
+_FIELDS = 2  # chunks whose sums over the field are kept: one ends while the next begins
 
 POSTERIORS = 20
 """Events whose posterior is sampled, where the configuration asks for it."""
@@ -159,42 +164,53 @@ def analyse_landings(
             config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
         )
     prepare(context)
-    plan = [
-        part
+    chunks = [
+        chunk
         for stretch in stretches
-        for part in plan_chunks(reader, config, window, stride, stretch)
+        for chunk in plan_parts(reader, config, window, stride, stretch)
     ]
+    plan = [part for chunk in chunks for part in chunk]
     store = Store(partial, config, identity, reader.shape, (first, last), camera)
     movie_job = ChunkSetting(
         frames, camera, with_absolute_paths(config), (first, last), count, window,
         noise.spectrum, noise.excess, lines,
     )  # fmt: skip
     merged = MergedChunks(reader.shape, [stop for _, stop in stretches])
+    fields = _Fields()
     interrupted = False
     with threads(executor.threads(config.compute.workers, len(plan))) as pool:
 
         def finish(number: int) -> FinishedChunk:
             done = None if posterior else store.load(number)
             if done is None:
-                core, span = plan[number]
+                part = plan[number]
                 budget = POSTERIORS - merged.sampled if posterior else 0
-                earlier = merged.earlier(number, core[0] - window)  # before all of this chunk
+                earlier = merged.earlier(number, part.core[0] - window)  # before all of this chunk
                 if executor.distant:
                     reader.forget()  # whoever does it has a reader of its own
 
+                def summed() -> FieldSums:
+                    return executor.call(
+                        field_job, movie_job, part.span,
+                        here=lambda: reader.field_sums(part.span, pool),
+                    )  # fmt: skip
+
+                sums = None
+                if part.tile is not None:
+                    sums = fields.of(part.span, summed).part(part.tile.here)
+
                 def here() -> FinishedChunk:
-                    chunk = reader.chunk(span, stride, pool)
-                    return analyse_chunk(
-                        context, chunk, core, window, pool, budget, noise.excess, earlier
+                    return analyse_part(
+                        reader, context, part, sums, window, pool, budget, noise.excess, earlier
                     )
 
-                done = executor.call(chunk_job, movie_job, core, span, budget, earlier, here=here)
+                done = executor.call(chunk_job, movie_job, part, sums, budget, earlier, here=here)
                 store.save(number, done)
             merged.note(number, done)
             return done
 
         try:
-            with closing(_finished(finish, len(plan), executor, merged, posterior)) as finished:
+            with closing(_finished(finish, chunks, executor, merged, posterior)) as finished:
                 for frames_done, stopped in finished:
                     if frames_done < total:
                         progress("landing", frames_done, total)
@@ -232,11 +248,13 @@ def analyse_landings(
         "noise_frames": list(opening.curve.frames),
         "noise_variance_over_shot": list(opening.curve.variance_over_shot),
         "noise_spectrum": noise.summary,
+        **({"judged_by": opening.sample} if opening.sample else {}),
         **searched,
         "frames_left_out": merged.left_out(),
         "drift_px": drift,
         **_trajectory_summary(merged.trajectory()),
-        "chunks": len(plan),
+        "chunks": len(chunks),
+        "tiles": len(chunks[0]),
     }
     return DetectionResult(
         context=context,
@@ -262,19 +280,18 @@ def analyse_landings(
 
 def _finished(
     finish: Callable[[int], FinishedChunk],
-    count: int,
+    chunks: Sequence[Sequence[Part]],
     executor: Executor,
     merged: MergedChunks,
     posterior: bool,
 ) -> Generator[tuple[int, bool]]:
-    """Finish chunks and merge them in order, in whatever order they come.
-
-    Yields the number of finished frames, and whether a chunk was interrupted.  With posteriors,
-    chunks run one after another, because each may sample as many as those before it left over.
+    """Finish chunks and their tiles, and merge them in order, in whatever order they come.
 
     Yields the number of frames that are done, and whether it stopped within a chunk.  Each chunk
     has the posteriors that those before it left to sample: with posteriors, one follows another.
     """
+    count = sum(map(len, chunks))
+    edges = np.cumsum([0, *map(len, chunks)]).tolist()
 
     def results() -> Iterator[tuple[int, FinishedChunk]]:
         alone = 0
@@ -285,15 +302,41 @@ def _finished(
             yield alone + number, done
 
     waiting: dict[int, FinishedChunk] = {}
-    ready = frames = 0
+    ready, frames = 0, 0.0
     for number, done in results():
         waiting[number] = done
         merged.note(number, done)
-        frames += done.core[1] - done.core[0]
-        while ready in waiting:
-            merged.add(waiting.pop(ready))
+        home = bisect_right(edges, number) - 1
+        frames += (done.core[1] - done.core[0]) / len(chunks[home])
+        while ready < len(chunks) and all(k in waiting for k in range(*edges[ready : ready + 2])):
+            merged.add(
+                _whole(chunks[ready], [waiting.pop(k) for k in range(*edges[ready : ready + 2])])
+            )
             ready += 1
-        yield frames, done.stopped
+        yield round(frames), done.stopped
+
+
+def _whole(parts: Sequence[Part], done: Sequence[FinishedChunk]) -> FinishedChunk:
+    """Give a chunk of the whole field, joined where it was divided."""
+    tiles = [part.tile for part in parts if part.tile is not None]
+    return joined(tiles, done) if tiles else done[0]
+
+
+class _Fields:
+    """What the frames of chunks say of the whole field: summed once for all tiles of a chunk."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int], FieldSums] = {}
+        self._lock = threading.Lock()
+
+    def of(self, span: tuple[int, int], make: Callable[[], FieldSums]) -> FieldSums:
+        """Give the sums of a span; those of spans long before are forgotten."""
+        with self._lock:
+            if span not in self._known:
+                for old in sorted(self._known)[: 1 - _FIELDS]:
+                    del self._known[old]
+                self._known[span] = make()
+            return self._known[span]
 
 
 def _median_snr(table: pd.DataFrame) -> float:

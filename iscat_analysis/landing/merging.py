@@ -23,7 +23,8 @@ VIEWS = 1000
 CLIPS = 250
 """Events of which a clip is kept, the first; the page holds fewer."""
 
-_SEAM_PX = 2.0  # two chunks' estimates of one step are nearer than this
+SEAM_PX = 2.0
+"""Estimates of one step by two chunks, or two tiles, are nearer than this."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +59,8 @@ class MergedChunks:
         self._done: list[FinishedChunk] = []
         self._ends = set(ends)  # of the stretches of the movie
         self._dated: dict[int, NDArray[np.int64]] = {}
+        self._sampled: dict[int, int] = {}
         self._strongest = np.zeros((2, *shape))
-        self.sampled = 0
         self.cause = ""
         self.empty: EmptySpread | None = None
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
@@ -67,7 +68,13 @@ class MergedChunks:
     def note(self, number: int, done: FinishedChunk) -> None:
         """Register the events of a finished chunk, which may not be the next one in order."""
         frame = done.lines["frame"].to_numpy() if len(done.lines) else np.empty(0, dtype=np.int64)
+        self._sampled[number] = done.sampled
         self._dated[number] = frame[(frame >= done.core[0]) & (frame < done.core[1])]
+
+    @property
+    def sampled(self) -> int:
+        """Events whose posterior is sampled."""
+        return sum(self._sampled.values())
 
     def earlier(self, number: int, frame: int) -> int:
         """Count the events before a frame in finished chunks before a given one."""
@@ -78,7 +85,6 @@ class MergedChunks:
         """Append the next chunk."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
-        self.sampled += done.sampled
         self.cause = self.cause or done.cause
         if done.empty is not None:
             self.empty = done.empty if self.empty is None else self.empty + done.empty
@@ -112,7 +118,7 @@ class MergedChunks:
             finished |= (frame >= done.core[0]) & (frame < done.core[1])
         kept = np.flatnonzero(own)
         for stranger in np.flatnonzero(~own & finished):
-            if not _is_same_step(table, int(stranger), kept):
+            if not is_same_step(table, int(stranger), kept):
                 kept = np.append(kept, stranger)
         order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
         views, repeats = [], []
@@ -223,13 +229,13 @@ class MergedChunks:
         return int(np.sum(masked & ~saturated)), int(saturated.sum())
 
 
-def _is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
+def is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
     """Whether some other row describes the same step."""
     frame, error, x, y, mass = (
         table[name].to_numpy(dtype=float)
         for name in ("frame", FRAME_COLUMN, "x_px", "y_px", "mass_kda")
     )
     near = np.abs(frame[others] - frame[one]) <= np.maximum(2, error[others] + error[one])
-    near &= np.hypot(x[others] - x[one], y[others] - y[one]) < _SEAM_PX
+    near &= np.hypot(x[others] - x[one], y[others] - y[one]) < SEAM_PX
     near &= mass[others] * mass[one] > 0
     return bool(near.any())

@@ -20,6 +20,7 @@ from iscat_analysis.landing.neighbours import Step
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, Chunk, MapArray, Peak
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, SIDELOBE
 
 LEVELS = np.geomspace(1.0, 64.0, 25)
@@ -81,17 +82,18 @@ def searched_shares(
     window: int,
     roi_px: int,
     threshold: float,
+    own: Box = EVERYWHERE,
 ) -> Searched:
     """Give the shares at the boundaries of a core, from the last search and what was found."""
     snr, effective = maps
     stride = int(chunk.edges[1] - chunk.edges[0])
     frames = chunk.first + chunk.edges[1:-1]
     lit = effective > 0  # frames, and pixels, that were left out are told by themselves
-    own = np.flatnonzero((frames >= core[0]) & (frames < core[1]) & lit)
+    inside = np.flatnonzero((frames >= core[0]) & (frames < core[1]) & lit)
     high = [peak for peak in peaks if SIDELOBE * abs(peak.snr) > threshold]
     bright = [step for step in steps if step.is_measured]
-    shares = np.ones((own.size, LEVELS.size))
-    for row, j in enumerate(own.tolist()):
+    shares = np.ones((inside.size, LEVELS.size))
+    for row, j in enumerate(inside.tolist()):
         reach = (STRIDES + 1) * stride
         now = int(frames[j])
         near = [step for step in bright if abs(step.at.frame - now) <= reach]
@@ -103,11 +105,11 @@ def searched_shares(
             _raise_near_unsubtracted(asked, peak, roi_px)
         for step in near:
             part = max(1 - abs(step.at.frame - now) / window, 0.0)
-            inside = part * math.sqrt(EXPLAINS * step.excess)
-            _raise_near_fitted(asked, step, snr[j], inside, roi_px)
-        sizes = np.sort(asked[chunk.usable]) / threshold
+            left = part * math.sqrt(EXPLAINS * step.excess)
+            _raise_near_fitted(asked, step, snr[j], left, roi_px)
+        sizes = np.sort(asked[own][chunk.usable[own]]) / threshold
         shares[row] = np.searchsorted(sizes, LEVELS * (1 + 1e-9)) / sizes.size
-    return Searched(frames[own].astype(np.int64), shares)
+    return Searched(frames[inside].astype(np.int64), shares)
 
 
 def _raise_near_unsubtracted(asked: FloatArray, peak: Peak, roi_px: int) -> None:

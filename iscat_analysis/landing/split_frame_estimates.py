@@ -30,6 +30,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk, Patch
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
 
 PLACES, MOVIE_PLACES = 20_000, 100_000
@@ -132,8 +133,9 @@ def step_controls(
     events: Sequence[Event],
     steps: Sequence[Step],
     neighbours: Neighbours,
+    own: Box = EVERYWHERE,
 ) -> EmptySpread | None:
-    """Make the same estimates in windows in which nothing lands or leaves."""
+    """Make the same estimates in windows in which nothing lands or leaves, at its own pixels."""
     times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
@@ -148,12 +150,15 @@ def step_controls(
         if not apart or t >= apart[-1] + window:
             apart.append(t)
     chosen = [apart[i] for i in np.unique(np.linspace(0, len(apart) - 1, most).round().astype(int))]
+    others = np.ones(chunk.shape, dtype=np.bool_)
+    others[own] = False
     total: EmptySpread | None = None
     for turn in chosen:
         near = [s for s in steps if abs(s.at.frame - turn) <= window]
         taken = taken_places(
             context, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
         )
+        taken |= others
         sides, powers = [], []
         for start, stop in ((turn - window, turn), (turn, turn + window)):
             parts, light = [], []

@@ -46,6 +46,7 @@ from iscat_analysis.search.sliding import (
     find_steps,
     make_filter,
 )
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
 ROUNDS = 10
@@ -89,8 +90,10 @@ class ChunkFitter:
         pattern: MovingPattern | None = None,
         *,
         excess_noise: ExcessNoise | None = None,
+        own: Box = EVERYWHERE,
     ) -> None:
         self._excess_noise = excess_noise
+        self._own = own  # pixels of the chunk that count: those of the core of a tile
         self._context = context
         self._chunk = chunk
         self._pattern = pattern
@@ -149,7 +152,7 @@ class ChunkFitter:
             self.searched = searched_shares(
                 self._chunk, core, steps, *self._last,
                 window=self._window, roi_px=self._roi_px,
-                threshold=self._context.templates.threshold,
+                threshold=self._context.templates.threshold, own=self._own,
             )  # fmt: skip
         self._last = None
         del maps  # fits need their memory
@@ -173,7 +176,7 @@ class ChunkFitter:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
                 context=self._context, chunk=self._chunk, window=self._window,
-                events=events, steps=everything, neighbours=self._neighbours,
+                events=events, steps=everything, neighbours=self._neighbours, own=self._own,
             )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 

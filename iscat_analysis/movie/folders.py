@@ -104,6 +104,12 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
     return list(_once(found))
 
 
+def is_movie(address: Path) -> bool:
+    """Tell whether an address names a movie, and not a folder that may hold some."""
+    path, part = split_address(address)
+    return bool(part) or not path.is_dir() or path.suffix.lower() == _ZARR
+
+
 def _is_movie(path: Path) -> bool:
     suffix = path.suffix.lower()
     if path.name.startswith(".") or suffix not in SUFFIXES:

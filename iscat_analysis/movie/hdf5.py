@@ -9,7 +9,6 @@ Format: HDF5 File Format Specification 3.0 (The HDF Group).
 
 from __future__ import annotations
 
-import functools
 import math
 import mmap
 import struct
@@ -25,12 +24,12 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed
+from iscat_analysis.movie.slabs import Slabs
 
 _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
 _MOST_DECODED_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
 _HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
-_CACHE_BYTES = 64_000_000  # of decoded chunks that are kept
 _HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
 _HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
 
@@ -71,9 +70,7 @@ class StoredArray:
         self._grid = tuple(-(-n // c) for n, c in zip(shape, chunk, strict=True))
         self._where = where
         self._filters = filters
-        # A chunk that spans several frames is wanted again for the next ones.
-        kept = _CACHE_BYTES // max(1, self._chunk_bytes) if chunk[0] > 1 else 0
-        self._decoded = functools.lru_cache(maxsize=kept)(self._decode)
+        self._slabs = Slabs(self._decoded, shape, self.dtype, chunk[0] if filters else 1)
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read rows of the first axis, ``[start, stop)``, as a new array in native byte order."""
@@ -83,11 +80,16 @@ class StoredArray:
             first = int(self._where[0, 0]) + start * math.prod(self.shape[1:]) * self.dtype.itemsize
             block[:] = np.ndarray(block.shape, self._stored, buffer=self._data, offset=first)
             return block
+        return self._slabs.read(start, stop)
+
+    def _decoded(self, start: int, stop: int) -> NDArray[Any]:
+        """Decode the chunks of some rows, each once."""
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         depth = self._chunk[0]
         first_slab, last_slab = start // depth, -(-stop // depth)
         for place in np.ndindex(max(0, last_slab - first_slab), *self._grid[1:]):
             index = (place[0] + first_slab, *place[1:])
-            pixels = self._decoded(int(np.ravel_multi_index(index, self._grid)))
+            pixels = self._decode(int(np.ravel_multi_index(index, self._grid)))
             source, target = [], []
             for axis, number in enumerate(index):
                 origin, size = number * self._chunk[axis], self._chunk[axis]
@@ -123,7 +125,7 @@ class Hdf5Reader:
     def __init__(self, path: Path) -> None:
         self._path = path
         with self._believing_nothing():
-            self._file = h5py.File(path, "r", locking=False)
+            self._file = _opened(path)
         try:
             with self._believing_nothing():
                 if self._file.userblock_size:
@@ -316,6 +318,16 @@ class Hdf5Reader:
             f"{self._path}: {name} is incomplete ({how}); "
             "the recording or the copy was interrupted: export it again"
         )
+
+
+def _opened(path: Path) -> h5py.File:
+    """Open a file for reading, also one that a program goes on writing so that others may read."""
+    try:
+        return h5py.File(path, "r", locking=False)
+    except OSError as error:
+        if "already open for write" not in str(error):
+            raise
+        return h5py.File(path, "r", locking=False, swmr=True)
 
 
 def _single(dataset: h5py.Dataset) -> bool:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
+from iscat_analysis.movie.slabs import Slabs
 from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
@@ -91,12 +92,16 @@ class ArrayFrames:
         self.shape = (shape[0], shape[1], shape[2])
         self.dtype = stored.newbyteorder("=")
         self.metadata = metadata
+        self._slabs = Slabs(self._decoded, self.shape, self.dtype, getattr(array, "depth", 1))
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
         Shapes: result (stop − start, y, x).
         """
+        return self._slabs.read(start, stop)
+
+    def _decoded(self, start: int, stop: int) -> NDArray[Any]:
         return np.array(self._array[start:stop], dtype=self.dtype, order="C")
 
     def close(self) -> None:

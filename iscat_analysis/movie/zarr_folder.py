@@ -79,6 +79,8 @@ class CheckedArray:
         if len(shape) > 3 and set(shape[1:-2]) == {1}:
             shape = (shape[0], *shape[-2:])
         self.shape = shape
+        self.depth = int((array.shards or array.chunks)[0])
+        """Frames that are stored together."""
         store.most = _GROWTH * math.prod(array.shards or array.chunks) * self.dtype.itemsize
         store.most += _HEADER_BYTES
         store.complete = True

@@ -55,6 +55,17 @@ class LocalModels:
         return brighter(self._moved(tuple(sorted(step for step in steps if step[1]))), dimming)
 
 
+class ModelsFrom:
+    """Models of a movie by places that count from a corner, as those of a tile of the field."""
+
+    def __init__(self, whole: LocalModels, corner_nm: tuple[float, float]) -> None:
+        self._whole, (self._y_nm, self._x_nm) = whole, corner_nm
+
+    def at(self, x_nm: float, y_nm: float, frame: float | None = None) -> ForwardModel:
+        """Give the model of a place; see `LocalModels`."""
+        return self._whole.at(x_nm + self._x_nm, y_nm + self._y_nm, frame)
+
+
 def refuse_moving_focus(config: Config) -> None:
     """Refuse a focus that moves where pictures are those of one focus."""
     if config.optics.focus_drift_nm:

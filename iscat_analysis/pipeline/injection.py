@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from iscat_analysis.bounds import power_searched
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Mover, Trajectory
+from iscat_analysis.camera.lines import Lines
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import Executor
@@ -175,13 +176,14 @@ def inject_and_recover(
     particles = draw_particles(
         result.context, (movie.shape[1], movie.shape[2]), frames, window, count, result.fits, seed
     )
+    lines = result.context.lines if isinstance(result.context.lines, Lines) else None
     again = analyse_landings(
         InjectedMovie(movie, camera, particles, seed, result.trajectory),
         config.model_copy(update={"background": fixed}),
         camera,
         warn=notify_nobody,  # the user has been told already
         progress=progress,
-        lines=result.context.lines,
+        lines=lines,
         executor=executor,
     )
     if again.interrupted:

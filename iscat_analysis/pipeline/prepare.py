@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.burnt_in import text_message, text_summary, without_text
 from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_overflow, refuse_ratio
+from iscat_analysis.camera.field_sample import whole_frames
 from iscat_analysis.camera.learned import with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.camera.processed import find_processing
@@ -43,7 +44,7 @@ from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread
 from iscat_analysis.tracking.tracks import judge_times
 
-_FIRST_FRAMES = 64  # frames that are looked at before anything else
+_FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field
 
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
@@ -78,8 +79,10 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     stored, auto = movie, config.camera.assumed is not config.camera
     stated = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
     refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
-    begun = movie.read(start, max(start, min(stop, start + _FIRST_FRAMES, movie.shape[0])))
+    first_frames = whole_frames(movie.shape[1:], _FIRST_FRAMES)
+    begun = movie.read(start, max(start, min(stop, start + first_frames, movie.shape[0])))
     refuse_channels(begun, stated, movie.name)
+    del begun
     movie, config, known = with_camera(movie, config, (start, min(stop, movie.shape[0])))
     camera = known.camera
     for text in (*known.messages, *law_messages(known)):
@@ -102,7 +105,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     processing = find_processing(movie, camera, span, moving=tracked)
     if processing is not None:
         run.warn(f"{movie.name}: {processing.message}")
-    stop = min(stop, start + _FIRST_FRAMES, movie.shape[0])
+    stop = min(stop, start + first_frames, movie.shape[0])
     seen = movie.read(start, max(start, stop))
     if mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{movie.name}: frames {start} to {stop - 1}")
@@ -110,6 +113,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     swapped = axes_warning(movie.name, seen)
     if swapped:
         run.warn(swapped)
+    del seen
     summary: dict[str, Any] = {"camera": known.summary}
     if processing is not None:
         summary["processing"] = processing.summary
@@ -206,7 +210,7 @@ def _landing_light(
     def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
         noise_survey = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
-        motion = motion_message(seen, noise_survey) if left_open else ""
+        motion = motion_message(noise_survey) if left_open else ""
         if not motion:
             sum_first_chunk(noise_survey.reader, config, noise_survey.window)
         return noise_survey, motion

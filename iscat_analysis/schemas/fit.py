@@ -136,6 +136,18 @@ class Background(Noise):
     drift_error_px: tuple[float, float] | None = key("Its standard errors [px]")
 
 
+class JudgedBy(Closed):
+    """The sample of pixels by which the noise of a large field was judged."""
+
+    pixels: Count = key("Pixels that were looked at, in squares all over the field")
+    of: Count = key("Pixels of the field")
+    side_px: Count = key("Side of a square [px]")
+    corners_px: list[tuple[Count, Count]] = key("First row and column of each square")
+    seed: Count = key("Of their places")
+    noise_ratio: NotNegative = key("Noise variance between neighbouring frames over the light's")
+    noise_ratio_se: NotNegative = key("Its standard error, from the scatter of the squares")
+
+
 class Landing(Document):
     """A landing movie: its windows, what was searched, and its drift."""
 
@@ -146,6 +158,7 @@ class Landing(Document):
     noise_variance_over_shot: list[Number] = maybe("Variance over that of the photoelectrons")
     shot_noise_limited_frames: int | None = maybe("Frames that may be averaged before other noise")
     noise_spectrum: Spectrum | None = maybe("Between neighbouring frames; null if as expected")
+    judged_by: JudgedBy = maybe("Of fields of more than 512 × 512 pixels: where noise was judged")
     stride_frames: Natural = maybe("From one searched boundary to the next")
     boundaries_searched: Count = maybe("Boundaries that share the expected false alarms")
     searched_share: Share | None = maybe(
@@ -163,7 +176,8 @@ class Landing(Document):
     drift_x_px: list[float] | None = maybe("Motion along x in each block [px]")
     drift_y_px: list[float] | None = maybe("Motion along y in each block [px]")
     drift_error_px: Number = maybe("Standard error from one block to the next [px]")
-    chunks: Count = maybe("Parts the movie was analysed in")
+    chunks: Count = maybe("Parts in time that the movie was analysed in")
+    tiles: Count = maybe("Parts of the field that each of them was divided into")
 
 
 class Injection(Closed):

@@ -43,9 +43,25 @@ class EmptySpread:
     distances: tuple[float, ...] | None = None
 
     def __add__(self, other: EmptySpread) -> EmptySpread:
-        """Add those of other frames of the same field."""
+        """Add those of other frames of the same field, or of other tiles of it."""
+        if self.counts.shape != other.counts.shape:
+            joined = EmptySpread.beside([self, other])
+            return self if joined is None else joined
         squares, counts = self.squares + other.squares, self.counts + other.counts
         return EmptySpread(squares, counts, self.shared, self.distances)
+
+    @classmethod
+    def beside(cls, parts: Sequence[EmptySpread | None]) -> EmptySpread | None:
+        """Join those of the same frames of fields beside each other; None where there is none."""
+        known = [part for part in parts if part is not None]
+        if not known:
+            return None
+        squares, counts = (
+            np.concatenate([getattr(part, name) for part in known], axis=-1)
+            for name in ("squares", "counts")
+        )
+        shared = np.mean([part.shared for part in known], axis=0)
+        return cls(squares, counts, shared, known[0].distances)
 
 
 class EmptyField:

@@ -24,7 +24,6 @@ from iscat_analysis.fitting import events as events_module
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.landing import chunk_work, merging
-from iscat_analysis.landing import find as landing_module
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
@@ -404,14 +403,14 @@ def test_lines_of_chunks_have_no_numbers(
 ) -> None:
     """A row is numbered when it is made, and that is when all chunks are there."""
     monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.005)
-    real, lines = landing_module.analyse_chunk, []
+    real, lines = chunk_work.analyse_chunk, []
 
     def looked_at(*arguments: Any) -> FinishedChunk:
         done = real(*arguments)
         lines.append(done.lines)
         return done
 
-    monkeypatch.setattr(landing_module, "analyse_chunk", looked_at)
+    monkeypatch.setattr(chunk_work, "analyse_chunk", looked_at)
     fits = _run(counts)[0].fits
     assert len(lines) > 1
     assert not any("event" in part for part in lines)
@@ -593,7 +592,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
     monkeypatch.setattr(pipeline_module, "FEW_FIGURES", 0)
     fit_stack(movie, config, out=tmp_path / "whole.iscat")
     assert not partial_folder(tmp_path / "whole.iscat").exists()
-    real: Callable[..., Any] = landing_module.analyse_chunk
+    real: Callable[..., Any] = chunk_work.analyse_chunk
     calls: list[int] = []
 
     def stopping(*arguments: Any) -> Any:
@@ -602,7 +601,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    monkeypatch.setattr(chunk_work, "analyse_chunk", stopping)
     out = tmp_path / "cut.iscat"
     for _ in range(2):  # before any chunk is finished, and after the first
         with pytest.raises(KeyboardInterrupt):
@@ -753,7 +752,7 @@ def test_an_interrupt_of_the_chains_keeps_the_fits(
 
 def _interrupted_at_the_second_chunk(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Interrupt the second chunk that is begun; the list grows with every one."""
-    real, calls = landing_module.analyse_chunk, []
+    real, calls = chunk_work.analyse_chunk, []
 
     def stopping(*arguments: Any) -> Any:
         calls.append(1)
@@ -761,7 +760,7 @@ def _interrupted_at_the_second_chunk(monkeypatch: pytest.MonkeyPatch) -> list[in
             raise KeyboardInterrupt
         return real(*arguments)
 
-    monkeypatch.setattr(landing_module, "analyse_chunk", stopping)
+    monkeypatch.setattr(chunk_work, "analyse_chunk", stopping)
     return calls
 
 

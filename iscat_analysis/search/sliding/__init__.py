@@ -21,8 +21,10 @@ from iscat_analysis.search.sliding.frames import (
     cut_off,
     good_frames,
     make_chunk,
+    make_tile_chunk,
     measure_frames,
     summed,
+    sums_of,
     well_lit,
 )
 from iscat_analysis.search.sliding.noise import (
@@ -49,6 +51,7 @@ from iscat_analysis.search.sliding.search import (
     sliding_maps,
     stride_of,
 )
+from iscat_analysis.search.sliding.tiles import FieldSums, Tile
 
 __all__ = [
     "CORRELATION",
@@ -61,12 +64,14 @@ __all__ = [
     "SHOT_LIMITED",
     "STRIDES",
     "Chunk",
+    "FieldSums",
     "Filter",
     "MapArray",
     "NoiseCurve",
     "Patch",
     "Peak",
     "StepFrame",
+    "Tile",
     "boundaries",
     "choose_window",
     "crosstalk",
@@ -78,11 +83,13 @@ __all__ = [
     "longest_window",
     "make_chunk",
     "make_filter",
+    "make_tile_chunk",
     "measure_frames",
     "measure_motion",
     "measure_noise",
     "sliding_maps",
     "stride_of",
     "summed",
+    "sums_of",
     "well_lit",
 ]

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.camera.field_sample import sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import (
@@ -22,14 +25,20 @@ from iscat_analysis.records import (
     Mapper,
     PlacedSource,
 )
+from iscat_analysis.scratch import Scratch
 from iscat_analysis.search.sliding import (
     DARK,
     Chunk,
     make_chunk,
+    make_tile_chunk,
     measure_frames,
     stride_of,
+    summed,
+    sums_of,
     well_lit,
 )
+from iscat_analysis.search.sliding.tiles import FieldSums, Tile, cut_field
+from iscat_analysis.search.templates import LARGEST_IMAGE
 from iscat_analysis.threads import threads
 
 NOISE_FRAMES = 800
@@ -41,6 +50,11 @@ HALO = 2
 _LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
+_AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fit into memory
+_FEWEST_AT_ONCE = 8
+_TOGETHER = 4  # sums over the field that are made at a time
+_SPAN_BYTES = 4e9  # of the frames of a chunk of a large field: they stay in the system's cache
+_TILE_BYTES = 100  # of a pixel of a tile, beside its blocks and maps
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
@@ -71,6 +85,8 @@ class Reader:
         # made at once, because growing copies; only what is written to takes memory
         room = 0 if self._placed else min(max(last - first, 0), room_bytes // self.frame_bytes)
         self._buffer = np.empty((room, *self.shape), dtype=movie.dtype)
+        self._room_bytes = room_bytes
+        self._scratch: Scratch | None = None  # frames that do not fit into memory
         self._held = (first, first)
         self._light: FloatArray = np.empty(0)
         self._repeats: BoolArray = np.empty(0, dtype=np.bool_)
@@ -89,6 +105,18 @@ class Reader:
         """
         return self.frame_bytes // 2 if self._placed else self.frame_bytes
 
+    @cached_property
+    def sampled(self) -> Reader:
+        """A reader of a sample of the pixels, by which noise is judged; itself of a small field."""
+        movie, camera = sampled(self._movie, self.camera)
+        if movie is self._movie:
+            return self
+        return Reader(movie, camera, self.first, self.last, self._room_bytes, dark_e=self._dark_e)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames of the movie, without keeping them."""
+        return self._movie.read(start, stop)
+
     @property
     def name(self) -> str:
         """What messages call the movie."""
@@ -99,19 +127,42 @@ class Reader:
         if self._placed:
             self._placed.let_go()
         self._buffer = self._buffer[:0].copy()
+        self._scratch = None
         self._held = (self.first, self.first)
         self._summed = None
 
+    def _let_go(self) -> None:
+        """Give back the memory of frames that lie in a file."""
+        if self._placed:
+            self._placed.let_go()
+        elif self._scratch is not None:
+            self._scratch.let_go()
+
     def _keep(self, kept: slice, room: int) -> None:
-        """Leave only some of the frames in memory, with room for more behind them."""
+        """Leave only some of the frames, with room for more behind them."""
         if self._placed:
             self._placed.let_go()
             return
         frames, old = self._buffer[kept], self._buffer
         if room > len(old):
-            self._buffer = np.empty((room, *self.shape), dtype=self._movie.dtype)
+            shape = (room, *self.shape)
+            if room * self.frame_bytes > self._room_bytes:
+                self._scratch = Scratch(shape, self._movie.dtype)
+                self._buffer = self._scratch.array
+            else:
+                self._buffer = np.empty(shape, dtype=self._movie.dtype)
         if self._buffer is not old or kept.start:
-            self._buffer[: len(frames)] = frames
+            step = self._at_once(len(frames))
+            for start in range(0, len(frames), step):  # forward, so that none is overwritten
+                part = frames[start : start + step]
+                self._buffer[start : start + len(part)] = part
+                self._let_go()
+
+    def _at_once(self, frames: int) -> int:
+        """Count the frames that are looked at together: all, where they fit into memory."""
+        if frames * self.frame_bytes <= self._room_bytes:
+            return max(frames, 1)
+        return max(_FEWEST_AT_ONCE, _AT_ONCE_BYTES // self.frame_bytes)
 
     def _frames(self, start: int, stop: int) -> NDArray[Any]:
         """Frames [start, stop) of those that are held."""
@@ -132,7 +183,11 @@ class Reader:
             self._keep(known, stop - start)
             self._light, self._repeats = self._light[known], self._repeats[known]
             self._held = (start, start + kept)
-            self._append(stop, mapper)
+            step = self._at_once(stop - start)
+            for end in (*range(self._held[1] + step, stop, step), stop):
+                self._append(end, mapper)
+                if step < stop - start:
+                    self._let_go()
         light = self._light[: stop - start]
         good = np.isfinite(light) & ~self._repeats[: stop - start]
         return self._frames(start, stop), good, light
@@ -175,12 +230,7 @@ class Reader:
         """Frames of a span, summed in blocks, once for all who ask for it one after the other."""
         if self._summed is not None and self._summed[:2] == (span, stride):
             return self._summed[2]
-        counts, good, light = self.counts(*span, pool.map)
-        if not good.any():
-            raise DataError(
-                f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
-                "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
-            )
+        counts, good, light = self._lit(span, pool)
         chunk = make_chunk(
             span[0], counts, good, light, self.camera,
             stride=stride, defects=find_defects, mapper=pool.map,
@@ -188,6 +238,50 @@ class Reader:
         )  # fmt: skip
         self._summed = span, stride, chunk
         return chunk
+
+    def field_sums(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> FieldSums:
+        """Sum the frames of a span over the whole field, for all of its tiles."""
+        counts, good, light = self._lit(span, pool)
+        total, highest = np.zeros(self.shape), np.zeros(self.shape, dtype=self._movie.dtype)
+        step = self._at_once(len(counts))
+        step = max(1, step // _TOGETHER) if step < len(counts) else step
+        starts = range(0, len(counts), step)
+
+        def one(start: int) -> tuple[FloatArray, NDArray[Any]]:
+            lit = counts[start : start + step][good[start : start + step]]
+            return summed(lit) if len(lit) else (np.zeros(self.shape), highest)
+
+        for first in range(0, len(starts), _TOGETHER):
+            for sums, most in pool.map(one, starts[first : first + _TOGETHER]):
+                total += sums
+                np.maximum(highest, most, out=highest)
+            self._let_go()
+        return sums_of(span, good, light, total, highest, self.camera, find_defects)
+
+    def tile_chunk(
+        self, sums: FieldSums, tile: Tile, stride: int, pool: ThreadPoolExecutor
+    ) -> Chunk:
+        """Frames of one tile, summed in blocks."""
+        if not self._placed:
+            self.counts(*sums.span, pool.map)
+        counts = self._frames(*sums.span)
+        return make_tile_chunk(
+            counts[(slice(None), *tile.here)], sums, self.camera.part(tile.here),
+            stride=stride, check=self._placed.check if self._placed else lambda: None,
+            let_go=self._let_go, mapper=pool.map,
+        )  # fmt: skip
+
+    def _lit(
+        self, span: tuple[int, int], pool: ThreadPoolExecutor
+    ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
+        """Frames of a span, which of them are good, and their light; refused where none is."""
+        counts, good, light = self.counts(*span, pool.map)
+        if not good.any():
+            raise DataError(
+                f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
+                "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
+            )
+        return counts, good, light
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
         """Good frames among the first, for judging the noise."""
@@ -211,9 +305,10 @@ def sum_first_chunk(reader: Reader, config: Config, window: int) -> None:
     if not reader.in_place:
         return
     stride = stride_of(window)
-    _, span = plan_chunks(reader, config, window, stride)[0]
-    with threads(config.compute.workers) as pool:
-        reader.chunk(span, stride, pool)
+    first, *_ = plan_parts(reader, config, window, stride)[0]
+    if first.tile is None:
+        with threads(config.compute.workers) as pool:
+            reader.chunk(first.span, stride, pool)
 
 
 def _runs(flags: BoolArray) -> Iterator[slice]:
@@ -228,8 +323,9 @@ def reader_of(movie: CountSource, config: Config, camera: Camera, span: tuple[in
     dark_e = -math.inf
     if config.optics.scheme != "darkfield" and span[0] < span[1]:
         numbers = np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int).tolist()
-        some = np.concatenate([movie.read(k, k + 1) for k in numbers])
-        light = measure_frames(some, camera)[0]
+        seen, theirs = sampled(movie, camera)
+        some = np.concatenate([seen.read(k, k + 1) for k in numbers])
+        light = measure_frames(some, theirs)[0]
         lit = light[well_lit(light)]
         if lit.size and np.median(lit) > 0:
             dark_e = DARK * float(np.median(lit))
@@ -241,6 +337,98 @@ def counts_budget(config: Config) -> int:
     return int(MEMORY_SHARE * config.compute.memory_limit_mb * 1e6)
 
 
+@dataclass(frozen=True)
+class Part:
+    """A chunk of a movie, or one tile of it."""
+
+    core: tuple[int, int]
+    span: tuple[int, int]
+    tile: Tile | None = None
+
+
+def plan_parts(
+    reader: Reader,
+    config: Config,
+    window: int,
+    stride: int,
+    stretch: tuple[int, int] | None = None,
+) -> list[list[Part]]:
+    """Divide a movie, or a stretch of it, into chunks, and each chunk of a large field into tiles.
+
+    Block edges fall on the same frames in every chunk.
+    """
+    first, last = stretch or (reader.first, reader.last)
+    plan = plan_chunks(reader, config, window, stride, (first, last))
+    if plan:
+        return [[Part(core, span)] for core, span in plan]
+    parts, core = choose_tiles(reader, config, window, stride, last - first)
+    tiles = cut_field(reader.shape, parts, halo_px(config))
+    count = math.ceil((last - first) / core)
+    even = math.ceil((last - first) / count / stride) * stride
+    halo = halo_frames(window, stride)
+    return [
+        [
+            Part((begin, end), (max(begin - halo, first), min(end + halo, last)), tile)
+            for tile in tiles
+        ]
+        for begin, end in pairwise([*range(first, last, even), last])
+    ]
+
+
+def halo_px(config: Config) -> int:
+    """Width of the halo of a tile: from a fitted square to the centre of its farthest neighbour."""
+    return math.ceil((LARGEST_IMAGE + 0.5) * _roi_px(config)) + 2
+
+
+def _roi_px(config: Config) -> int:
+    return config.fit.roi_px(config.camera.pixel_size_nm or math.nan)
+
+
+def halo_frames(window: int, stride: int) -> int:
+    """Length of the halo of a chunk."""
+    return math.ceil(HALO * window / stride) * stride
+
+
+def choose_tiles(
+    reader: Reader, config: Config, window: int, stride: int, frames: int
+) -> tuple[tuple[int, int], int]:
+    """Choose rows and columns of tiles, and the frames of a core, that look at least at halos."""
+    side, halo = halo_px(config), halo_frames(window, stride)
+    smallest = _roi_px(config)
+    budget, per_frame = counts_budget(config), _per_block(config) / stride
+    longest = int(_SPAN_BYTES // reader.frame_bytes)
+    best: tuple[float, tuple[int, int], int] | None = None
+    rows, columns = reader.shape
+    for high in range(1, rows // smallest + 1):
+        for wide in range(1, columns // smallest + 1):
+            pixels = min(math.ceil(rows / high) + 2 * side, rows)
+            pixels *= min(math.ceil(columns / wide) + 2 * side, columns)
+            room = min(int((budget / pixels - _TILE_BYTES) / per_frame), longest)
+            core = frames if room >= frames else (room - 2 * halo) // stride * stride
+            if core < stride:
+                continue
+            work = high * wide * pixels * (min(core + 2 * halo, frames) / core)
+            if best is None or work < best[0]:
+                best = work, (high, wide), core
+    if best is None:
+        pixels = (smallest + 2 * side) ** 2
+        least = pixels * (_TILE_BYTES + per_frame * (2 * halo + stride)) / MEMORY_SHARE / 1e6
+        raise DataError(
+            f"{reader.name}: windows of {window} frames of {columns} x {rows} pixels need "
+            f"compute.memory_limit_mb = {math.ceil(least)}; raise it, or lower "
+            "background.window_frames"
+        )
+    return best[1], best[2]
+
+
+def _per_block(config: Config) -> int:
+    """Bytes of a pixel of a block beside its counts: its sum and its map.
+
+    Where the motion of the pattern is divided out, that and a spectrum as well.
+    """
+    return 32 if config.background.follows_pattern else 20
+
+
 def plan_chunks(
     reader: Reader,
     config: Config,
@@ -248,27 +436,19 @@ def plan_chunks(
     stride: int,
     stretch: tuple[int, int] | None = None,
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
-    """Divide a movie, or a stretch of it; block edges fall on the same frames in every chunk."""
+    """Divide a movie, or a stretch of it, whose field is not divided; empty where it has to be."""
     first, last = stretch or (reader.first, reader.last)
-    halo = math.ceil(HALO * window / stride) * stride
+    halo = halo_frames(window, stride)
     budget = counts_budget(config)
-    # beside its counts, a block holds its sum and its map (where the pattern's motion is divided
-    # out, that and a spectrum as well), and the field some images in doubles
+    # beside counts and blocks, the field holds some images in doubles
     pixels = math.prod(reader.shape)
-    per_block = 32 if config.background.follows_pattern else 20
-    buffers_bytes = per_block * pixels // stride
+    buffers_bytes = _per_block(config) * pixels // stride
     if (last - first) * (reader.frame_bytes + buffers_bytes) <= budget - 40 * pixels:
         return [((first, last), (first, last))]
-    per_frame = reader.held_bytes + buffers_bytes
-    room = (budget - 40 * pixels) // per_frame
+    room = (budget - 40 * pixels) // (reader.held_bytes + buffers_bytes)
     core = (room - 2 * halo) // stride * stride
-    if core < stride:
-        least = math.ceil((40 * pixels + per_frame * (2 * halo + stride)) / MEMORY_SHARE / 1e6)
-        raise DataError(
-            f"{reader.name}: windows of {window} frames of {reader.shape[1]} x {reader.shape[0]} "
-            f"pixels need compute.memory_limit_mb = {least}; raise it, or lower "
-            "background.window_frames"
-        )
+    if core < max(halo, stride):  # most of the work would be that of halos
+        return []
     count = 2 * math.ceil((last - first) / core / 2)  # which two processes share
     even = (last - first) / count
     # two that are held at once have the room of two

@@ -13,6 +13,7 @@ from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.search.sliding.tiles import FieldSums
 
 HALF = 0.5
 """Share of the usual light, below which a shutter is not open."""
@@ -43,6 +44,8 @@ class Chunk:
     edges: NDArray[np.int64]
     blocks_e: FloatArray
     check: Callable[[], None]
+    let_go: Callable[[], None]  # of pages of the file, once a region was copied
+    level_e: float  # mean light of a pixel and frame, of the whole field
 
     @property
     def stop(self) -> int:
@@ -65,9 +68,11 @@ class Chunk:
         self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
+        counts = _region(self.counts, here, rows, columns)
+        self.let_go()
         return Patch(
             first=self.first + here.start,
-            counts=_region(self.counts, here, rows, columns),
+            counts=counts,
             good=self.good[here],
             power=self.power[here],
             gain=_at(camera.gain_e_per_adu, pixels),
@@ -259,6 +264,88 @@ def make_chunk(
 
     Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
+    rows, columns = counts.shape[1:]
+    edges, blocks, highest = _sum_blocks(counts, good, camera, stride, check, mapper)
+    saturated = camera.saturated(highest.max(axis=0))
+    power = np.where(good, light_e, 0.0)
+    power /= power[good].mean()
+    total = blocks.sum(axis=0)
+    variance = camera.read_variance_e2((rows, columns))
+    usable = ~(saturated | defects(total, np.count_nonzero(good) * variance)) & (total > 0)
+    mean = total / power.sum()
+    return Chunk(
+        first, counts, good, power, camera, mean, usable, saturated, edges, blocks, check,
+        _nothing, float(mean.mean()),
+    )  # fmt: skip
+
+
+def sums_of(
+    span: tuple[int, int],
+    good: BoolArray,
+    light_e: FloatArray,
+    total: FloatArray,
+    highest: NDArray[Any],
+    camera: Camera,
+    defects: Callable[[FloatArray, FloatArray], BoolArray],
+) -> FieldSums:
+    """Say which light and which pixels some frames have, as `make_chunk` does.
+
+    Shapes: `good, light_e` (t,), `total, highest` (y, x), in counts.
+    """
+    frames = np.count_nonzero(good)
+    electrons = camera.gain_e_per_adu * (total - frames * np.asarray(camera.offset_adu))
+    power = np.where(good, light_e, 0.0)
+    power /= power[good].mean()
+    saturated = camera.saturated(highest)
+    variance = camera.read_variance_e2((total.shape[0], total.shape[1]))
+    usable = ~(saturated | defects(electrons, frames * variance)) & (electrons > 0)
+    mean = electrons / power.sum()
+    return FieldSums(span, good, power, float(mean.mean()), mean, usable, saturated)
+
+
+def make_tile_chunk(
+    counts: NDArray[Any],
+    sums: FieldSums,
+    camera: Camera,
+    *,
+    stride: int,
+    check: Callable[[], None],
+    let_go: Callable[[], None],
+    mapper: Mapper = map,
+) -> Chunk:
+    """Sum the frames of a tile in blocks; light and pixels left out are known from the field.
+
+    Shapes: `counts` (t, y, x).
+    """
+
+    def check_and_let_go() -> None:
+        check()
+        let_go()
+
+    edges, blocks, _ = _sum_blocks(counts, sums.good, camera, stride, check_and_let_go, mapper)
+    let_go()
+    return Chunk(
+        sums.span[0], counts, sums.good, sums.power, camera, sums.mean_e, sums.usable,
+        sums.saturated, edges, blocks, check, let_go, sums.level_e,
+    )  # fmt: skip
+
+
+def _nothing() -> None:
+    """Keep the pages of the frames."""
+
+
+def _sum_blocks(
+    counts: NDArray[Any],
+    good: BoolArray,
+    camera: Camera,
+    stride: int,
+    check: Callable[[], None],
+    mapper: Mapper,
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[Any]]:
+    """Sum blocks of so many frames, and find the highest count of each pixel in each.
+
+    Shapes: `counts` (t, y, x), `blocks_e, highest` (k, y, x).
+    """
     frames, rows, columns = counts.shape
     edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
     blocks = np.empty((edges.size - 1, rows, columns))
@@ -270,22 +357,14 @@ def make_chunk(
         part = slice(edges[k], edges[k + 1])
         start = int(np.argmax(good[part])) + int(edges[k])
         highest[k] = counts[start]
-        block_sums(counts[part], good[part], _scratch(counts), blocks[k], highest[k])
+        block = np.ascontiguousarray(counts[part])
+        block_sums(block, good[part], _scratch(counts), blocks[k], highest[k])
         blocks[k] -= np.count_nonzero(good[part]) * offset
         blocks[k] *= camera.gain_e_per_adu
 
     for _ in mapper(one, range(edges.size - 1)):
         pass
-    saturated = camera.saturated(highest.max(axis=0))
-    power = np.where(good, light_e, 0.0)
-    power /= power[good].mean()
-    total = blocks.sum(axis=0)
-    variance = camera.read_variance_e2((rows, columns))
-    usable = ~(saturated | defects(total, np.count_nonzero(good) * variance)) & (total > 0)
-    return Chunk(
-        first, counts, good, power, camera, total / power.sum(), usable, saturated, edges, blocks,
-        check,
-    )  # fmt: skip
+    return edges, blocks, highest
 
 
 def _region(

@@ -1,0 +1,310 @@
+"""Large sensors, long movies, crowded fields: how processor time and memory grow, and what limits.
+
+    python benchmarks/scale.py [--quick] [--full] [--fields 128x128,…] [--frames 500,…]
+                               [--particles 10,…] [--memory-mb N] [--keep FOLDER]
+
+Each job is ``iscat fit`` in a process of its own, on plain numbers: a block of frames with
+particles that land in its first half and leave in its second one, and links to it, so that a movie
+of any length takes the room of a block.  Reported are megabytes of input per second of processor time,
+the peak memory of all its processes and the seconds of its parts.  Of three series, in pixels,
+frames and particles, the slope of processor time is printed, both on logarithmic scales: each job
+costs what its start costs, a job of the smallest kind, and what grows; the growing part may have a
+slope of 1.05 at most.  From one and two workers, and jobs of one and several chunks, follow what a
+job costs once, per chunk and per megabyte; more workers are extrapolated from that.
+
+Without options, the default takes less than ten minutes on two idle cores; ``--full`` goes to
+1200 × 1920 pixels, 100 000 frames and 10 000 particles.  ``--quick`` judges nothing.
+Exit status 1 where a slope or the memory breaks its promise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _memory import Memory
+from scipy.optimize import nnls
+
+from iscat_analysis.config import load_config
+from iscat_analysis.fitting.context import AnalysisContext, make_context
+from iscat_analysis.optics.forward import PixelGrid
+
+ROOT = Path(__file__).resolve().parent
+RESULTS = ROOT / "results"
+CONFIG = ROOT.parent / "sample_configs" / "landing.toml"
+PROGRAM = "import sys; sys.argv[0] = 'iscat'; from iscat_cli import main; sys.exit(main())"
+LARGEST_SLOPE, MOST_MEMORY_MB = 1.05, 1500.0
+BLOCK, LIGHT_ADU, HALF_PX = 400, 25_000.0, 40
+WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
+MASSES_KDA = (66.0, 146.0, 480.0)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is analysed."""
+
+    rows: int
+    columns: int
+    frames: int
+    particles: int
+    workers: int = 2
+
+    @property
+    def megabytes(self) -> float:
+        """Size of the movie."""
+        return self.rows * self.columns * self.frames * 2 / 1e6
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What it took."""
+
+    job: Job
+    processor_s: float
+    seconds: float
+    peak_memory_mb: float
+    parts_s: dict[str, float]
+    events: int
+    chunks: int
+    tiles: int
+
+
+def write_movie(job: Job, folder: Path) -> Path:
+    """Write a block of frames, and links to it."""
+    rng = np.random.default_rng(1)
+    config = load_config(CONFIG, [])
+    context = make_context(config, (job.rows, job.columns), searches=100, sliding=True)
+    length = min(BLOCK, job.frames)
+    y, x = np.mgrid[: job.rows, : job.columns]
+    light = 1 + 0.05 * np.sin(y / 7.3 + np.sin(x / 31)) * np.cos(x / 9.1 + np.sin(y / 23))
+    steps = [_particle(job, context, rng, length) for _ in range(job.particles)]
+    first = folder / "movie_0000.bin"
+    with first.open("wb") as file:
+        for frame in range(length):
+            mean = light * LIGHT_ADU * (1 + 0.005 * rng.standard_normal())
+            for landing, leaving, here, image in steps:
+                if landing <= frame < leaving:
+                    mean[here] *= 1 + image
+            noise = rng.standard_normal(mean.shape, dtype=np.float32)
+            file.write(np.rint(mean + np.sqrt(mean / 4) * noise).astype("<u2").tobytes())
+    parts = max(1, job.frames // length)
+    for number in range(1, parts):
+        folder.joinpath(f"movie_{number:04}.bin").symlink_to(first.name)
+    folder.joinpath("movie_settings.dat").write_text(
+        f"save/frame/shape\t({job.rows}, {job.columns})\nsave/frame/dtype\t<u2\n"
+        f"save/saved\t{parts * length}\n",
+        encoding="utf-8",
+    )
+    return first
+
+
+def _particle(
+    job: Job, context: AnalysisContext, rng: np.random.Generator, length: int
+) -> tuple[int, int, tuple[slice, slice], np.ndarray]:
+    """Choose when and where a particle is, and draw it."""
+    landing = int(rng.integers(length // 8, length // 2 - length // 16))
+    leaving = int(rng.integers(length // 2 + length // 16, length - length // 8))
+    mass = float(rng.choice(MASSES_KDA))
+    places, spans = [], []
+    for size in (job.rows, job.columns):
+        place = float(rng.uniform(HALF_PX + 2, size - HALF_PX - 3))
+        places.append(place)
+        spans.append((round(place) - HALF_PX, round(place) + HALF_PX + 1))
+    pixel = context.pixel_nm
+    grid = PixelGrid.region(spans[0], spans[1], pixel)
+    image = context.wide.image(grid, places[1] * pixel, places[0] * pixel, 5.0, mass)
+    return landing, leaving, (slice(*spans[0]), slice(*spans[1])), image
+
+
+def measure(job: Job, folder: Path, memory_mb: int) -> Cost:
+    """Analyse a movie in a process of its own."""
+    with tempfile.TemporaryDirectory(dir=folder) as name:
+        movie = write_movie(job, Path(name))
+        command = [sys.executable, "-c", PROGRAM, "fit", str(movie), "--config", str(CONFIG)]
+        command += ["--quiet", "--json", "--workers", str(job.workers), "--out", f"{name}/out"]
+        command += [
+            "--set",
+            f"compute.memory_limit_mb={memory_mb}",
+            "--set",
+            "optics.calibrate=never",
+        ]
+        answer = Path(name) / "answer.json"
+        start = time.perf_counter()
+        with answer.open("w", encoding="utf-8") as out:
+            process = subprocess.Popen(command, stdout=out)
+            watch = Memory(process.pid, movie)
+            watch.start()
+            _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start
+        if status:
+            raise SystemExit(f"{' '.join(command)} did not finish")
+        summary: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
+    landing = summary["landing"]
+    cost = Cost(
+        job, usage.ru_utime + usage.ru_stime, seconds, watch.peak_mb,
+        summary["seconds"], len(summary["events"]), landing["chunks"], landing["tiles"],
+    )  # fmt: skip
+    print(
+        f"{job.rows:5} × {job.columns:<5} {job.frames:7} frames {job.particles:6} particles "
+        f"{job.workers} workers: {job.megabytes / cost.processor_s:7.1f} MB per processor-second, "
+        f"{job.megabytes / cost.seconds:7.1f} MB/s of the clock, {cost.peak_memory_mb:6.0f} MB of "
+        f"memory, {cost.chunks} × {cost.tiles} parts, {cost.events} events; "
+        + ", ".join(f"{part} {s:.1f} s" for part, s in cost.parts_s.items()),
+        flush=True,
+    )
+    return cost
+
+
+def slope(costs: Sequence[Cost], along: str, start_s: float) -> float:
+    """Slope of the processor time beyond the start, on logarithmic scales."""
+    sizes = {
+        "pixels": [c.job.rows * c.job.columns for c in costs],
+        "frames": [c.job.frames for c in costs],
+        "particles": [c.job.particles for c in costs],
+    }[along]
+    grown = [max(c.processor_s - start_s, 1e-2) for c in costs]
+    return float(np.polyfit(np.log(sizes), np.log(grown), 1)[0])
+
+
+def parts_of_time(costs: Sequence[Cost]) -> tuple[float, float, float]:
+    """Fit what a job costs once, per part and per megabyte [processor seconds]."""
+    design = np.array([[1.0, c.chunks * c.tiles, c.job.megabytes] for c in costs])
+    weight = 1 / np.array([c.processor_s for c in costs])
+    # no part costs less than nothing
+    found, _ = nnls(design * weight[:, None], np.ones(len(costs)))
+    return float(found[0]), float(found[1]), float(found[2])
+
+
+def limits(folder: Path) -> dict[str, float]:
+    """Measure how fast memory is copied, and how fast a file is read that is in no cache [MB/s]."""
+    block = np.zeros(2**27, dtype=np.uint8)
+    copy = np.empty_like(block)
+    seconds = []
+    for _ in range(3):
+        start = time.process_time()
+        copy[:] = block
+        seconds.append(time.process_time() - start)
+    path = folder / "disk"
+    path.write_bytes(np.random.default_rng(0).bytes(2**28))
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        if hasattr(os, "posix_fadvise"):
+            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        start = time.perf_counter()
+        while file.read(2**24):
+            pass
+        disk = 2**28 / 1e6 / (time.perf_counter() - start)
+    path.unlink()
+    return {"memory_copy_mb_per_s": block.size / 1e6 / min(seconds), "disk_mb_per_s": disk}
+
+
+def series(options: argparse.Namespace) -> dict[str, list[Job]]:
+    """Choose the jobs: each series changes one thing."""
+    fields, frames, particles = options.fields, options.frames, options.particles
+    small = fields[0]
+    length = 400 if options.quick else 800
+    return {
+        "pixels": [
+            Job(*field, length, max(1, round(10 * field[0] * field[1] / 128**2)))
+            for field in fields
+        ],
+        "frames": [Job(*small, n, 10) for n in frames],
+        "particles": [Job(*fields[-1], BLOCK, n) for n in particles],
+    }
+
+
+def _fields(text: str) -> list[tuple[int, int]]:
+    sizes = [tuple(int(n) for n in part.split("x")) for part in text.split(",")]
+    return [(rows, columns) for rows, columns in sizes]
+
+
+def _numbers(text: str) -> list[int]:
+    return [int(part) for part in text.split(",")]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="How landing movies scale.")
+    parser.add_argument("--quick", action="store_true", help="small movies, no judgement")
+    parser.add_argument("--full", action="store_true", help="up to 1200 × 1920 and 100 000 frames")
+    parser.add_argument("--fields", type=_fields, help="as 128x128,1200x1920")
+    parser.add_argument("--frames", type=_numbers, help="as 500,5000")
+    parser.add_argument("--particles", type=_numbers, help="in a field of the largest size")
+    parser.add_argument("--memory-mb", type=int, default=1000, help="compute.memory_limit_mb")
+    parser.add_argument("--keep", type=Path, help="folder for the movies while they are analysed")
+    options = parser.parse_args()
+    sizes = {
+        "quick": ("128x128,256x256", "400,800", "10,40"),
+        "usual": ("128x128,256x256,512x512", "800,3200,12800", "10,100,400"),
+        "full": (
+            "128x128,256x256,512x512,1024x1024,1200x1920", "400,4000,20000,100000",
+            "10,100,1000,10000",
+        ),
+    }["quick" if options.quick else "full" if options.full else "usual"]  # fmt: skip
+    options.fields = options.fields or _fields(sizes[0])
+    options.frames = options.frames or _numbers(sizes[1])
+    options.particles = options.particles or _numbers(sizes[2])
+    with tempfile.TemporaryDirectory(dir=options.keep) as name:
+        folder = Path(name)
+        bounds = limits(folder)
+        small = options.fields[0]
+        start = measure(Job(*small, BLOCK, 1), folder, options.memory_mb)
+        found = {
+            along: [measure(job, folder, options.memory_mb) for job in jobs]
+            for along, jobs in series(options).items()
+        }
+        long = found["frames"][-1].job
+        alone = measure(Job(**{**asdict(long), "workers": 1}), folder, options.memory_mb)
+    every = [start, *(cost for costs in found.values() for cost in costs)]
+    slopes = {along: slope(costs, along, start.processor_s) for along, costs in found.items()}
+    once, per_part, per_mb = parts_of_time(every)
+    two = found["frames"][-1]
+    efficiency = alone.processor_s / two.processor_s
+    shared = per_part * two.chunks * two.tiles + per_mb * long.megabytes
+    predicted = {n: (once + shared) / (n * (once + shared / n)) for n in WORKERS}
+    rate = max(c.job.megabytes / c.processor_s for c in every)
+    for along, value in slopes.items():
+        print(f"slope of processor time with {along}: {value:.2f} (at most {LARGEST_SLOPE})")
+    print(
+        f"a job costs {once:.2f} s, {per_part:.3f} s for each part and {1e3 * per_mb:.2f} ms per MB"
+    )
+    print(f"two workers: {efficiency:.2f} of the processor time of one is not lost")
+    print("efficiency by that model: " + ", ".join(f"{n}: {e:.2f}" for n, e in predicted.items()))
+    print(
+        f"limits: memory is copied at {bounds['memory_copy_mb_per_s']:.0f} MB/s, the disk gives "
+        f"{bounds['disk_mb_per_s']:.0f} MB/s; the fastest job, {rate:.0f} MB per processor-second, "
+        f"is {bounds['memory_copy_mb_per_s'] / rate:.0f} times below the first: instructions limit"
+    )
+    memory = max(c.peak_memory_mb for c in every)
+    numbers = {
+        "limits": bounds, "jobs": [asdict(c) for c in (*every, alone)], "slopes": slopes,
+        "once_s": once, "per_part_s": per_part, "per_mb_s": per_mb,
+        "efficiency_of_two": efficiency, "efficiency_predicted": predicted,
+        "peak_memory_mb": memory,
+    }  # fmt: skip
+    RESULTS.mkdir(exist_ok=True)
+    (RESULTS / "scale.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
+    if options.quick:
+        return 0
+    promises = {
+        **{
+            f"slope with {a} at most {LARGEST_SLOPE}": s <= LARGEST_SLOPE for a, s in slopes.items()
+        },
+        f"peak memory at most {MOST_MEMORY_MB:g} MB": memory <= MOST_MEMORY_MB,
+    }
+    for text, kept in promises.items():
+        print(("ok      " if kept else "BROKEN  ") + text)
+    return 0 if all(promises.values()) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

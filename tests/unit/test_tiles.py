@@ -1,0 +1,194 @@
+"""A field that is cut into tiles: the rows of the whole field, each once, on seams as well."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from scenes import Stack
+
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.spectrum import measure_spectrum
+from iscat_analysis.config import Config, load_config
+from iscat_analysis.errors import DataError
+from iscat_analysis.landing import joining
+from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.movie import open_stack
+from iscat_analysis.records import FRAME_COLUMN
+from iscat_analysis.search.sliding import chunks as chunks_module
+from iscat_analysis.search.sliding.tiles import cut_field
+from iscat_analysis.study.simulate import Movie
+
+SIDE, FRAMES = 176, 130
+# of 2 × 2 tiles the seams are at 87.5: on them, beside them, where they cross, and bright ones
+# whose rings cross them
+EVENTS = [
+    (60, 95, 87.5, 87.5, 480.0),
+    (40, None, 40.2, 87.47, 480.0),
+    (70, None, 135.4, 87.6, 480.0),
+    (80, None, 130.6, 62.4, 800.0),
+    (90, None, 93.3, 48.9, 480.0),
+    (50, None, 44.1, 126.2, 480.0),
+]
+
+
+def _config(*settings: str) -> Config:
+    base = [
+        "camera.pixel_size_nm=84.0", "camera.gain_e_per_adu=4.0", "particle.mass_kda=146.0",
+        "calibration.gradient_per_kda=-3.1e-5", f"simulation.shape=[{SIDE}, {SIDE}]",
+        f"simulation.frames={FRAMES}", "simulation.photons_per_pixel=1e5",
+        "simulation.background=speckle", "simulation.power_noise=0.01",
+        "background.window_frames=30", "detection.false_alarms_per_movie=0.01", "fit.roi_nm=1000",
+    ]  # fmt: skip
+    config = load_config(None, [*base, *settings])
+    names = ("frame", "leave", "x_px", "y_px", "mass_kda")
+    events = [dict(zip(names, event, strict=True)) for event in EVENTS]
+    simulation = type(config.simulation).model_validate(
+        {**config.simulation.model_dump(), "events": events}
+    )
+    return config.model_copy(update={"simulation": simulation})
+
+
+@pytest.fixture(scope="module")
+def counts() -> np.ndarray:
+    """Draw the movie of `EVENTS` once."""
+    return np.array(list(Movie(_config(), 1).frames(2)))
+
+
+def _run(movie: Any, config: Config | None = None, **options: Any) -> Any:
+    return analyse_landings(
+        movie, config or _config(), Camera(gain_e_per_adu=4.0), warn=lambda _: None,
+        progress=lambda *_: None, **options,
+    )  # fmt: skip
+
+
+def _tiled(monkeypatch: pytest.MonkeyPatch, parts: tuple[int, int], core: int) -> None:
+    monkeypatch.setattr(chunks_module, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_: (parts, core))
+
+
+@pytest.fixture(scope="module")
+def whole(counts: np.ndarray) -> Any:
+    """Analyse the field at once."""
+    return _run(Stack(counts))
+
+
+def _difference(found: Any, whole: Any) -> float:
+    """Compare estimates, in standard errors of the whole field's."""
+    there, here = whole.fits, found.fits
+    return max(
+        float(np.abs((here[name] - there[name]) / there[f"sigma_{name}"]).max())
+        for name in ("x_nm", "y_nm", "mass_kda")
+    )
+
+
+def _check(found: Any, whole: Any) -> None:
+    """Compare rows, masks, light, views and the image of the field."""
+    assert len(whole.fits) == len(EVENTS) + 1
+    for name in ("frame", "status", "flags", "n_before", "n_after"):
+        assert found.fits[name].tolist() == whole.fits[name].tolist()
+    assert _difference(found, whole) < 0.01
+    assert found.compared.masked_pixels == whole.compared.masked_pixels
+    np.testing.assert_allclose(found.compared.power, whole.compared.power, rtol=1e-12)
+    corners = [(view.event, view.row_px, view.column_px) for view in whole.views]
+    assert [(view.event, view.row_px, view.column_px) for view in found.views] == corners
+    clear = np.abs(whole.image) > 0.2 * np.abs(whole.image).max()
+    np.testing.assert_allclose(found.image[clear], whole.image[clear], rtol=0.01)
+
+
+def test_tiles_change_nothing(
+    counts: np.ndarray, whole: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Frames stay where they lie in the file."""
+    _tiled(monkeypatch, (2, 2), FRAMES)
+    np.save(tmp_path / "movie.npy", counts)
+    with open_stack(tmp_path / "movie.npy") as movie:
+        found = _run(movie)
+    assert (whole.summary["tiles"], found.summary["tiles"]) == (1, 4)
+    assert found.summary["chunks"] == 1
+    _check(found, whole)
+    places = (part.counts.sum(axis=1) for part in (found.empty, whole.empty))
+    assert np.divide(*places) == pytest.approx(1.0, abs=0.05)  # none in two tiles
+
+
+@pytest.mark.large
+@pytest.mark.parametrize(("parts", "core"), [((2, 2), 70), ((3, 1), FRAMES)])
+def test_tiles_and_chunks_of_frames_that_exceed_the_memory(
+    counts: np.ndarray,
+    whole: Any,
+    parts: tuple[int, int],
+    core: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They are read once, into a temporary file."""
+    _tiled(monkeypatch, parts, core)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.002)
+    found = _run(Stack(counts))
+    assert found.summary["chunks"] == -(-FRAMES // core)
+    _check(found, whole)
+
+
+def test_without_halos_rows_change(
+    counts: np.ndarray, whole: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control: particles on seams are cut in half."""
+    _tiled(monkeypatch, (2, 2), FRAMES)
+    monkeypatch.setattr(chunks_module, "halo_px", lambda _: 6)
+    found = _run(Stack(counts))
+    assert len(found.fits) != len(whole.fits) or _difference(found, whole) > 0.1
+
+
+def test_a_particle_on_a_seam_is_reported_once() -> None:
+    """Each tile may place it in the core of the other, or both in their own."""
+    tiles = cut_field((100, 100), (1, 2), 20)
+    rows = {"frame": 40, FRAME_COLUMN: 1, "y_px": 30.0, "mass_kda": 100.0, "snr": 9.0,
+            "y_nm": 1.0, "x_nm": 1.0}  # fmt: skip
+    for left, right in ((49.3, 49.6), (49.6, 49.3), (49.7, 49.8)):
+        tables = [pd.DataFrame([rows | {"x_px": x}]) for x in (left, right)]
+        parts = [SimpleNamespace(lines=table) for table in tables]
+        assert len(joining._own_rows(tiles, parts)) == 1
+    apart = [pd.DataFrame([rows | {"x_px": x}]) for x in (47.0, 50.2)]
+    assert len(joining._own_rows(tiles, [SimpleNamespace(lines=one) for one in apart])) == 2
+
+
+def test_noise_and_optics_of_a_tile_are_those_of_its_place() -> None:
+    rng = np.random.default_rng(1)
+    light = rng.uniform(0.8, 1.2, (120, 140))
+    leak = rng.poisson(1000 * light, (160, 120, 140)).astype(float)
+    leak[:, :, 1:] = 0.8 * leak[:, :, 1:] + 0.2 * leak[:, :, :-1]
+    spectrum = measure_spectrum(leak, Camera())
+    assert spectrum is not None
+    here = slice(20, 100), slice(30, 130)
+    signal = rng.standard_normal((120, 140))
+    seen = spectrum.whitened(signal, light)[here]
+    part = spectrum.on((80, 100)).whitened(signal[here], light[here])
+    inner = slice(10, -10), slice(10, -10)
+    assert np.abs(part - seen)[inner].max() < 2e-3 * np.abs(seen).max()
+    assert np.abs(signal[here] - seen)[inner].max() > 0.1 * np.abs(seen).max()  # control
+
+
+def test_the_division_of_a_field_minds_memory_and_halos() -> None:
+    """What a camera of 1200 × 1920 pixels needs fits into the limit, and little is done twice."""
+    config = load_config(None, ["camera.pixel_size_nm=84.0"])
+    reader = SimpleNamespace(
+        shape=(1200, 1920), frame_bytes=1200 * 1920 * 2, first=0, last=10_000, name="movie"
+    )
+    (high, wide), core = chunks_module.choose_tiles(reader, config, 100, 25, 10_000)
+    halo = chunks_module.halo_px(config)
+    tiles = cut_field(reader.shape, (high, wide), halo)
+    largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
+    blocks = (core + 2 * chunks_module.halo_frames(100, 25)) / 25
+    assert largest * blocks * 20 < 0.32 * 1000e6
+    seen = np.zeros(reader.shape, dtype=int)
+    for tile in tiles:
+        seen[tile.core] += 1
+    assert (seen == 1).all()  # each pixel has one home
+    work = sum(tile.shape[0] * tile.shape[1] for tile in tiles) * (core + 400) / core
+    assert work < 6 * seen.size
+    small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
+    with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
+        chunks_module.choose_tiles(reader, small, 100, 25, 10_000)
