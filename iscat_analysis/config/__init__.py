@@ -17,7 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.field import FIELD_TERMS, field_keys
+from iscat_analysis.config.field import FIELD_TERMS, MOST_JUMPS, MOVING, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
@@ -64,6 +64,8 @@ __all__ = [
     "FIELD_TERMS",
     "LARGEST_SD_NM",
     "MEASURABLE",
+    "MOST_JUMPS",
+    "MOVING",
     "PIXEL_NM",
     "SIMULATED",
     "BackgroundConfig",

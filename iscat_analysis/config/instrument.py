@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.field import FIELD_TERMS, FieldTerms, Share, Size
+from iscat_analysis.config.field import FIELD_TERMS, MOST_JUMPS, FieldTerms, Jump, Share, Size
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -152,8 +152,14 @@ class Optics(FieldTerms):
     focus_drift_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
         0.0, description="rise of the focus in 1000 frames of a landing movie"
     )
+    focus_bend_nm: Finite = Field(
+        0.0, description="the same, growing with the square of the frames from focus_frame"
+    )
+    focus_jumps: Annotated[tuple[Jump, ...], Field(max_length=MOST_JUMPS)] = Field(
+        (), description="[[frame, rise], ...]: the focus rises at once, and stays"
+    )
     focus_frame: Annotated[int, Field(ge=0)] = Field(
-        0, description="frame at which the focus is focus_nm"
+        0, description="frame at which the focus is focus_nm, but for jumps"
     )
     convention: Literal["exact", "dong2021"] = Field(
         "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'

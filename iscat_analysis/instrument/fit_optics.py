@@ -16,10 +16,10 @@ from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm
 from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
 from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
 from iscat_analysis.instrument.starts import FOCUS_STEP_NM
+from iscat_analysis.optics.field_map import MOVES
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     FIELD,
-    FOCUS_DRIFT,
     FOCUS_STEP,
     FREE,
     LEAST_SIGHTS,
@@ -64,6 +64,9 @@ class Collected:
     least: int = LEAST_SIGHTS
     focus_step_nm: float | None = None
     """Of a scan of the focus."""
+
+    refusal: str = ""
+    """Why no optics describe them, however well they fit."""
 
 
 def fit_optics(
@@ -111,7 +114,7 @@ def _fitted(
         low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
     near = seen.near or {}
-    configured |= {name: 0.0 for name in (FOCUS_DRIFT, *FIELD) if name in near}
+    configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in near}
     build = microscopes(config, max(map(reach_nm, images)))
     focus = config.optics.focus_nm
     search = OpticsSearch(
@@ -126,6 +129,8 @@ def _fitted(
         mapper=mapper,
     )
     measured = search.run(images)
+    if seen.refusal:
+        measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
     estimate = measured.estimate
     pictures = make_pictures(estimate.sights, build, estimate.values)
     return make_result(config, configured, measured, pictures, origin)

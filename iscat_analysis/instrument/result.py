@@ -21,9 +21,9 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
+from iscat_analysis.optics.field_map import BEND, DRIFT, JUMPS
 from iscat_analysis.optics.parameters import (
     FIELD,
-    FOCUS_DRIFT,
     FOCUS_STEP,
     RISES,
     Settings,
@@ -177,11 +177,16 @@ class OpticsCalibration:
             parts.append(
                 with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
             )
-        if FOCUS_DRIFT in self.names:
-            drift = with_error(
-                "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
-            )
-            parts.append(f"{drift} in 1000 frames")
+        for name, label, over in (
+            (DRIFT, "focus rising by", " in 1000 frames"),
+            (BEND, "focus bent by", " 1000 frames from the middle"),
+            *(
+                (name, "focus jumping by", f" at frame {frame}")
+                for name, (frame, _) in zip(JUMPS, self.config.optics.focus_jumps, strict=False)
+            ),
+        ):
+            if name in self.names:
+                parts.append(with_error(label, self.value(name), self.sigma(name), "nm") + over)
         parts += [
             with_error(name_in_words(n), self.value(n), self.sigma(n), n.rsplit("_", 1)[1])
             for n in self.names

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from iscat_analysis.config import (
+    MOVING,
     Calibration,
     Config,
     Optics,
@@ -20,7 +21,7 @@ from iscat_analysis.config import (
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 
 _OF_A_MOVIE = {
-    "file": None, "covariance": None, "calibrate": "auto", "focus_drift_nm": 0.0, "focus_frame": 0,
+    "file": None, "covariance": None, "calibrate": "auto", **MOVING,
 }  # fmt: skip
 """Keys of [optics] that do not change the contrast of standards, and their neutral values."""
 
