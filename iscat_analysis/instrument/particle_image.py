@@ -109,6 +109,11 @@ class ParticleImage:
         return Spot(*self.place, self.focus_steps, self.after)
 
     @property
+    def step(self) -> float:
+        """Frame between those with its particle and those without."""
+        return sum(self.frames) / 2
+
+    @property
     def shown(self) -> float:
         """Middle of the frames that show its particle."""
         return self.frames[0] if self.mass_kda < 0 else self.frames[1]

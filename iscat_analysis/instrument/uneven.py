@@ -43,7 +43,7 @@ from iscat_analysis.optics.parameters import (
     free_names,
     prior_range,
 )
-from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.records import FloatArray, Mapper
 
 KINDS: Mapping[str, tuple[str, ...]] = {
     "the focus moves": (DRIFT,),
@@ -127,6 +127,15 @@ class FieldOfView:
             time = time if self.in_time else 0.0
             out.append(replace(sight, place=place, focus_steps=time, after=after))
         return out
+
+    def undivided(self, sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+        """Leave pictures out whose frames lie on both sides of a jump."""
+        return [
+            sight
+            for sight in sights
+            if not any(abs(frame - sight.step) < 2 * abs(sight.shown - sight.step)
+                       for frame in self.jumps)
+        ]  # fmt: skip
 
     def jumping(self, sights: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
         """Add a jump of the focus that lies between two pictures, in the order of time."""
@@ -248,7 +257,8 @@ class _Wishes:
             return []
         order = np.argsort([sight.shown for sight in self.sights])
         found: list[Change | None] = []
-        for before in range(_SIDE, len(order) - _SIDE + 1):
+        taken = {sum(not self.sights[k].after[jump] for k in order) for jump in range(known)}
+        for before in sorted({*range(_SIDE, len(order) - _SIDE + 1)} - taken):
             slopes = np.zeros((len(order), 1, len(self.asked.names)))
             slopes[order[before:], 0, self.asked.names.index("focus_nm")] = 1.0
             found.append(self._change(JUMP, (JUMPS[known],), slopes, trials=len(order)))
@@ -318,48 +328,44 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
     )
 
 
-_ENDS = 8  # frames at either end, which show the light before and after
+_ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
 
 
 def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
-    """Find the frame of a jump between two pictures, in which what has landed changes at once.
+    """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
 
-    Every frame is compared with the change of the whole field from one end to the other, places
-    where a known particle lands meanwhile apart: it is that of the one end, then of the other.
+    Around each particle every frame is compared with the change from one end to the other.  The
+    roots of what all of them gain from a step are added: one that leaves outweighs no others.
     """
     order = sorted(sights, key=lambda sight: sight.shown)
     last, first = (order[k] for k in between)
-    windows = [sight.frames[1] - sight.frames[0] for sight in (last, first)]
-    low = max(round(last.shown - windows[0] / 2) - _ENDS, view.frames[0])
-    high = min(round(first.shown + windows[1] / 2) + _ENDS, view.frames[1])
-    used = np.ones(view.movie.shape[1:], dtype=bool)
-    for sight in sights:
-        if low < sum(sight.frames) / 2 < high:
-            rows, columns = (
-                np.rint(axis / view.pixel_nm).astype(int)
-                for axis in (sight.grid.y_nm, sight.grid.x_nm)
-            )
-            used[max(rows[0], 0) : rows[-1] + 1, max(columns[0], 0) : columns[-1] + 1] = False
-    while high - low > 2 * _ENDS + 1:
-        ends = [_light(view, frame, used) for frame in (*range(low, low + _ENDS),
-                                                        *range(high - _ENDS, high))]  # fmt: skip
-        change = np.mean(ends[_ENDS:], axis=0) - np.mean(ends[:_ENDS], axis=0)
+    low = max(round(2 * last.step - last.shown) - _ENDS, view.frames[0])
+    high = min(round(2 * first.shown - first.step) + _ENDS, view.frames[1])
+    places = [
+        tuple(slice(*np.rint(axis[[0, -1]] / view.pixel_nm).astype(int)) for axis in axes)
+        for axes in ((sight.grid.y_nm, sight.grid.x_nm) for sight in order if sight.step < low)
+    ]
+    found = round((last.shown + first.shown) / 2)
+    while places and high - low > 2 * _ENDS + 1:
         frames = np.unique(np.linspace(low + _ENDS, high - _ENDS - 1, _LOOKED_AT).astype(int))
-        likeness = np.array([_light(view, int(frame), used) @ change for frame in frames])
-        sums, number = np.cumsum(likeness), np.arange(1, len(likeness))
-        before, after = sums[:-1] / number, (sums[-1] - sums[:-1]) / number[::-1]
-        split = int(np.argmax(number * number[::-1] * (after - before) ** 2))
-        if np.diff(frames).max(initial=1) == 1:
-            return int(frames[split + 1])
-        low, high = int(frames[split]) - 2 * _ENDS, int(frames[split + 1]) + 2 * _ENDS
-    return round((last.shown + first.shown) / 2)
-
-
-def _light(view: FieldOfView, frame: int, used: BoolArray) -> FloatArray:
-    """Give the light of a frame over its mean, where it is looked at."""
-    counts = view.movie.read(frame, frame + 1)[0][used].astype(np.float64)
-    return np.asarray(counts / counts.mean())
+        looked = [*range(low, low + _ENDS), *frames.tolist(), *range(high - _ENDS, high)]
+        light = [view.movie.read(frame, frame + 1)[0].astype(np.float64) for frame in looked]
+        light = [one / one.mean() for one in light]
+        clear = np.zeros(len(frames) - 1)
+        number = np.arange(1, len(frames))
+        for place in places:
+            seen = np.array([one[place].ravel() for one in light])
+            change = seen[-_ENDS:].mean(axis=0) - seen[:_ENDS].mean(axis=0)
+            sums = np.cumsum(seen[_ENDS:-_ENDS] @ change)
+            steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
+            clear += np.sqrt(number * number[::-1]) * np.abs(steps) / np.linalg.norm(change)
+        found = int(frames[int(np.argmax(clear)) + 1])
+        around = max(found - 2 * _ENDS, low), min(found + 2 * _ENDS, high)
+        if around == (low, high):
+            break
+        low, high = around
+    return found
 
 
 def in_uneven_field(
@@ -379,7 +385,9 @@ def in_uneven_field(
     def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
         return maximise(some, build, start, names, passes=_PASSES, mapper=mapper)
 
-    def tried(start: Settings, names: Sequence[str]) -> tuple[Settings, float]:
+    def tried(
+        pictures: Sequence[ParticleImage], start: Settings, names: Sequence[str]
+    ) -> tuple[Settings, float]:
         """Fit all parts of the pictures but one, which is judged, in turns."""
         values, total = start, 0.0
         for part in range(HELD_OUT):
@@ -389,7 +397,7 @@ def in_uneven_field(
         return values, total
 
     names: tuple[str, ...] = free_names(tuple(FREE), settings, FREE["zernike"])
-    values, before = tried(settings, names)
+    values, before = tried(pictures, settings, names)
     kept, refused = list[tuple[str, ...]](), set[str]()
     while True:
         best = fitted(pictures, values, names)
@@ -398,21 +406,21 @@ def in_uneven_field(
         if not change.matters:
             break
         refused.add(change.kind)
-        terms, sooner = tuple(change.terms), (view, pictures)
+        terms, seen_by, judged, least = tuple(change.terms), view, pictures, before
         if change.kind == JUMP:
-            view = view.jumping(best.sights, (change.jump - 1, change.jump))
-            pictures = view.placed(pictures)
+            seen_by = view.jumping(best.sights, (change.jump - 1, change.jump))
+            judged = seen_by.placed(seen_by.undivided(pictures))
+            least = tried(judged, values, names)[1]
         start = {**best.values, **dict.fromkeys(terms, 0.0)}
-        trial, after = tried(start, (*names, *terms))
-        if after <= before + HELD_OUT_GAIN:
-            view, pictures = sooner
+        trial, after = tried(judged, start, (*names, *terms))
+        if after <= least + HELD_OUT_GAIN:
             continue
         refused.discard(JUMP)
-        values, before, names = trial, after, (*names, *terms)
+        view, pictures, values, before, names = seen_by, judged, trial, after, (*names, *terms)
         for kind in kept[:]:  # what was taken for lack of what came later
             others = tuple(name for name in names if name not in kind)
             rest = {key: value for key, value in values.items() if key not in kind}
-            trial, after = tried(rest, others)
+            trial, after = tried(pictures, rest, others)
             if after > before - HELD_OUT_GAIN:
                 values, before, names = trial, after, others
                 kept.remove(kind)
@@ -421,6 +429,6 @@ def in_uneven_field(
     if not kept and not refusal:
         return None
     return Collected(
-        view.optics(config), best.sights, view.placed(seen.others), near=best.values,
-        refusal=refusal,
+        view.optics(config), best.sights, view.placed(seen.others),
+        near=best.values, refusal=refusal,
     )  # fmt: skip
