@@ -17,7 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.field import FIELD_TERMS, MOST_JUMPS, MOVING, field_keys
+from iscat_analysis.config.field import FIELD_TERMS, JUMPS, MOVES, MOVING, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
@@ -62,9 +62,10 @@ __all__ = [
     "ASSUMED",
     "AUTO",
     "FIELD_TERMS",
+    "JUMPS",
     "LARGEST_SD_NM",
     "MEASURABLE",
-    "MOST_JUMPS",
+    "MOVES",
     "MOVING",
     "PIXEL_NM",
     "SIMULATED",

@@ -43,6 +43,12 @@ Jump = tuple[Annotated[int, Field(ge=0)], Size]
 MOST_JUMPS = 4
 """Jumps of the focus that a movie may have."""
 
+JUMPS = tuple(f"focus_jump_{number}_nm" for number in range(1, MOST_JUMPS + 1))
+"""Rises of the focus at the frames of ``focus_jumps`` [nm]."""
+
+MOVES = ("focus_drift_nm", "focus_bend_nm", *JUMPS)
+"""What moves the focus during a movie, each coefficient by a name of its own."""
+
 
 class FieldTerms(Section):
     """Terms of the field by name; each is the change from its centre to its edge."""

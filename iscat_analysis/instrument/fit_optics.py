@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
 from iscat_analysis.instrument.measure import OpticsSearch
@@ -16,7 +16,6 @@ from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm
 from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
 from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
 from iscat_analysis.instrument.starts import FOCUS_STEP_NM
-from iscat_analysis.optics.field_map import MOVES
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     FIELD,

@@ -14,6 +14,7 @@ from scipy import ndimage
 from iscat_analysis._kernels.zernike import zernike
 from iscat_analysis.config import (
     FIELD_TERMS,
+    JUMPS,
     Config,
     OpticsCovariance,
     field_keys,
@@ -21,7 +22,7 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
-from iscat_analysis.optics.field_map import BEND, DRIFT, JUMPS
+from iscat_analysis.optics.field_map import BEND, DRIFT
 from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_STEP,
@@ -162,7 +163,7 @@ class OpticsCalibration:
         parameters["sigma"] = sigma.where(sigma.notna(), parameters["sigma"])
         config = self.config
         if self.accepted:
-            config = _with_covariance(config, *_of_optics(self.names, covariance))
+            config = _with_covariance(config, self.names, covariance)
         return replace(self, config=config, parameters=parameters, covariance=covariance)
 
     def headline(self, pictures_of: str = "particles") -> str:
@@ -302,7 +303,7 @@ def make_result(
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
     if not measured.refusals:
         config = _with_covariance(
-            with_settings(config, measured.settings), *_of_optics(estimate.names, covariance)
+            with_settings(config, measured.settings), estimate.names, covariance
         )
     return OpticsCalibration(
         config=config,
@@ -321,12 +322,19 @@ def _of_optics(
     names: tuple[str, ...], covariance: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Leave out what is no property of the microscope."""
-    kept = [k for k, name in enumerate(names) if name not in RISES]
+    return _without(RISES, names, covariance)
+
+
+def _without(
+    left_out: Sequence[str], names: tuple[str, ...], covariance: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    kept = [k for k, name in enumerate(names) if name not in left_out]
     return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 
 def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:
     """Put the errors beside the values, from where fits take what is common to all events."""
+    names, covariance = _without((FOCUS_STEP,), names, covariance)
     errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, covariance.tolist())))
     optics = config.optics.model_copy(update={"covariance": errors})
     return config.model_copy(update={"optics": optics})

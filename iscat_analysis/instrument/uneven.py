@@ -17,7 +17,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import JUMPS, MOVES, Config
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
@@ -30,8 +30,6 @@ from iscat_analysis.optics.field_map import (
     BEND,
     DRIFT,
     DRIFT_FRAMES,
-    JUMPS,
-    MOVES,
     Spot,
     centre_of,
     changes_at,

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from iscat_analysis.config import FIELD_TERMS, MOST_JUMPS, Optics
+from iscat_analysis.config import FIELD_TERMS, JUMPS, Optics
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.waves import LatticeField, RadialField
 
@@ -32,12 +32,6 @@ DRIFT_FRAMES = 1000.0
 
 BEND = "focus_bend_nm"
 """What the focus rises by beside that, 1000 frames from that of which it is configured [nm]."""
-
-JUMPS = tuple(f"focus_jump_{number}_nm" for number in range(1, MOST_JUMPS + 1))
-"""Rises of the focus at the frames of ``optics.focus_jumps`` [nm]."""
-
-MOVES = (DRIFT, BEND, *JUMPS)
-"""What moves the focus during a movie."""
 
 REFERENCE = "reference"
 """Amplitude of the reference, over that in the middle of the field."""

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from iscat_analysis.config import Config, Optics
+from iscat_analysis.config import MOVES, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.field_map import (
-    MOVES,
     REFERENCE,
     STEPS,
     brighter,

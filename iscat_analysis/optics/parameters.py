@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.config import Config, field_keys
+from iscat_analysis.config import JUMPS, MOVES, Config, field_keys
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.field_map import BASES, BEND, DRIFT, JUMPS, MOVES, WEIGHTS, moves_in
+from iscat_analysis.optics.field_map import BASES, BEND, DRIFT, WEIGHTS, moves_in
 from iscat_analysis.records import FloatArray
 
 FOCUS_STEP = "focus_step_nm"

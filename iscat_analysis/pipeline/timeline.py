@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import measure_drift
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.field_map import MOVES, changes_at, terms_of, when
+from iscat_analysis.optics.field_map import changes_at, terms_of, when
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 

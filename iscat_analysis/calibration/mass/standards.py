@@ -66,7 +66,7 @@ def standards_of(config: Config) -> Standards:
     gain, offset = camera.gain_e_per_adu, camera.offset_adu
     return Standards(
         optics=config.optics.model_copy(update=_OF_A_MOVIE),
-        covariance=config.optics.covariance,
+        covariance=None if (errors := config.optics.covariance) is None else errors.at_rest,
         height_nm=config.particle.nominal_height_nm,
         camera=StandardsCamera(
             pixel_size_nm=camera.pixel_size_nm,
