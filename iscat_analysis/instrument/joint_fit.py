@@ -274,8 +274,8 @@ class _Point:
         ridge = damping * np.einsum("eii->ei", block)
         inverse = np.linalg.inv(block + ridge[:, :, None] * np.eye(PRIVATE))
         gains = np.einsum("eij,ejk->eik", cross, inverse)
-        information = self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)
-        score = self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])
+        information: FloatArray = self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)
+        score: FloatArray = self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])
         return information, score, inverse
 
     def gain(self, names: tuple[str, ...]) -> float:
