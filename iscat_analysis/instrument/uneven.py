@@ -77,7 +77,7 @@ HELD_OUT_GAIN = 4.0
 """Log-likelihood that pictures that were not fitted must gain, to keep a change."""
 
 _SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before optics are learned
-_SIDE = 3  # pictures on either side of a jump
+_SIDE = 2  # pictures on either side of a jump
 _BLOCKS, _BLOCK = 6, 4  # parts of a movie with a focus of their own, and least pictures of one
 _PERIODS = 20  # parts of the movie with a time of their own, in which pictures are looked at
 _PASSES = 10
@@ -249,20 +249,25 @@ class _Wishes:
         return [Change(RESTLESS, {}, significance, spread)]
 
     def _jumps(self) -> list[Change | None]:
-        """Give the jump of the focus that is asked for most."""
-        known = len(self.view.jumps)
+        """Give the jump of the focus that is asked for most.
+
+        A single picture on its other side may as well show something else, and is no jump.
+        """
+        known, number = len(self.view.jumps), len(self.sights)
         if not self.view.in_time or known == len(JUMPS):
             return []
         order = np.argsort([sight.shown for sight in self.sights])
-        found: list[Change | None] = []
         taken = {sum(not self.sights[k].after[jump] for k in order) for jump in range(known)}
-        for before in sorted({*range(_SIDE, len(order) - _SIDE + 1)} - taken):
-            slopes = np.zeros((len(order), 1, len(self.asked.names)))
+        asked: dict[int, tuple[float, FloatArray]] = {}
+        for before in sorted({*range(1, number)} - taken):
+            slopes = np.zeros((number, 1, len(self.asked.names)))
             slopes[order[before:], 0, self.asked.names.index("focus_nm")] = 1.0
-            found.append(self._change(JUMP, (JUMPS[known],), slopes, trials=len(order)))
-            if found[-1] is not None:
-                found[-1] = replace(found[-1], jump=before)
-        return [max(filter(None, found), key=lambda one: one.significance, default=None)]
+            asked[before] = self._step(slopes)[1], slopes
+        before = max(asked, key=lambda split: asked[split][0], default=0)
+        if not _SIDE <= before <= number - _SIDE:
+            return []
+        found = self._change(JUMP, (JUMPS[known],), asked[before][1], trials=number)
+        return [found and replace(found, jump=before)]
 
     def _slopes(self, names: Sequence[str]) -> FloatArray:
         """Give what parameters change about the optics of every picture, (n, m, k)."""
@@ -328,6 +333,7 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
+_CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
 def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
@@ -340,9 +346,14 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
     last, first = (order[k] for k in between)
     low = max(round(2 * last.step - last.shown) - _ENDS, view.frames[0])
     high = min(round(2 * first.shown - first.step) + _ENDS, view.frames[1])
+    reach = round(_CORE_NM / view.pixel_nm)
     places = [
-        tuple(slice(*np.rint(axis[[0, -1]] / view.pixel_nm).astype(int)) for axis in axes)
-        for axes in ((sight.grid.y_nm, sight.grid.x_nm) for sight in order if sight.step < low)
+        tuple(
+            slice(max(round(at / view.pixel_nm) - reach, 0), round(at / view.pixel_nm) + reach + 1)
+            for at in (sight.y_nm, sight.x_nm)
+        )
+        for sight in order
+        if sight.step < low
     ]
     found = round((last.shown + first.shown) / 2)
     while places and high - low > 2 * _ENDS + 1:
