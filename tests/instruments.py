@@ -272,8 +272,8 @@ class InstrumentMovie:
         Photoelectrons per pixel and frame.
     pixel_nm, gain_e_per_adu : float
         Of the camera.
-    focus_rise_nm : float
-        From the first frame to the last; in the middle the focus is the instrument's.
+    focus_nm : ndarray, shape (frames,), optional
+        Rise of the focus in every frame; the masses are those of the instrument's own focus.
     speckle : float
         Standard deviation of the background.
     beam : ndarray, shape (rows, columns), or float
@@ -294,7 +294,7 @@ class InstrumentMovie:
         level_e: float = 1e5,
         pixel_nm: float = 84.0,
         gain_e_per_adu: float = 4.0,
-        focus_rise_nm: float = 0.0,
+        focus_nm: FloatArray | None = None,
         speckle: float = 0.05,
         beam: FloatArray | float = 1.0,
         stage_px: FloatArray | None = None,
@@ -303,12 +303,15 @@ class InstrumentMovie:
         frames, rows, columns = shape
         y, x = np.arange(rows) * pixel_nm, np.arange(columns) * pixel_nm
         reach_nm = 1.02 * pixel_nm * math.hypot(rows, columns)
-        parts = 2 * math.ceil(abs(focus_rise_nm) / _FOCUS_PART_NM / 2)
-        foci = instrument.focus_nm + (
-            np.linspace(-0.5, 0.5, parts + 1) * focus_rise_nm if parts else np.zeros(1)
-        )
-        pictures = [Pictures(replace(instrument, focus_nm=focus), reach_nm) for focus in foci]
-        alike = pictures[len(pictures) // 2]
+        rises = np.zeros(1)
+        if focus_nm is not None:
+            low, high = min(float(focus_nm.min()), 0.0), max(float(focus_nm.max()), 0.0)
+            rises = np.linspace(low, high, max(math.ceil((high - low) / _FOCUS_PART_NM), 3) + 1)
+        pictures = [
+            Pictures(replace(instrument, focus_nm=instrument.focus_nm + rise), reach_nm)
+            for rise in rises
+        ]
+        alike = Pictures(instrument, reach_nm)
         rough = gaussian_filter(rng.standard_normal((rows, columns)), 3.0, mode="wrap")
         light = level_e * (1 + speckle * rough / rough.std())
         order = np.argsort(landings.frame)
@@ -327,9 +330,10 @@ class InstrumentMovie:
                             float(landings.mass_kda[i]) * alike.per_kda / picture.per_kda,
                         )
                     )
-                if parts:
-                    moving = CubicSpline(np.linspace(0, frames - 1, parts + 1), landed)
-            expected = light * np.exp(landed[0] if moving is None else moving(t))
+                if focus_nm is not None:
+                    moving = CubicSpline(rises, landed)
+            seen = landed[0] if moving is None or focus_nm is None else moving(focus_nm[t])
+            expected = light * np.exp(seen)
             if stage_px is not None:
                 expected = shift(expected, stage_px[t], order=3, mode="nearest")
             expected = expected * beam

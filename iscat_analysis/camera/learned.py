@@ -119,6 +119,8 @@ class LearnedCamera:
             key: {"value": number.value, "se": number.se, "from": number.source}
             for key, number in self.numbers.items()
         }
+        if self.level_e:
+            found["light_adu"] = self.level_e / float(np.mean(self.camera.gain_e_per_adu))
         law = self.camera.law
         if law is not None:
             found["law"] = {

@@ -17,7 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.field import FIELD_TERMS, field_keys
+from iscat_analysis.config.field import FIELD_TERMS, JUMPS, MOVES, MOVING, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
     config_to_toml,
@@ -62,8 +62,11 @@ __all__ = [
     "ASSUMED",
     "AUTO",
     "FIELD_TERMS",
+    "JUMPS",
     "LARGEST_SD_NM",
     "MEASURABLE",
+    "MOVES",
+    "MOVING",
     "PIXEL_NM",
     "SIMULATED",
     "BackgroundConfig",

@@ -1,9 +1,9 @@
-"""Keys of ``[optics]`` that say how the microscope differs over its field."""
+"""Keys of ``[optics]`` that say how the microscope differs over its field and in time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -27,6 +27,27 @@ FIELD_TERMS: Mapping[str, tuple[str, int | None]] = {
     "reference_curvature": ("reference_curvature", None),
 }
 """Every coefficient by a name of its own: its key in ``[optics]``, and its place in a pair."""
+
+
+MOVING: Mapping[str, Any] = {
+    "focus_drift_nm": 0.0,
+    "focus_bend_nm": 0.0,
+    "focus_jumps": (),
+    "focus_frame": 0,
+}
+"""Keys of ``[optics]`` that move the focus during a movie, and their values where it rests."""
+
+Jump = tuple[Annotated[int, Field(ge=0)], Size]
+"""Frame, and rise of the focus there [nm]."""
+
+MOST_JUMPS = 4
+"""Jumps of the focus that a movie may have."""
+
+JUMPS = tuple(f"focus_jump_{number}_nm" for number in range(1, MOST_JUMPS + 1))
+"""Rises of the focus at the frames of ``focus_jumps`` [nm]."""
+
+MOVES = ("focus_drift_nm", "focus_bend_nm", *JUMPS)
+"""What moves the focus during a movie, each coefficient by a name of its own."""
 
 
 class FieldTerms(Section):

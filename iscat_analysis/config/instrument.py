@@ -8,7 +8,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.field import FIELD_TERMS, FieldTerms, Share, Size
+from iscat_analysis.config.field import (
+    FIELD_TERMS,
+    MOST_JUMPS,
+    MOVES,
+    FieldTerms,
+    Jump,
+    Share,
+    Size,
+)
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -89,14 +97,22 @@ class OpticsCovariance(Section):
     @property
     def of_the_middle(self) -> OpticsCovariance:
         """Errors of the optics in the middle of the field, without those of its terms."""
-        kept = [k for k, name in enumerate(self.names) if name not in FIELD_TERMS]
+        return self._without({*FIELD_TERMS, *MOVES})
+
+    @property
+    def at_rest(self) -> OpticsCovariance:
+        """Errors of the microscope, without those of how its focus moved in a movie."""
+        return self._without({*MOVES})
+
+    def _without(self, left_out: set[str]) -> OpticsCovariance:
+        kept = [k for k, name in enumerate(self.names) if name not in left_out]
         matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
         return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
 
     @model_validator(mode="after")
     def _symmetric(self) -> OpticsCovariance:
         size = len(self.names)
-        known = (*MEASURABLE, *FIELD_TERMS)
+        known = (*MEASURABLE, *FIELD_TERMS, *MOVES)
         unknown = [name for name in self.names if name not in known]
         if unknown:
             raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
@@ -155,8 +171,14 @@ class Optics(FieldTerms):
     focus_drift_nm: Annotated[Finite, length(0.0, LARGEST_NM)] = Field(
         0.0, description="rise of the focus in 1000 frames of a landing movie"
     )
+    focus_bend_nm: Finite = Field(
+        0.0, description="the same, growing with the square of the frames from focus_frame"
+    )
+    focus_jumps: Annotated[tuple[Jump, ...], Field(max_length=MOST_JUMPS)] = Field(
+        (), description="[[frame, rise], ...]: the focus rises at once, and stays"
+    )
     focus_frame: Annotated[int, Field(ge=0)] = Field(
-        0, description="frame at which the focus is focus_nm"
+        0, description="frame at which the focus is focus_nm, but for jumps"
     )
     convention: Literal["exact", "dong2021"] = Field(
         "exact", description='"exact" | "dong2021" (the paper\'s numbers, errors included)'

@@ -89,3 +89,6 @@ class Uncertainty(Section):
     magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
         0.005, description="of camera.pixel_size_nm, as a share of it"
     )
+    offset_adu: NonNegative = Field(
+        1.0, description="of camera.offset_adu if it is configured, counts"
+    )

@@ -72,6 +72,19 @@ class Stretches:
         longest = max(stop - start for start, stop in self.kept)
         return next(span for span in self.kept if span[1] - span[0] >= _LONG * longest)
 
+    def with_jumps(self, frames: Sequence[int]) -> Stretches:
+        """Break where the focus jumps, too."""
+        jumps = [
+            Break(frame, frame, "the focus jumps")
+            for frame in frames
+            if any(start < frame < stop for start, stop in self.kept)
+        ]
+        if not jumps:
+            return self
+        every = sorted([*self.breaks, *jumps], key=lambda one: (one.start, one.stop))
+        span = min(self.kept[0][0], every[0].start), max(self.kept[-1][1], every[-1].stop)
+        return _between(span, every) or self
+
     def message(self, name: str) -> str:
         """Say where the movie breaks; empty where it does not."""
         if not self.breaks:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
 from iscat_analysis.instrument.measure import OpticsSearch
@@ -19,7 +19,6 @@ from iscat_analysis.instrument.starts import FOCUS_STEP_NM
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     FIELD,
-    FOCUS_DRIFT,
     FOCUS_STEP,
     FREE,
     LEAST_SIGHTS,
@@ -64,6 +63,9 @@ class Collected:
     least: int = LEAST_SIGHTS
     focus_step_nm: float | None = None
     """Of a scan of the focus."""
+
+    refusal: str = ""
+    """Why no optics describe them, however well they fit."""
 
 
 def fit_optics(
@@ -111,7 +113,7 @@ def _fitted(
         low, high = sorted(factor * seen.focus_step_nm for factor in STEP_FACTORS)
         limits[FOCUS_STEP] = (low, high)
     near = seen.near or {}
-    configured |= {name: 0.0 for name in (FOCUS_DRIFT, *FIELD) if name in near}
+    configured |= {name: 0.0 for name in (*MOVES, *FIELD) if name in near}
     build = microscopes(config, max(map(reach_nm, images)))
     focus = config.optics.focus_nm
     search = OpticsSearch(
@@ -126,6 +128,8 @@ def _fitted(
         mapper=mapper,
     )
     measured = search.run(images)
+    if seen.refusal:
+        measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
     estimate = measured.estimate
     pictures = make_pictures(estimate.sights, build, estimate.values)
     return make_result(config, configured, measured, pictures, origin)

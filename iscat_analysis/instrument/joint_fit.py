@@ -120,24 +120,30 @@ def maximise(
 
 @dataclass(frozen=True)
 class Asked:
-    """How the likelihood of pictures changes with parameters of the optics, to second order."""
+    """How the likelihood of each picture changes with its own optics, to second order.
+
+    Shapes: `information` (n, k, k), `score` (n, k), `scatter` (n, k, k).
+    """
 
     names: tuple[str, ...]
     information: FloatArray
     score: FloatArray
     scatter: FloatArray
 
-    def step(self, names: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-        """Say how far the pictures ask to change some of them, the others held.
+    def step(self, slopes: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Say how far the pictures ask to change what changes the optics of each by its slopes.
 
-        Shapes: `step` (n,), `covariance` (n, n).
+        Shapes: `slopes` (n, m, k), result (m,) and its covariance (m, m).
         """
-        chosen = [self.names.index(name) for name in names]
-        both = np.ix_(chosen, chosen)
-        unit = 1 / np.sqrt(np.maximum(np.diag(self.information)[chosen], 1e-300))
-        scaled = self.information[both] * np.outer(unit, unit)
+        score = np.einsum("nik,nk->i", slopes, self.score)
+        information, scatter = (
+            np.einsum("nik,nkl,njl->ij", slopes, each, slopes, optimize=True)
+            for each in (self.information, self.scatter)
+        )
+        unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+        scaled = information * np.outer(unit, unit)
         bound = np.linalg.pinv(scaled, rcond=_FLAT, hermitian=True) * np.outer(unit, unit)
-        return bound @ self.score[chosen], bound @ self.scatter[both] @ bound
+        return bound @ score, bound @ scatter @ bound
 
 
 def asked_changes(
@@ -150,9 +156,8 @@ def asked_changes(
     """Look how pictures ask to change the optics."""
     private, walls = np.array([sight.private for sight in sights]), _walls(sights)
     at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
-    information, score, _ = at.reduced(0.0)
-    scatter = at.scatter([sight.owner for sight in sights])
-    return Asked(tuple(names), information, score, scatter)
+    information, score, _ = at.each(0.0)
+    return Asked(tuple(names), information, score, at.pixel_scatter()[0])
 
 
 def _walls(sights: Sequence[ParticleImage]) -> FloatArray:
@@ -236,26 +241,41 @@ class _Point:
         Its shape is what the pixels say.  What the scores of pictures with owners scatter more, or
         those of all pictures of an owner together, is a common factor: there are too few for more.
         """
-        k = self.score.shape[1] - PRIVATE
-        gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.reduced(0.0)[2])
-        reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
-        pixels = np.asarray(np.einsum("eia,eab,ejb->ij", reduce, self.squares, reduce))
-        whole = np.einsum("eia,ea->ei", reduce, self.score)
-        known = np.array(owners)
+        each, whole = self.pixel_scatter()
+        pixels, known = each.sum(axis=0), np.array(owners)
         if not (known >= 0).all():
             return pixels
         groupings = (np.arange(len(known)), known)
         return pixels * max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
 
+    def pixel_scatter(self) -> tuple[FloatArray, FloatArray]:
+        """Covariance of every picture's reduced score from its residuals, and the score.
+
+        Shapes: result (n, k, k) and (n, k).
+        """
+        k = self.score.shape[1] - PRIVATE
+        gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.each(0.0)[2])
+        reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
+        scatter = np.einsum("eia,eab,ejb->eij", reduce, self.squares, reduce, optimize=True)
+        return np.asarray(scatter), np.asarray(np.einsum("eia,ea->ei", reduce, self.score))
+
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
+        information, score, inverse = self.each(damping)
+        return np.asarray(information.sum(axis=0)), np.asarray(score.sum(axis=0)), inverse
+
+    def each(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give the same of every picture.
+
+        Shapes: result (n, k, k), (n, k) and (n, 5, 5).
+        """
         k = self.score.shape[1] - PRIVATE
         cross, block = self.fisher[:, :k, k:], self.fisher[:, k:, k:]
         ridge = damping * np.einsum("eii->ei", block)
         inverse = np.linalg.inv(block + ridge[:, :, None] * np.eye(PRIVATE))
         gains = np.einsum("eij,ejk->eik", cross, inverse)
-        information = (self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)).sum(axis=0)
-        score = (self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])).sum(axis=0)
+        information: FloatArray = self.fisher[:, :k, :k] - gains @ cross.transpose(0, 2, 1)
+        score: FloatArray = self.score[:, :k] - np.einsum("eij,ej->ei", gains, self.score[:, k:])
         return information, score, inverse
 
     def gain(self, names: tuple[str, ...]) -> float:

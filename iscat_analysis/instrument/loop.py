@@ -137,6 +137,8 @@ class Rounds:
     @property
     def best(self) -> Round | None:
         """The last one whose optics may be used, of pictures that were found with right ones."""
+        if self.all and self.all[-1].seen.refusal:
+            return None
         good = (one for one in reversed(self.all) if one.learned is not None and one.described)
         return next(good, None)
 

@@ -68,6 +68,7 @@ class ParticleImage:
     level: float = 0.0
     focus_steps: float = 0.0
     place: tuple[float, float] = (0.0, 0.0)
+    after: tuple[bool, ...] = ()
     frames: tuple[float, float] = (0.0, 0.0)
     snr: float = 0.0
     neighbours: tuple[tuple[int, float], ...] = ()
@@ -105,7 +106,17 @@ class ParticleImage:
     @property
     def spot(self) -> Spot:
         """Where in the field and when the picture was taken."""
-        return Spot(*self.place, self.focus_steps)
+        return Spot(*self.place, self.focus_steps, self.after)
+
+    @property
+    def step(self) -> float:
+        """Frame between those with its particle and those without."""
+        return sum(self.frames) / 2
+
+    @property
+    def shown(self) -> float:
+        """Middle of the frames that show its particle."""
+        return self.frames[0] if self.mass_kda < 0 else self.frames[1]
 
     def slopes(self, name: str) -> Mapping[str, float]:
         """Give by how much a shared parameter changes those of this picture's optics."""

@@ -14,6 +14,7 @@ from scipy import ndimage
 from iscat_analysis._kernels.zernike import zernike
 from iscat_analysis.config import (
     FIELD_TERMS,
+    JUMPS,
     Config,
     OpticsCovariance,
     field_keys,
@@ -21,9 +22,9 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.instrument.measure import Judgement, Measured
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, contrast_of
+from iscat_analysis.optics.field_map import BEND, DRIFT
 from iscat_analysis.optics.parameters import (
     FIELD,
-    FOCUS_DRIFT,
     FOCUS_STEP,
     RISES,
     Settings,
@@ -162,7 +163,7 @@ class OpticsCalibration:
         parameters["sigma"] = sigma.where(sigma.notna(), parameters["sigma"])
         config = self.config
         if self.accepted:
-            config = _with_covariance(config, *_of_optics(self.names, covariance))
+            config = _with_covariance(config, self.names, covariance)
         return replace(self, config=config, parameters=parameters, covariance=covariance)
 
     def headline(self, pictures_of: str = "particles") -> str:
@@ -177,11 +178,16 @@ class OpticsCalibration:
             parts.append(
                 with_error("steps of", self.value(FOCUS_STEP), self.sigma(FOCUS_STEP), "nm")
             )
-        if FOCUS_DRIFT in self.names:
-            drift = with_error(
-                "focus rising by", self.value(FOCUS_DRIFT), self.sigma(FOCUS_DRIFT), "nm"
-            )
-            parts.append(f"{drift} in 1000 frames")
+        for name, label, over in (
+            (DRIFT, "focus rising by", " in 1000 frames"),
+            (BEND, "focus bent by", " 1000 frames from the middle"),
+            *(
+                (name, "focus jumping by", f" at frame {frame}")
+                for name, (frame, _) in zip(JUMPS, self.config.optics.focus_jumps, strict=False)
+            ),
+        ):
+            if name in self.names:
+                parts.append(with_error(label, self.value(name), self.sigma(name), "nm") + over)
         parts += [
             with_error(name_in_words(n), self.value(n), self.sigma(n), n.rsplit("_", 1)[1])
             for n in self.names
@@ -297,7 +303,7 @@ def make_result(
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
     if not measured.refusals:
         config = _with_covariance(
-            with_settings(config, measured.settings), *_of_optics(estimate.names, covariance)
+            with_settings(config, measured.settings), estimate.names, covariance
         )
     return OpticsCalibration(
         config=config,
@@ -316,12 +322,19 @@ def _of_optics(
     names: tuple[str, ...], covariance: FloatArray
 ) -> tuple[tuple[str, ...], FloatArray]:
     """Leave out what is no property of the microscope."""
-    kept = [k for k, name in enumerate(names) if name not in RISES]
+    return _without(RISES, names, covariance)
+
+
+def _without(
+    left_out: Sequence[str], names: tuple[str, ...], covariance: FloatArray
+) -> tuple[tuple[str, ...], FloatArray]:
+    kept = [k for k, name in enumerate(names) if name not in left_out]
     return tuple(names[k] for k in kept), covariance[np.ix_(kept, kept)]
 
 
 def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatArray) -> Config:
     """Put the errors beside the values, from where fits take what is common to all events."""
+    names, covariance = _without((FOCUS_STEP,), names, covariance)
     errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, covariance.tolist())))
     optics = config.optics.model_copy(update={"covariance": errors})
     return config.model_copy(update={"optics": optics})

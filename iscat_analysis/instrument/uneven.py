@@ -11,14 +11,14 @@ for with it in place.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 from scipy.special import chdtrc
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import JUMPS, MOVES, Config
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
@@ -26,20 +26,27 @@ from iscat_analysis.instrument.measure import HELD_OUT
 from iscat_analysis.instrument.microscope import microscopes, reach_nm
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.field_map import centre_of, changes_at
-from iscat_analysis.optics.local import DRIFT_FRAMES
+from iscat_analysis.optics.field_map import (
+    BASES,
+    BEND,
+    DRIFT,
+    DRIFT_FRAMES,
+    Spot,
+    centre_of,
+    changes_at,
+)
 from iscat_analysis.optics.parameters import (
-    FOCUS_DRIFT,
     FREE,
     LEAST_SIGHTS,
     Settings,
     free_names,
     prior_range,
 )
-from iscat_analysis.records import Mapper
+from iscat_analysis.records import FloatArray, Mapper
 
 KINDS: Mapping[str, tuple[str, ...]] = {
-    "the focus moves": (FOCUS_DRIFT,),
+    "the focus moves": (DRIFT,),
+    "the focus moves to and fro": (BEND,),
     "the focus is tilted": ("focus_tilt_x_nm", "focus_tilt_y_nm"),
     "the focus is curved": ("focus_curvature_nm",),
     "coma grows over the field": ("coma_field_nm",),
@@ -48,6 +55,12 @@ KINDS: Mapping[str, tuple[str, ...]] = {
     "the reference's phase is curved": ("phase_curvature_deg",),
 }
 """Coefficients that are asked for, tried and kept together, with what they mean."""
+
+JUMP = "the focus jumps"
+"""The same of one more jump, at the frame at which the pictures ask for it most."""
+
+RESTLESS = "the focus moves in a way that is not learned"
+"""What is left of a focus that moves, where parts of the movie ask for other ones."""
 
 RANDOM_P = 5e-7
 """Chance below which pictures ask for a change: five standard errors of a single coefficient."""
@@ -65,6 +78,8 @@ HELD_OUT_GAIN = 4.0
 """Log-likelihood that pictures that were not fitted must gain, to keep a change."""
 
 _SHARED = ("focus_nm", "reference_phase_deg")  # free beside a change before optics are learned
+_SIDE = 2  # pictures on either side of a jump
+_BLOCKS, _BLOCK = 6, 4  # parts of a movie with a focus of their own, and least pictures of one
 _PERIODS = 20  # parts of the movie with a time of their own, in which pictures are looked at
 _PASSES = 10
 _NEVER: Mapping[str, float] = MappingProxyType({})
@@ -78,6 +93,9 @@ class FieldOfView:
     pixel_nm: float
     frames: tuple[int, int]
     in_time: bool
+    movie: Stack
+    jumps: tuple[int, ...] = ()
+    """Frames from which on the focus is another one."""
 
     @classmethod
     def of(cls, movie: Stack, config: Config, *, in_time: bool) -> FieldOfView:
@@ -85,7 +103,7 @@ class FieldOfView:
         frames = fitted_frames(movie, config, config.background.recorded)
         shape = (movie.shape[1], movie.shape[2])
         pixel = config.camera.pixel_size_nm or math.nan
-        return cls(centre_of(config.optics, shape), pixel, frames, in_time)
+        return cls(centre_of(config.optics, shape), pixel, frames, in_time, movie)
 
     @property
     def middle(self) -> int:
@@ -99,18 +117,36 @@ class FieldOfView:
         x, y, half = self.centre_px
         out = []
         for sight in sights:
-            shown = sight.frames[0] if sight.mass_kda < 0 else sight.frames[1]
-            time = round((shown - self.middle) / part) * part / DRIFT_FRAMES
+            time = round((sight.shown - self.middle) / part) * part / DRIFT_FRAMES
+            after = tuple(sight.shown >= frame for frame in self.jumps)
             at_x, at_y = (
                 float(np.mean(axis)) / self.pixel_nm for axis in (sight.grid.x_nm, sight.grid.y_nm)
             )
             place = ((at_x - x) / half, (at_y - y) / half)
-            out.append(replace(sight, place=place, focus_steps=time if self.in_time else 0.0))
+            time = time if self.in_time else 0.0
+            out.append(replace(sight, place=place, focus_steps=time, after=after))
         return out
+
+    def undivided(self, sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+        """Leave pictures out whose frames lie on both sides of a jump."""
+        return [
+            sight
+            for sight in sights
+            if not any(abs(frame - sight.step) < 2 * abs(sight.shown - sight.step)
+                       for frame in self.jumps)
+        ]  # fmt: skip
+
+    def jumping(self, sights: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
+        """Add a jump of the focus that lies between two pictures, in the order of time."""
+        return replace(self, jumps=(*self.jumps, jump_frame(self, sights, between)))
 
     def optics(self, config: Config) -> Config:
         """Say in a configuration for what part of the sample and what time its terms hold."""
-        update = {"field_px": self.centre_px, "focus_frame": self.middle if self.in_time else 0}
+        update = {
+            "field_px": self.centre_px,
+            "focus_frame": self.middle if self.in_time else 0,
+            "focus_jumps": tuple((frame, 0.0) for frame in self.jumps),
+        }
         return config.model_copy(update={"optics": config.optics.model_copy(update=update)})
 
 
@@ -122,17 +158,21 @@ class Change:
     terms: Mapping[str, float] = field(default_factory=lambda: _NEVER)
     significance: float = 0.0
     rise_nm: float = 0.0
+    jump: int = 0
+    """Pictures before it."""
 
     @property
     def matters(self) -> bool:
         """Whether there is one."""
-        return bool(self.terms)
+        return bool(self.kind)
 
     @property
     def said(self) -> str:
         """Say so."""
-        if FOCUS_DRIFT in self.terms:
+        if DRIFT in self.terms:
             return f"the focus moves by about {self.rise_nm:+.0f} nm over the movie"
+        if self.kind in (JUMP, RESTLESS) or BEND in self.terms:
+            return f"{self.kind}, by about {self.rise_nm:.0f} nm"
         size = math.hypot(*self.terms.values())
         unit = "deg" if next(iter(self.terms), "").endswith("_deg") else "nm"
         return f"{self.kind} by about {size:.0f} {unit} towards the edge of the field"
@@ -154,59 +194,186 @@ def asked_change(
     if len({sight.spot for sight in seen}) < LEAST_PICTURES:
         return EVEN
     build = microscopes(config, max(map(reach_nm, sights)))
-    return next(_asked(seen, build, settings, _SHARED, view, mapper), EVEN)
+    wishes = _Wishes.of(seen, build, settings, _SHARED, view, mapper)
+    return next(iter([*wishes.changes(), *wishes.rest()]), EVEN)
 
 
-def _asked(
-    sights: Sequence[ParticleImage],
-    build: Build,
-    settings: Settings,
-    shared: Sequence[str],
-    view: FieldOfView,
-    mapper: Mapper,
-) -> Iterator[Change]:
-    """Give the kinds of change that pictures ask for, the clearest first."""
-    kinds = {k: names for k, names in KINDS.items() if not set(names) <= set(shared)}
-    if not view.in_time:
-        kinds = {k: names for k, names in kinds.items() if FOCUS_DRIFT not in names}
-    names = (*shared, *(n for names in kinds.values() for n in names))
-    asked = asked_changes(sights, build, settings, names, mapper)
-    found = [_change(asked, kind, shared, sights, view) for kind in kinds]
-    yield from sorted(filter(None, found), key=lambda each: -each.significance)
+@dataclass(frozen=True)
+class _Wishes:
+    """What pictures ask for beside parameters that all of them share."""
+
+    sights: Sequence[ParticleImage]
+    shared: Sequence[str]
+    asked: Asked
+    view: FieldOfView
+
+    @classmethod
+    def of(
+        cls,
+        sights: Sequence[ParticleImage],
+        build: Build,
+        settings: Settings,
+        shared: Sequence[str],
+        view: FieldOfView,
+        mapper: Mapper,
+    ) -> _Wishes:
+        """Ask pictures."""
+        terms = (term for names in KINDS.values() for term in names)
+        bases = dict.fromkeys(b for name in (*shared, *terms) for b in BASES.get(name, (name,)))
+        asked = asked_changes(sights, build, settings, tuple(bases), mapper)
+        return cls(sights, shared, asked, view)
+
+    def changes(self) -> list[Change]:
+        """Give the kinds of change, the clearest first."""
+        found = [
+            self._change(kind, names, self._slopes(names))
+            for kind, names in KINDS.items()
+            if not set(names) <= set(self.shared)
+            and (self.view.in_time or not set(names) & set(MOVES))
+        ]
+        found += self._jumps()
+        return sorted(filter(None, found), key=lambda each: -each.significance)
+
+    def rest(self) -> list[Change]:
+        """Say whether parts of the movie ask for a focus of their own."""
+        number = min(_BLOCKS, len(self.sights) // _BLOCK)
+        if not self.view.in_time or number < 2:
+            return []
+        order = np.argsort([sight.shown for sight in self.sights])
+        slopes = np.zeros((len(self.sights), number - 1, len(self.asked.names)))
+        for block, pictures in enumerate(np.array_split(order, number)[1:]):
+            slopes[pictures, block, self.asked.names.index("focus_nm")] = 1.0
+        rises, significance = self._step(slopes)
+        spread = float(np.ptp([0.0, *rises]))
+        if not _by_no_chance(significance, number - 1) or spread < LEAST_CHANGE["focus_nm"]:
+            return []
+        return [Change(RESTLESS, {}, significance, spread)]
+
+    def _jumps(self) -> list[Change | None]:
+        """Give the jump of the focus that is asked for most.
+
+        A single picture on its other side may as well show something else, and is no jump.
+        """
+        known, number = len(self.view.jumps), len(self.sights)
+        if not self.view.in_time or known == len(JUMPS):
+            return []
+        order = np.argsort([sight.shown for sight in self.sights])
+        taken = {sum(not self.sights[k].after[jump] for k in order) for jump in range(known)}
+        asked: dict[int, tuple[float, FloatArray]] = {}
+        for before in sorted({*range(1, number)} - taken):
+            slopes = np.zeros((number, 1, len(self.asked.names)))
+            slopes[order[before:], 0, self.asked.names.index("focus_nm")] = 1.0
+            asked[before] = self._step(slopes)[1], slopes
+        before = max(asked, key=lambda split: asked[split][0], default=0)
+        if not _SIDE <= before <= number - _SIDE:
+            return []
+        found = self._change(JUMP, (JUMPS[known],), asked[before][1], trials=number)
+        return [found and replace(found, jump=before)]
+
+    def _slopes(self, names: Sequence[str]) -> FloatArray:
+        """Give what parameters change about the optics of every picture, (n, m, k)."""
+        out = np.zeros((len(self.sights), len(names), len(self.asked.names)))
+        for number, sight in enumerate(self.sights):
+            for term, name in enumerate(names):
+                for base, weight in sight.slopes(name).items():
+                    out[number, term, self.asked.names.index(base)] = weight
+        return out
+
+    def _step(self, slopes: FloatArray) -> tuple[FloatArray, float]:
+        """Give what is asked for beside what is shared, and how clearly in squared errors."""
+        both = np.concatenate([self._slopes(self.shared), slopes], axis=1)
+        step, covariance = self.asked.step(both)
+        size, errors = step[len(self.shared) :], covariance[len(self.shared) :, len(self.shared) :]
+        if not np.all(np.diag(errors) > 0):
+            return size, 0.0
+        return size, float(size @ np.linalg.solve(errors, size))
+
+    def _change(
+        self, kind: str, names: tuple[str, ...], slopes: FloatArray, trials: int = 1
+    ) -> Change | None:
+        """Give one kind of change, if it is beyond chance, can be, and matters."""
+        size, significance = self._step(slopes)
+        terms = dict(zip(names, size.tolist(), strict=True))
+        if not (
+            len(self.sights) >= LEAST_PICTURES
+            and _by_no_chance(significance, len(names), trials)
+            and is_plausible(terms, self.view.frames)
+        ):
+            return None
+        changes = np.abs(np.einsum("nmk,m->nk", slopes, size)).max(axis=0)
+        largest = zip(self.asked.names, changes.tolist(), strict=True)
+        if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest):
+            return None
+        return Change(kind, terms, significance, rise_nm(terms, self.view.frames))
 
 
-def _change(
-    asked: Asked,
-    kind: str,
-    shared: Sequence[str],
-    sights: Sequence[ParticleImage],
-    view: FieldOfView,
-) -> Change | None:
-    """Give one kind of change, if it is beyond chance, can be, and matters."""
-    names = KINDS[kind]
-    step, covariance = asked.step((*shared, *names))
-    size, errors = step[len(shared) :], covariance[len(shared) :, len(shared) :]
-    if len(sights) < LEAST_PICTURES or not np.all(np.diag(errors) > 0):
-        return None
-    significance = float(size @ np.linalg.solve(errors, size))
-    terms = dict(zip(names, size.tolist(), strict=True))
-    if chdtrc(len(names), significance) > RANDOM_P or not is_plausible(terms, view.frames):
-        return None
-    changes = [changes_at(terms, sight.spot) for sight in sights]
-    largest = {base: max(abs(each[base]) for each in changes) for base in changes[0]}
-    if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest.items()):
-        return None
-    rise = terms.get(FOCUS_DRIFT, 0.0) * (view.frames[1] - view.frames[0]) / DRIFT_FRAMES
-    return Change(kind, terms, significance, rise)
+def _by_no_chance(significance: float, parameters: int, trials: int = 1) -> bool:
+    return bool(trials * chdtrc(parameters, significance) < RANDOM_P)
+
+
+def rise_nm(terms: Mapping[str, float], frames: tuple[int, int]) -> float:
+    """Give by how much the focus differs most within a movie, or by a drift alone with its sign."""
+    over = (frames[1] - frames[0]) / DRIFT_FRAMES
+    if set(terms) == {DRIFT}:
+        return terms[DRIFT] * over
+    every = (True,) * len(JUMPS)
+    spots = [Spot(), *(Spot(t=t, after=every) for t in np.linspace(-over / 2, over / 2, 9))]
+    rises = [changes_at(terms, spot).get("focus_nm", 0.0) for spot in spots]
+    return max(rises) - min(rises)
 
 
 def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
     """Whether optics can change so much; pictures that no optics describe ask for anything."""
-    over = (frames[1] - frames[0]) / DRIFT_FRAMES
-    rise_nm = abs(terms.get(FOCUS_DRIFT, 0.0) * over)
-    return rise_nm < prior_range("focus_nm") and all(
-        abs(size) < prior_range(name) for name, size in terms.items()
+    moves = {name: size for name, size in terms.items() if name in MOVES}
+    return abs(rise_nm(moves, frames)) < prior_range("focus_nm") and all(
+        abs(size) < prior_range(name) for name, size in terms.items() if name not in moves
     )
+
+
+_ENDS = 16  # frames at either end, which show the light before and after
+_LOOKED_AT = 256  # frames between them
+_CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
+
+
+def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
+    """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
+
+    Around each particle every frame is compared with the change from one end to the other.  The
+    roots of what all of them gain from a step are added: one that leaves outweighs no others.
+    """
+    order = sorted(sights, key=lambda sight: sight.shown)
+    last, first = (order[k] for k in between)
+    low = max(round(2 * last.step - last.shown) - _ENDS, view.frames[0])
+    high = min(round(2 * first.shown - first.step) + _ENDS, view.frames[1])
+    reach = round(_CORE_NM / view.pixel_nm)
+    places = [
+        tuple(
+            slice(max(round(at / view.pixel_nm) - reach, 0), round(at / view.pixel_nm) + reach + 1)
+            for at in (sight.y_nm, sight.x_nm)
+        )
+        for sight in order
+        if sight.step < low
+    ]
+    found = round((last.shown + first.shown) / 2)
+    while places and high - low > 2 * _ENDS + 1:
+        frames = np.unique(np.linspace(low + _ENDS, high - _ENDS - 1, _LOOKED_AT).astype(int))
+        looked = [*range(low, low + _ENDS), *frames.tolist(), *range(high - _ENDS, high)]
+        light = [view.movie.read(frame, frame + 1)[0].astype(np.float64) for frame in looked]
+        light = [one / one.mean() for one in light]
+        clear = np.zeros(len(frames) - 1)
+        number = np.arange(1, len(frames))
+        for place in places:
+            seen = np.array([one[place].ravel() for one in light])
+            change = seen[-_ENDS:].mean(axis=0) - seen[:_ENDS].mean(axis=0)
+            sums = np.cumsum(seen[_ENDS:-_ENDS] @ change)
+            steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
+            clear += np.sqrt(number * number[::-1]) * np.abs(steps) / np.linalg.norm(change)
+        found = int(frames[int(np.argmax(clear)) + 1])
+        around = max(found - 2 * _ENDS, low), min(found + 2 * _ENDS, high)
+        if around == (low, high):
+            break
+        low, high = around
+    return found
 
 
 def in_uneven_field(
@@ -226,7 +393,9 @@ def in_uneven_field(
     def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
         return maximise(some, build, start, names, passes=_PASSES, mapper=mapper)
 
-    def tried(start: Settings, names: Sequence[str]) -> tuple[Settings, float]:
+    def tried(
+        pictures: Sequence[ParticleImage], start: Settings, names: Sequence[str]
+    ) -> tuple[Settings, float]:
         """Fit all parts of the pictures but one, which is judged, in turns."""
         values, total = start, 0.0
         for part in range(HELD_OUT):
@@ -236,29 +405,38 @@ def in_uneven_field(
         return values, total
 
     names: tuple[str, ...] = free_names(tuple(FREE), settings, FREE["zernike"])
-    values, before = tried(settings, names)
-    kept, refused = list[str](), set[str]()
+    values, before = tried(pictures, settings, names)
+    kept, refused = list[tuple[str, ...]](), set[str]()
     while True:
         best = fitted(pictures, values, names)
-        wanted = _asked(best.sights, build, best.values, names, view, mapper)
-        change = next((each for each in wanted if each.kind not in refused), EVEN)
+        wishes = _Wishes.of(best.sights, build, best.values, names, view, mapper)
+        change = next((each for each in wishes.changes() if each.kind not in refused), EVEN)
         if not change.matters:
             break
         refused.add(change.kind)
-        start = {**best.values, **dict.fromkeys(change.terms, 0.0)}
-        trial, after = tried(start, (*names, *change.terms))
-        if after <= before + HELD_OUT_GAIN:
+        terms, seen_by, judged, least = tuple(change.terms), view, pictures, before
+        if change.kind == JUMP:
+            seen_by = view.jumping(best.sights, (change.jump - 1, change.jump))
+            judged = seen_by.placed(seen_by.undivided(pictures))
+            least = tried(judged, values, names)[1]
+        start = {**best.values, **dict.fromkeys(terms, 0.0)}
+        trial, after = tried(judged, start, (*names, *terms))
+        if after <= least + HELD_OUT_GAIN:
             continue
-        values, before, names = trial, after, (*names, *change.terms)
+        refused.discard(JUMP)
+        view, pictures, values, before, names = seen_by, judged, trial, after, (*names, *terms)
         for kind in kept[:]:  # what was taken for lack of what came later
-            others = tuple(name for name in names if name not in KINDS[kind])
-            rest = {key: value for key, value in values.items() if key not in KINDS[kind]}
-            trial, after = tried(rest, others)
+            others = tuple(name for name in names if name not in kind)
+            rest = {key: value for key, value in values.items() if key not in kind}
+            trial, after = tried(pictures, rest, others)
             if after > before - HELD_OUT_GAIN:
                 values, before, names = trial, after, others
                 kept.remove(kind)
-        kept.append(change.kind)
-    if not kept:
+        kept.append(terms)
+    refusal = "; ".join(change.said for change in wishes.rest())
+    if not kept and not refusal:
         return None
-    others_placed = view.placed(seen.others)
-    return Collected(view.optics(config), best.sights, others_placed, near=best.values)
+    return Collected(
+        view.optics(config), best.sights, view.placed(seen.others),
+        near=best.values, refusal=refusal,
+    )  # fmt: skip

@@ -3,7 +3,7 @@
 A parameter of the optics is its value in the middle plus a few coefficients, each times a known
 function of the place (x, y), in halves of the field from its centre, and of the time t:
 
-    focus            tilt·x, tilt·y, curvature·(x² + y²), drift·t
+    focus            tilt·x, tilt·y, curvature·(x² + y²), drift·t, bend·t², jumps after their frames
     reference phase  tilt·x, tilt·y, curvature·(x² + y²)
     coma             (Z8, Z7) = coma·(x, y): along the radius, as an objective has it off its axis
     astigmatism      (Z6, Z5) = a_x·(x, y) + a_y·(−y, x): what a tilted element adds to it
@@ -20,23 +20,30 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from iscat_analysis.config import FIELD_TERMS, Optics
+from iscat_analysis.config import FIELD_TERMS, JUMPS, Optics
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.waves import LatticeField, RadialField
 
 DRIFT = "focus_drift_nm"
 """Rise of the focus in 1000 frames of a movie [nm]."""
 
+DRIFT_FRAMES = 1000.0
+"""Frames in which the focus rises by ``optics.focus_drift_nm``."""
+
+BEND = "focus_bend_nm"
+"""What the focus rises by beside that, 1000 frames from that of which it is configured [nm]."""
+
 REFERENCE = "reference"
 """Amplitude of the reference, over that in the middle of the field."""
 
 
 class Spot(NamedTuple):
-    """Where in the field, in halves of it, and when, in thousands of frames."""
+    """Where in the field, in halves of it, and when, in thousands of frames, after what jumps."""
 
     x: float = 0.0
     y: float = 0.0
     t: float = 0.0
+    after: tuple[bool, ...] = ()
 
     @property
     def r2(self) -> float:
@@ -44,8 +51,14 @@ class Spot(NamedTuple):
         return self.x**2 + self.y**2
 
 
+def _jump(number: int) -> Callable[[Spot], Mapping[str, float]]:
+    return lambda s: {"focus_nm": float(number < len(s.after) and s.after[number])}
+
+
 WEIGHTS: Mapping[str, Callable[[Spot], Mapping[str, float]]] = {
     DRIFT: lambda s: {"focus_nm": s.t},
+    BEND: lambda s: {"focus_nm": s.t**2},
+    **{name: _jump(number) for number, name in enumerate(JUMPS)},
     "focus_tilt_x_nm": lambda s: {"focus_nm": s.x},
     "focus_tilt_y_nm": lambda s: {"focus_nm": s.y},
     "focus_curvature_nm": lambda s: {"focus_nm": s.r2},
@@ -82,7 +95,25 @@ def changes_at(terms: Mapping[str, float], spot: Spot) -> dict[str, float]:
 def terms_of(optics: Optics) -> dict[str, float]:
     """Give the coefficients of optics that are not 0."""
     terms = {name: optics.field_term(name) for name in FIELD_TERMS}
-    return {name: size for name, size in {**terms, DRIFT: optics.focus_drift_nm}.items() if size}
+    terms |= {DRIFT: optics.focus_drift_nm, BEND: optics.focus_bend_nm}
+    terms |= {name: rise for name, (_, rise) in zip(JUMPS, optics.focus_jumps, strict=False)}
+    return {name: size for name, size in terms.items() if size}
+
+
+def when(optics: Optics, frame: float | None) -> Spot:
+    """Give the time of a frame, or of that of which the focus is configured."""
+    if frame is None:
+        return Spot()
+    after = tuple(frame >= start for start, _ in optics.focus_jumps)
+    return Spot(t=(frame - optics.focus_frame) / DRIFT_FRAMES, after=after)
+
+
+def moves_in(optics: Optics, settings: Mapping[str, float]) -> dict[str, Any]:
+    """Give what moves the focus as keys of ``[optics]``, whose jumps have their frames."""
+    keys = {name: settings[name] for name in (DRIFT, BEND) if name in settings}
+    named = zip(JUMPS, optics.focus_jumps, strict=False)
+    jumps = tuple((frame, settings.get(name, rise)) for name, (frame, rise) in named)
+    return {**keys, "focus_jumps": jumps}
 
 
 def changed(optics: Optics, changes: Mapping[str, float]) -> Optics:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.field_map import (
     REFERENCE,
     STEPS,
-    Spot,
     brighter,
     centre_of,
     changed,
     changes_at,
     terms_of,
+    when,
 )
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.memoize import memoize
-
-DRIFT_FRAMES = 1000.0
-"""Frames in which the focus rises by ``optics.focus_drift_nm``."""
 
 _KEPT = 64  # models at hand, of some MB each
 
@@ -43,12 +40,17 @@ class LocalModels:
 
         self._moved = memoize(_KEPT, moved)
 
+    def rise(self, frame: int) -> int:
+        """Give by how many steps of its models the focus has risen in a frame."""
+        moves = {name: size for name, size in self._terms.items() if name in MOVES}
+        change = changes_at(moves, when(self._optics, frame)).get("focus_nm", 0.0)
+        return round(change / STEPS["focus_nm"])
+
     def at(self, x_nm: float, y_nm: float, frame: float | None = None) -> ForwardModel:
         """Give the model of a place, in a frame or in that of which the focus is configured."""
         x, y, half = self._centre_px
-        first = self._optics.focus_frame
-        time = 0.0 if frame is None else (frame - first) / DRIFT_FRAMES
-        spot = Spot((x_nm / self._pixel_nm - x) / half, (y_nm / self._pixel_nm - y) / half, time)
+        at_x, at_y = (x_nm / self._pixel_nm - x) / half, (y_nm / self._pixel_nm - y) / half
+        spot = when(self._optics, frame)._replace(x=at_x, y=at_y)
         changes = changes_at(self._terms, spot)
         dimming = changes.pop(REFERENCE, 0.0)
         steps = ((base, round(change / STEPS[base])) for base, change in changes.items())
@@ -68,16 +70,18 @@ class ModelsFrom:
 
 def refuse_moving_focus(config: Config) -> None:
     """Refuse a focus that moves where pictures are those of one focus."""
-    if config.optics.focus_drift_nm:
+    moves = [name for name in terms_of(config.optics) if name in MOVES]
+    if moves:
+        key = moves[0] if moves[0] in Optics.model_fields else "focus_jumps"
         raise ConfigError(
-            f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g} is known only of landing "
-            'movies (background.method = "sliding") with optics.psf = "model": set it to 0'
+            f"optics.{key} = {getattr(config.optics, key)} is known only of landing "
+            'movies (background.method = "sliding") with optics.psf = "model": leave it out'
         )
 
 
 def refuse_uneven_field(config: Config) -> None:
     """Refuse optics that differ over the field where one model serves all of it."""
-    terms = [name for name in terms_of(config.optics) if name != "focus_drift_nm"]
+    terms = [name for name in terms_of(config.optics) if name not in MOVES]
     if terms and (config.fit.mode == "track" or config.optics.psf == "measured"):
         raise ConfigError(
             f"optics: {terms[0]} says that the microscope is not the same over the field, which "

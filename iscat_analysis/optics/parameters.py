@@ -9,22 +9,19 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.config import FIELD_TERMS, Config, field_keys
+from iscat_analysis.config import JUMPS, MOVES, Config, field_keys
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.optics.field_map import BASES, DRIFT, WEIGHTS
+from iscat_analysis.optics.field_map import BASES, BEND, DRIFT, WEIGHTS, moves_in
 from iscat_analysis.records import FloatArray
 
 FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
 ``[optics]``."""
 
-FOCUS_DRIFT = DRIFT
-"""Rise of the focus in 1000 frames of a movie [nm]."""
-
-RISES = (FOCUS_STEP, FOCUS_DRIFT)
+RISES = (FOCUS_STEP, *MOVES)
 """What moves the focus from one picture to another, and is no property of the microscope."""
 
-FIELD = tuple(name for name in WEIGHTS if name != DRIFT and not name.startswith("reference_"))
+FIELD = tuple(name for name in WEIGHTS if name not in MOVES and not name.startswith("reference_"))
 """What differs over the field, and shows in the shape of pictures: of the reference's amplitude,
 which shows in their size alone, the pictures of particles of unknown mass say nothing."""
 
@@ -67,7 +64,9 @@ _EVEN, _ODD = (Parameter("zernike", 100.0, 25.0, mirrored=sign) for sign in (-1,
 PARAMETERS = {
     "focus_nm": Parameter("focus", 1000.0, 120.0),
     FOCUS_STEP: Parameter("focus", 50.0, 2.0, -1),
-    FOCUS_DRIFT: Parameter("focus", 1000.0, 100.0, -1),
+    DRIFT: Parameter("focus", 1000.0, 100.0, -1),
+    BEND: Parameter("focus", 4000.0, 500.0, -1),
+    **dict.fromkeys(JUMPS, Parameter("focus", 1000.0, 100.0, -1)),
     "na": Parameter("na", 0.05, 0.02),
     "reference_phase_deg": Parameter("phase", 180.0, 40.0, -1, period=360.0),
     "mask_na": Parameter("mask", 0.3, 0.1),
@@ -199,10 +198,9 @@ def settings_of(config: Config) -> dict[str, Any]:
 def with_settings(config: Config, settings: Settings) -> Config:
     """Put parameters into a configuration."""
     plain = {
-        k: v
-        for k, v in settings.items()
-        if not is_term(k) and k != FOCUS_STEP and k not in FIELD_TERMS
+        k: v for k, v in settings.items() if not is_term(k) and k != FOCUS_STEP and k not in WEIGHTS
     }
+    plain |= moves_in(config.optics, settings)
     plain |= field_keys({name: settings.get(name, 0.0) for name in FIELD})
     terms = {key: value for key, value in settings.items() if is_term(key) and value}
     optics = config.optics.model_copy(update={**plain, "aberrations_nm": terms})

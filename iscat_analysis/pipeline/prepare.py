@@ -155,6 +155,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         )  # fmt: skip
     if learned:
         summary["optics"] = learned
+    if mode == "sliding" and config.optics.focus_jumps:
+        whole_of, stretches = stretches, stretches.with_jumps(
+            [frame for frame, rise in config.optics.focus_jumps if rise]
+        )  # fmt: skip
+        if stretches is not whole_of:
+            run.warn(stretches.message(movie.name))
     run.clock.lap("optics")
     other_kind = ""
     if changes_future is not None:

@@ -48,8 +48,13 @@ class ReportedRows:
     changing_light: str = ""
 
 
-def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> ReportedRows:
-    """Make the rows of all events of a movie."""
+def reported_rows(
+    found: DetectionResult,
+    *,
+    learned_optics: bool = False,
+    camera: Mapping[str, Any] | None = None,
+) -> ReportedRows:
+    """Make the rows of all events of a movie, `camera` as the summary describes it."""
     fits, config, mode = found.fits, found.context.config, found.context.mode
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     evidence, heights, extension = None, None, None
@@ -81,7 +86,10 @@ def reported_rows(found: DetectionResult, *, learned_optics: bool = False) -> Re
     unfit = (
         mass_error(found.optics) if mode == "track" else misfit_error(fits, found.context.roi_px**2)
     )
-    shared = contributions(config, fits, unfit, found.context.model.scale, shifts)
+    threshold = 0.0 if mode == "track" else found.context.templates.threshold
+    shared = contributions(
+        config, fits, unfit, found.context.model.scale, shifts, camera, threshold
+    )  # fmt: skip
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Pattern, pattern_of
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVES, Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
-from iscat_analysis.optics.local import DRIFT_FRAMES
+from iscat_analysis.optics.field_map import changes_at, terms_of, when
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 
@@ -128,8 +128,9 @@ def _middle(image: FloatArray) -> FloatArray:
 def _focus(config: Config, starts: Sequence[int]) -> list[float | None]:
     """Give the focus with which each part was fitted."""
     optics = config.optics
-    rise = (np.array(starts) - optics.focus_frame) / DRIFT_FRAMES * optics.focus_drift_nm
-    return _numbers(optics.focus_nm + rise)
+    moves = {name: size for name, size in terms_of(optics).items() if name in MOVES}
+    rises = [changes_at(moves, when(optics, frame)).get("focus_nm", 0.0) for frame in starts]
+    return _numbers([optics.focus_nm + rise for rise in rises])
 
 
 def _intervals(stretches: Stretches, found: DetectionResult) -> Iterator[dict[str, Any]]:

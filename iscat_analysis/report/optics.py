@@ -25,6 +25,8 @@ _LABELS = {
     "polarization_deg": ("direction of polarisation", "deg"),
     "focus_step_nm": ("rise of the focus per picture", "nm"),
     "focus_drift_nm": ("rise of the focus in 1000 frames", "nm"),
+    "focus_bend_nm": ("bend of the focus in 1000 frames", "nm"),
+    **{f"focus_jump_{k}_nm": (f"jump of the focus, number {k}", "nm") for k in range(1, 5)},
     "focus_tilt_x_nm": ("rise of the focus to the edge of the field, x", "nm"),
     "focus_tilt_y_nm": ("rise of the focus to the edge of the field, y", "nm"),
     "focus_curvature_nm": ("curvature of the focus at the edge", "nm"),

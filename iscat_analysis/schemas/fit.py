@@ -260,6 +260,7 @@ class CameraNumbers(Closed):
     gain_e_per_adu: CameraNumber = key("Photoelectrons per count [e]")
     offset_adu: CameraNumber = key("Counts in the dark [counts]")
     read_noise_e: CameraNumber = key("Read noise, standard deviation per frame [e]")
+    light_adu: NotNegative = maybe("If known: counts above the offset in the usual pixel")
     law: CameraLaw = maybe("If the pixels differ in brightness: how counts grow with the light")
 
 

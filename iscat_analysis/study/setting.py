@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
-from iscat_analysis.config import Config
+from iscat_analysis.config import MOVING, Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.regions import Region, region_likelihood
@@ -192,7 +192,7 @@ def make_setting(
     changes: dict[str, Mapping[str, Any]] = {
         "bounds": {"pixels": side},
         "fit": {"mode": mode},
-        "optics": {"focus_drift_nm": 0.0},  # one picture, in the middle of the movie
+        "optics": MOVING,  # one picture, in the middle of the movie
     }
     config = _changed(config, changes)
     if pixel_nm:

@@ -126,11 +126,6 @@ class Movie:
         self.movers = place_movers(config, self._near_px, lambda i: self._generator("movers", i))
         heights = [p.z_nm for p in self.particles]
         heights += [float(p.points_nm[..., 2].max()) for p in self.movers]
-        if config.optics.focus_drift_nm:
-            raise ConfigError(
-                f"optics.focus_drift_nm = {config.optics.focus_drift_nm:g}: movies are simulated "
-                "with a focus that rests; set it to 0"
-            )
         reach = self._grid.diagonal_nm + self._pixel_nm
         if not all(p.still for p in self.movers):
             reach += (4 * self._near_px + 8) * self._pixel_nm  # also from beyond a corner
@@ -196,11 +191,15 @@ class Movie:
         field = np.zeros((self._components, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
         particles = [*self.particles, *(self._standing(p) for p in self.movers if p.still)]
-        still = None
+        still, risen = None, 0
         for t in range(self.power.size):
+            if self._local is not None and (rise := self._local.rise(t)) != risen:
+                present = {i: self._field_of(particles[i], t) for i in present}
+                field = sum(present.values(), start=np.zeros_like(field))
+                still, risen = None, rise
             for i, particle in enumerate(particles):
                 if particle.frame == t:
-                    present[i] = self._field_of(particle)
+                    present[i] = self._field_of(particle, t)
                     field = field + present[i]
                     still = None
                 if particle.leave == t and i in present:
@@ -324,19 +323,21 @@ class Movie:
         moved = fft.irfft2(spectrum * phase_y[:, None] * phase_x, s=(rows, columns))
         return np.asarray(np.maximum(moved[self._field], 0.0))
 
-    def _field_of(self, particle: SimulatedParticle) -> ComplexArray:
+    def _field_of(self, particle: SimulatedParticle, frame: int) -> ComplexArray:
         dy, dx = self.drift_px[particle.frame]
         x, y = (particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm
-        return self._field_at(x, y, particle.z_nm, particle.mass_kda)
+        return self._field_at(x, y, particle.z_nm, particle.mass_kda, frame)
 
-    def _field_at(self, x_nm: float, y_nm: float, z_nm: float, mass_kda: float) -> ComplexArray:
+    def _field_at(
+        self, x_nm: float, y_nm: float, z_nm: float, mass_kda: float, frame: int | None = None
+    ) -> ComplexArray:
         """Field of a particle in the sample, on the samples inside each pixel."""
         offsets = self._model.samples[0] * self._pixel_nm
         x = (self._grid.x_nm[:, None] + offsets).ravel() - x_nm
         y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
         dx, dy = np.meshgrid(x, y)
         field = np.zeros((self._components, *dx.shape), dtype=complex)  # an analyser leaves one
-        model = self._model if self._local is None else self._local.at(x_nm, y_nm)
+        model = self._model if self._local is None else self._local.at(x_nm, y_nm, frame)
         given = model.field(dx, dy, z_nm, mass_kda)
         field[: len(given)] = given
         return field
@@ -419,7 +420,9 @@ class Movie:
             return None
         dy, dx = self.drift_px[particle.frame]
         place = ((particle.x_px - dx) * self._pixel_nm, (particle.y_px - dy) * self._pixel_nm)
-        return self._local.at(*place).peak_contrast(particle.z_nm, particle.mass_kda)
+        return self._local.at(*place, particle.frame).peak_contrast(
+            particle.z_nm, particle.mass_kda
+        )
 
     def _check_range(self) -> None:
         camera = self._camera

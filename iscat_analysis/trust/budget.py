@@ -36,7 +36,13 @@ def budget_of(
         return []
     noise = rows["sigma_mass_kda"].to_numpy(float)
     remedy = "more light, or more frames of each particle"
-    budget = [_entry("photon noise", "measured", noise, mass, remedy, common=False)]
+    budget = [
+        _entry("photon noise", "measured", noise, mass, remedy, common=False),
+        _entry(  # 1/SNR² of the mass is taken off, at an SNR that is off by 1
+            "bias of faint particles, taken off", "measured", noise**3 / mass**2, mass, remedy,
+            common=False,
+        ),
+    ]  # fmt: skip
     spread = achieved.get("mass_kda")
     if (
         spread is not None

@@ -9,20 +9,21 @@ not shrink when events are averaged.  What they come to, source by source, is th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.mass import line_sigma_kda
 from iscat_analysis.config import Config
-from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, Spot, centre_of
+from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
@@ -54,6 +55,7 @@ _MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
 _LEAST_NONLINEAR_SHARE = 0.02
 _NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
 _LEAST_SIGMAS = 0.5  # of σ, beyond which it is told of every row
+_LEAST_SELECTED = 0.01  # of σ, below which a threshold does nothing
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 _NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
 
@@ -120,12 +122,22 @@ def contributions(
     mass_share: float = 0.0,
     scale: MassScale | None = None,
     held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
+    camera: Mapping[str, Any] | None = None,
+    threshold_snr: float = 0.0,
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
+    `camera` is what ``summary.json`` says of it, and `threshold_snr` that of the search.
+
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
-    sources = [*sources_of(config, mass_share, scale)]
+    sources = [*sources_of(config, mass_share, scale), *_of_the_camera(config, camera or {})]
+    if threshold_snr:
+        sources.append(
+            Source("selection near the threshold", "measured",
+                   partial(_of_the_selection, threshold_snr),
+                   "more light, or more frames; species, which know what was missed")
+        )  # fmt: skip
     sources += [_of_held(name, shift) for name, shift in held_kda.items() if shift.any()]
     found = [(source, source.errors(config, table)) for source in sources]
     return [(source, errors) for source, errors in found if errors]
@@ -153,6 +165,58 @@ def _of_held(name: str, shift_kda: FloatArray) -> Source:
     return Source(
         f"{name} of the particles", "measured", lambda *_: {"mass_kda": shift_kda}, remedy
     )
+
+
+_FROM_LIGHT = ("measured", "assumed")
+"""Where an error of the offset is from the law of the counts, that of their linearity is the same.
+"""
+
+
+def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source]:
+    """Give what counts in the dark, and counts that are not in proportion to light, do to masses.
+
+    Contrast is a change of counts over counts above the offset: offset too high by δ makes it too
+    large by δ/counts.  The gain is in both, and leaves it as it is.
+    """
+    offset, law, light = (camera.get(key) for key in ("offset_adu", "law", "light_adu"))
+    if not _fits_masses(config) or config.optics.scheme == "darkfield":
+        return
+    if offset is not None and light:
+        known = offset["from"] in (*_FROM_LIGHT, "dark frames")
+        sigma = offset["se"] if known else config.uncertainty.offset_adu
+        kind: Kind = "measured" if known and offset["from"] != "assumed" else "assumed"
+        yield Source("offset of the camera", kind, partial(_as_a_share, sigma / light),
+                     "frames without light (iscat calibrate camera)")  # fmt: skip
+    if law is not None and (offset is None or offset["from"] not in _FROM_LIGHT):
+        yield Source("linearity of the camera, and light that does not interfere", "measured",
+                     partial(_as_a_share, law["contrast_se"]),
+                     "a calibration of the camera (iscat calibrate camera)")  # fmt: skip
+    if camera.get("gain_e_per_adu") is not None:
+        yield Source("gain of the camera", "measured", partial(_as_a_share, 0.0),
+                     "nothing: it changes sigma, and no mass")  # fmt: skip
+
+
+def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
+    """Give the same share of all masses."""
+    del config
+    return {"mass_kda": share * np.abs(table["mass_kda"].to_numpy(float))}
+
+
+def _of_the_selection(
+    threshold_snr: float, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give by how much masses of those that pass a threshold are too large on average.
+
+    Of a Gaussian of which what is u standard deviations below its middle is cut off, the mean is
+    φ(u)/Φ(u) standard deviations higher.
+    """
+    if not _fits_masses(config):
+        return {}
+    sigma, snr = (table[name].to_numpy(float) for name in ("sigma_mass_kda", "snr"))
+    over = np.maximum(snr - threshold_snr, 0.0)
+    shift = np.exp(-0.5 * over**2 - log_ndtr(over)) / math.sqrt(2 * math.pi)
+    shift = np.where(shift > _LEAST_SELECTED, shift, 0.0)
+    return {"mass_kda": shift * sigma} if np.any(shift > 0) else {}
 
 
 def _of_the_missing_record(
@@ -285,7 +349,8 @@ def _is_about_contrast(config: Config) -> bool:
 def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatArray:
     """Shift of x, y, z, mass and contrast of every event per unit of the optics, (n, 5, k).
 
-    A term of the field shifts an event as the parameters that it changes at the event's place.
+    A term of the field shifts an event as the parameters that it changes at the event's place, and
+    a focus that moves as it does in its frame.
     """
     errors = config.optics.covariance
     names = errors.names if errors is not None else ()
@@ -300,8 +365,10 @@ def _shifts(config: Config, model: ForwardModel, table: pd.DataFrame) -> FloatAr
     bases = (*bases, REFERENCE)
     x, y, half = centre_of(config.optics, (1, 1))
     shifts = np.zeros((len(table), len(COMMON), len(names)))
-    for event, place in enumerate(zip(table["x_px"], table["y_px"], strict=True)):
-        spot = Spot((place[0] - x) / half, (place[1] - y) / half)
+    times = [when(config.optics, frame) for frame in table.get("frame", [None] * len(table))]
+    places = zip(table["x_px"], table["y_px"], strict=True)
+    for event, (shown, place) in enumerate(zip(times, places, strict=True)):
+        spot = shown._replace(x=(place[0] - x) / half, y=(place[1] - y) / half)
         for k, name in enumerate(names):
             for base, weight in WEIGHTS[name](spot).items() if name in WEIGHTS else ((name, 1.0),):
                 shifts[event, :, k] += weight * found[event, :, bases.index(base)]

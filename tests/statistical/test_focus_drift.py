@@ -1,4 +1,4 @@
-"""A focus that moves during a landing movie is noticed, learned, and fitted with.
+"""A focus that moves or jumps during a landing movie is noticed, learned, and fitted with.
 
 The movies know nothing of the model that is fitted; of the heaviest particles the pictures change
 by many times their noise.
@@ -31,8 +31,12 @@ SIGMAS = 4.0
 
 @cache
 def _movie(rise_nm: float) -> InstrumentMovie:
+    return _moving(np.linspace(-0.5, 0.5, SHAPE[0]) * rise_nm if rise_nm else None)
+
+
+def _moving(course_nm: np.ndarray | None) -> InstrumentMovie:
     microscope = Instrument(emission="reciprocal", focus_nm=FOCUS_NM)
-    return InstrumentMovie(microscope, SHAPE, LANDINGS, seed=22, focus_rise_nm=rise_nm)
+    return InstrumentMovie(microscope, SHAPE, LANDINGS, seed=22, focus_nm=course_nm)
 
 
 def _config(*settings: str) -> Config:
@@ -91,6 +95,44 @@ def test_a_focus_that_moves_is_learned_and_fitted_with(rise_nm: float) -> None:
             pulls.append((row["mass_kda"].item() - mass) / error)
     assert len(pulls) >= len(LANDINGS.frame) - 3
     assert np.sqrt(np.mean(np.square(pulls))) < 1 + SIGMAS / np.sqrt(2 * len(pulls))
+
+
+@pytest.mark.parametrize(
+    "jumps",
+    [((700, 60.0),), ((700, 30.0),), ((560, -120.0),), ((500, 60.0), (900, -60.0))],
+    ids=lambda jumps: " and ".join(f"{rise:g} nm" for _, rise in jumps),
+)
+def test_a_focus_that_jumps_is_learned_with_its_frame(jumps: tuple[tuple[int, float], ...]) -> None:
+    frames = np.arange(SHAPE[0])
+    course = sum((rise * (frames >= frame) for frame, rise in jumps), start=np.zeros(SHAPE[0]))
+    learned, said = _learned(_moving(course), _config())
+    found = sorted(learned.optics.focus_jumps)
+    assert len(found) == len(jumps), said
+    assert learned.optics.focus_drift_nm == learned.optics.focus_bend_nm == 0
+    for (frame, rise), (at, by) in zip(found, jumps, strict=True):
+        assert abs(frame - at) <= 8  # a tenth of a window
+        assert abs(rise - by) < 5.0  # errors of 1 to 1.5 nm
+
+
+def test_a_focus_that_bends_is_learned() -> None:
+    half = np.linspace(-1, 1, SHAPE[0])
+    learned, said = _learned(_moving(60.0 * half**2), _config())
+    assert learned.optics.focus_jumps == (), said
+    bend = 60.0 / (SHAPE[0] / 2000) ** 2
+    assert abs(learned.optics.focus_bend_nm - bend) < 0.2 * bend
+
+
+def test_a_focus_that_wanders_is_learned_or_refused() -> None:
+    """No term describes it: where the optics are used, particles at all times agree with them."""
+    course = 40 * np.sin(2 * np.pi * 2.5 * np.arange(SHAPE[0]) / SHAPE[0])
+    movie = _moving(course)
+    learned, said = _learned(movie, _config())
+    if learned.optics.calibrate == "auto":
+        assert any("the focus moves in a way that is not learned" in text for text in said)
+        return
+    good = _analysed(movie, learned).fits.query("status == 'ok'")
+    heavy = good[good["mass_kda"] > 300]
+    assert (np.abs(heavy["mass_kda"] / 480 - 1) < 5 * heavy["sigma_mass_kda"] / 480).all()
 
 
 def test_a_focus_that_moves_is_named_where_the_optics_cannot_be_learned() -> None:

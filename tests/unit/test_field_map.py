@@ -53,6 +53,8 @@ def _local(config: Config, x_px: float, y_px: float, frame: int | None = None) -
         ({"phase_tilt_deg": "[12, 4]"}, {"reference_phase_deg": 12 * 0.5 - 4 * 0.25}),
         ({"phase_curvature_deg": "16"}, {"reference_phase_deg": 16 * 0.3125}),
         ({"focus_drift_nm": "50", "focus_frame": "100"}, {"focus_nm": -300 + 50 * 0.4}),
+        ({"focus_bend_nm": "-200", "focus_frame": "100"}, {"focus_nm": -300 - 200 * 0.16}),
+        ({"focus_jumps": "[[300, 60], [500, -35], [501, 80]]"}, {"focus_nm": -300 + 60 - 35}),
     ],
 )
 def test_a_particle_is_seen_with_the_optics_of_its_place(
@@ -86,16 +88,41 @@ def test_the_learner_knows_how_pictures_change_with_a_coefficient() -> None:
     settings = settings_of(_config())
     light = asimov_poisson(forward_model(_config(), REACH_NM), GRID, np.zeros(5), 1.0, 1.0)
     sight = ParticleImage(
-        GRID, light.noise, light.data, 0.0, 0.0, 5.0, focus_steps=0.3, place=(0.6, -0.4)
-    )
-    assert sight.spot == Spot(0.6, -0.4, 0.3)
-    for name in (*FIELD, "focus_drift_nm"):
+        GRID, light.noise, light.data, 0.0, 0.0, 5.0, focus_steps=0.3, place=(0.6, -0.4),
+        after=(False, True),
+    )  # fmt: skip
+    assert sight.spot == Spot(0.6, -0.4, 0.3, (False, True))
+    for name in (*FIELD, "focus_drift_nm", "focus_bend_nm", "focus_jump_2_nm"):
         low, high = (sight.seen_with({**settings, name: size}) for size in (0.0, 2.0))
         slopes = {k: (high[k] - low[k]) / 2 for k in low if isinstance(low[k], float)}
         expected = {key: sight.slopes(name).get(key, 0.0) for key in slopes}
         assert slopes == pytest.approx(expected)
         assert any(expected.values())
     assert set(FIELD) < set(WEIGHTS)
+
+
+@pytest.mark.parametrize(
+    ("moves", "frames"),
+    [
+        ({"focus_jumps": "[[3, 80]]"}, {1: -300, 3: -220}),
+        ({"focus_drift_nm": "20000", "focus_frame": "1"}, {1: -300, 4: -240}),
+        ({"focus_bend_nm": "5e6", "focus_frame": "1"}, {1: -300, 5: -220}),
+    ],
+)
+def test_a_simulated_focus_moves(moves: dict[str, str], frames: dict[int, float]) -> None:
+    """What has landed before changes with it."""
+    scene = (
+        "simulation.shape=[31, 31]", "simulation.frames=6", 'simulation.background="flat"',
+        "simulation.power_noise=0", "simulation.photons_per_pixel=1000",
+        "simulation.events=[{frame=1,x_px=15.0,y_px=15.0,mass_kda=480.0,z_nm=5.0}]",
+        "background.method=sliding",
+    )  # fmt: skip
+    seen = list(Movie(_config(*scene, focus_nm=-300, **moves), 1).expected_frames())
+    grid = PixelGrid.region((0, 31), (0, 31), PIXEL_NM)
+    for frame, focus in frames.items():
+        model = forward_model(_config(focus_nm=focus), 6000.0)
+        expected = model.image(grid, 15 * PIXEL_NM, 15 * PIXEL_NM, 5.0, 480.0)
+        assert np.abs(seen[frame] / seen[0] - 1 - expected).max() < 0.002 * np.abs(expected).max()
 
 
 def test_one_model_for_the_whole_field_is_refused_where_optics_differ() -> None:

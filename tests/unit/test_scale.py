@@ -265,7 +265,59 @@ def test_the_budget_adds_up_to_the_column() -> None:
     # two nanometres of focus there are worth more than one here
     assert sizes["optics of the standards"] > sizes["optics of the movie"] > 1e-4
     assert next(one for one in budget if one["name"] == "line of the standards")["dof"] == 1
-    assert explained_kda(budget) == 0.0
+    own = table["sigma_mass_kda"].item() ** 3 / table["mass_kda"].item() ** 2
+    assert explained_kda(budget) == pytest.approx(own)  # of the bias that is taken off
+
+
+CAMERA: dict[str, Any] = {
+    "gain_e_per_adu": {"value": 4.0, "se": 0.1, "from": "measured"},
+    "offset_adu": {"value": 100.0, "se": 12.0, "from": "dark frames"},
+    "light_adu": 2000.0,
+    "law": {"kind": "linear", "contrast": 1.0, "contrast_se": 0.004},
+}
+
+
+@pytest.mark.parametrize(
+    ("offset", "expected"),
+    [
+        ({}, {"offset of the camera": (0.006, "measured"), "linearity": (0.004, "measured")}),
+        # the same number: the offset is from the law of the counts
+        ({"from": "measured"}, {"offset of the camera": (0.006, "measured")}),
+        ({"from": "assumed"}, {"offset of the camera": (0.006, "assumed")}),
+        # nobody says how well a configured one is known: one count of 2000
+        (
+            {"from": "configured", "se": 0.0},
+            {"offset of the camera": (0.0005, "assumed"), "linearity": (0.004, "measured")},
+        ),
+    ],
+)
+def test_the_budget_has_the_camera(
+    offset: dict[str, Any], expected: dict[str, tuple[float, str]]
+) -> None:
+    camera = {**CAMERA, "offset_adu": CAMERA["offset_adu"] | offset}
+    found = contributions(_config(), _event(), camera=camera)
+    budget = budget_of(_event(), found, {}, calibrated=True, scaled=False)
+    lines = {one["name"].split(",")[0]: one for one in budget if "camera" in one["name"]}
+    assert lines.pop("gain of the camera")["sigma_rel"] == 0  # it changes sigma alone
+    said = {name.removesuffix(" of the camera") if "lin" in name else name: one
+            for name, one in lines.items()}  # fmt: skip
+    assert {name: (one["sigma_rel"], one["kind"]) for name, one in said.items()} == {
+        name: (pytest.approx(size, rel=1e-9), kind) for name, (size, kind) in expected.items()
+    }
+
+
+@pytest.mark.parametrize("over", [0.0, 1.0, 2.0, 6.0])
+def test_what_passes_a_threshold_is_too_large_by_what_the_budget_says(over: float) -> None:
+    """Against draws of a Gaussian, of which what is beneath the threshold is lost."""
+    table = _event().assign(snr=5.0 + over)
+    found = dict(contributions(_config(), table, threshold_snr=5.0))
+    said = next((each for source, each in found.items() if "threshold" in source.name), None)
+    draws = over + np.random.default_rng(1).standard_normal(200_000)
+    kept = draws[draws > 0]
+    shift, error = float(kept.mean()) - over, float(kept.std()) / np.sqrt(kept.size)
+    size = 0.0 if said is None else said["mass_kda"][0] / table["sigma_mass_kda"].item()
+    assert abs(size - shift) < 4 * error
+    assert (said is None) == (over > 3)
 
 
 def test_a_width_that_nothing_explains_is_said() -> None:

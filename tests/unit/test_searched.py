@@ -205,3 +205,6 @@ def test_a_focus_does_not_move_by_micrometres() -> None:
     assert is_plausible({"focus_drift_nm": -100.0}, (0, 1000))
     assert not is_plausible({"focus_drift_nm": -6705.0}, (0, 1000))
     assert not is_plausible({"focus_drift_nm": -500.0}, (0, 8000))
+    assert is_plausible({"focus_bend_nm": 1500.0}, (0, 400))  # 60 nm
+    assert not is_plausible({"focus_bend_nm": 500.0}, (0, 4000))
+    assert not is_plausible({"focus_jump_1_nm": 1200.0}, (0, 400))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from iscat_analysis.config import (
+    MOVING,
     Calibration,
     Config,
     Optics,
@@ -20,7 +21,7 @@ from iscat_analysis.config import (
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 
 _OF_A_MOVIE = {
-    "file": None, "covariance": None, "calibrate": "auto", "focus_drift_nm": 0.0, "focus_frame": 0,
+    "file": None, "covariance": None, "calibrate": "auto", **MOVING,
 }  # fmt: skip
 """Keys of [optics] that do not change the contrast of standards, and their neutral values."""
 
@@ -65,7 +66,7 @@ def standards_of(config: Config) -> Standards:
     gain, offset = camera.gain_e_per_adu, camera.offset_adu
     return Standards(
         optics=config.optics.model_copy(update=_OF_A_MOVIE),
-        covariance=config.optics.covariance,
+        covariance=None if (errors := config.optics.covariance) is None else errors.at_rest,
         height_nm=config.particle.nominal_height_nm,
         camera=StandardsCamera(
             pixel_size_nm=camera.pixel_size_nm,
