@@ -27,9 +27,10 @@ from uneven_movies import Optics, half_fields, in_a_cone
 Array = NDArray[np.float64]
 
 SHAPE, COUNT, APART_PX = (500, 96, 96), 16, 12.0
+LARGE, MANY, LARGE_APART_PX = (700, 160, 160), 36, 14.0  # of which optics can be learned
 PIXEL_NM, GAIN, LEVEL_E = 84.0, 4.0, 1e5
 NOMINAL = Instrument(emission="reciprocal")
-_REACH_NM = 1.5 * PIXEL_NM * max(SHAPE[1:])
+_REACH_NM = 1.5 * PIXEL_NM * max(LARGE[1:])
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,11 @@ class Place:
     x_px: float
     y_px: float
     mass_kda: float
+    field_px: tuple[int, int]
 
     def away(self, x_nm: float = 0.0, y_nm: float = 0.0) -> tuple[Array, Array]:
         """Camera minus particle coordinates, the particle moved by so much."""
-        rows, columns = SHAPE[1:]
+        rows, columns = self.field_px
         x = np.arange(columns) * PIXEL_NM - self.x_px * PIXEL_NM - x_nm
         y = np.arange(rows) * PIXEL_NM - self.y_px * PIXEL_NM - y_nm
         return x[None, :], y[:, None]
@@ -74,8 +76,12 @@ class Case:
     others: Landings | None = None
 
 
-def landings(seed: int, masses: tuple[float, ...] = (92.0, 205.0, 430.0)) -> Landings:
-    """Draw particles of the small field."""
+def landings(
+    seed: int, masses: tuple[float, ...] = (92.0, 205.0, 430.0), *, large: bool = False
+) -> Landings:
+    """Draw particles of the small field, or of the large one."""
+    if large:
+        return draw_landings(LARGE, MANY, seed=seed, masses=masses, apart_px=LARGE_APART_PX)
     return draw_landings(SHAPE, COUNT, seed=seed, masses=masses, apart_px=APART_PX)
 
 
@@ -91,7 +97,7 @@ def of_optics(optics: Optics, illumination_na: float = 0.0) -> Draw:
 
     def draw(place: Place, rng: np.random.Generator) -> Array:
         del rng
-        x, y = half_fields(SHAPE[1:], np.array(place.x_px), np.array(place.y_px))
+        x, y = half_fields(place.field_px, np.array(place.x_px), np.array(place.y_px))
         local, reference = optics(NOMINAL, float(x), float(y))
         picture = middle if local == NOMINAL else Pictures(local, _REACH_NM)
         mass = place.mass_kda * middle.per_kda / picture.per_kda / reference
@@ -220,7 +226,8 @@ def film(
     draw: Draw,
     seed: int,
     *,
-    course: Course | Callable[[int], Course] = at_once,
+    shape: tuple[int, int, int] = SHAPE,
+    course: Course = at_once,
     by_frame: Callable[[int], Array] | None = None,
     record: Record | None = None,
     pattern: float = 0.05,
@@ -243,7 +250,7 @@ def film(
         How far the second pattern moves, and all, within the movie.
     """
     rng = np.random.default_rng(seed)
-    frames, rows, columns = SHAPE
+    frames, rows, columns = shape
     particles = [(truth, draw)]
     if others is not None and draw_others is not None:
         particles.append((others, draw_others))
@@ -252,7 +259,7 @@ def film(
         for t, x, y, mass in zip(
             which.frame.tolist(), which.x_px, which.y_px, which.mass_kda, strict=True
         ):
-            pictures = how(Place(float(x), float(y), float(mass)), rng)
+            pictures = how(Place(float(x), float(y), float(mass), (rows, columns)), rng)
             if by_frame is not None:
                 weights = np.array([by_frame(n) for n in range(t, frames)])
             else:
@@ -262,7 +269,7 @@ def film(
     wide = (rows + 2 * margin, columns + 2 * margin)
     inner = (slice(margin, -margin), slice(margin, -margin))
     still, mobile = speckle(rng, pattern, wide), speckle(rng, second, wide)
-    counts = np.empty(SHAPE)
+    counts = np.empty(shape)
     for t in range(frames):
         part = t / frames
         light = still * shift(mobile, (0.0, moved_px * part), order=3, mode="nearest")

@@ -14,6 +14,7 @@ from _hazard_movies import (
     APART_PX,
     COUNT,
     GAIN,
+    LARGE,
     LEVEL_E,
     NOMINAL,
     PIXEL_NM,
@@ -42,7 +43,6 @@ from uneven_movies import comatic, other_reference, tilted
 from wanderers import SETTINGS as TRACKED
 from wanderers import wander
 
-LARGE, MANY = (900, 160, 160), 36  # of movies whose optics are to be learned
 LINE_SE = 0.002  # of the line of the standards, where something else is wrong
 FRAME_MS = 1e3 / 331.0
 
@@ -81,18 +81,24 @@ def usual(
     return case(stored(film(truth, draw, seed, **more)), truth)
 
 
+def learned(draw: Draw, seed: int, **more: Any) -> Case:
+    """Do the same with enough particles to learn optics."""
+    truth = landings(seed, large=True)
+    return case(stored(film(truth, draw, seed, shape=LARGE, **more)), truth)
+
+
 # ---------------------------------------------------------------- optics and scale
 
 
-def large(
+def scattered_alike(
     seen: Instrument, seed: int, *, standards: Instrument = NOMINAL, pixel_nm: float = PIXEL_NM
 ) -> tuple[Array, Landings]:
-    """Record enough particles to learn optics, which scatter as where the standards were.
+    """Record enough particles to learn optics, which scatter as those of the standards did.
 
     The field of a dipole over that of the reference goes as the wavelength to the power of -3,
     which pictures of a given peak do not have.
     """
-    truth = draw_landings(LARGE, MANY, seed=seed, apart_px=14.0)
+    truth = landings(seed, large=True)
     strength = Pictures(standards).per_kda / Pictures(seen).per_kda
     strength *= (standards.wavelength_nm / seen.wavelength_nm) ** 3
     scattered = replace(truth, mass_kda=truth.mass_kda * strength)
@@ -105,33 +111,33 @@ def large(
 def other_focus(strength: float, seed: int) -> Case:
     """Record a movie so many nm from the focus at which the standards were."""
     seen = replace(NOMINAL, focus_nm=NOMINAL.focus_nm - strength)
-    return Case(*large(seen, seed), recorded(relative=0.01))
+    return Case(*scattered_alike(seen, seed), recorded(relative=0.01))
 
 
 def other_focus_unrecorded(strength: float, seed: int) -> Case:
     """Do the same with a gradient that came without its optics."""
     seen = replace(NOMINAL, focus_nm=NOMINAL.focus_nm - strength)
-    return Case(*large(seen, seed), unrecorded())
+    return Case(*scattered_alike(seen, seed), unrecorded())
 
 
 def other_wavelength(strength: float, seed: int) -> Case:
     """Record at a wavelength that is so many nm above what is configured."""
     seen = replace(NOMINAL, wavelength_nm=NOMINAL.wavelength_nm + strength)
     settings = unrecorded() | {"uncertainty.wavelength_nm": strength}
-    return Case(*large(seen, seed), settings)
+    return Case(*scattered_alike(seen, seed), settings)
 
 
 def other_magnification(strength: float, seed: int) -> Case:
     """Record with pixels that are larger by a share than what is configured."""
     pixel = PIXEL_NM * (1 + strength)
     settings = unrecorded() | {"uncertainty.magnification": max(strength, 0.0)}
-    return Case(*large(NOMINAL, seed, pixel_nm=pixel), settings)
+    return Case(*scattered_alike(NOMINAL, seed, pixel_nm=pixel), settings)
 
 
 def focus_step(strength: float, seed: int) -> Case:
     """Move the focus in the middle of the movie."""
-    draw, middle = of_foci(NOMINAL.focus_nm, NOMINAL.focus_nm - strength), SHAPE[0] // 2
-    return usual(draw, seed, by_frame=lambda t: np.array([t < middle, t >= middle], dtype=float))
+    draw, middle = of_foci(NOMINAL.focus_nm, NOMINAL.focus_nm - strength), LARGE[0] // 2
+    return learned(draw, seed, by_frame=lambda t: np.array([t < middle, t >= middle], dtype=float))
 
 
 def cone(strength: float, seed: int) -> Case:
@@ -142,12 +148,12 @@ def cone(strength: float, seed: int) -> Case:
 
 def focus_tilt(strength: float, seed: int) -> Case:
     """Tilt the focus over the field by so many nm at its border."""
-    return usual(of_optics(tilted(strength, 0.0)), seed)
+    return learned(of_optics(tilted(strength, 0.0)), seed)
 
 
 def coma(strength: float, seed: int) -> Case:
     """Let coma grow to so many nm at the border."""
-    return usual(of_optics(comatic(strength)), seed)
+    return learned(of_optics(comatic(strength)), seed)
 
 
 def uneven_amplitude(strength: float, seed: int) -> Case:
@@ -157,7 +163,7 @@ def uneven_amplitude(strength: float, seed: int) -> Case:
 
 def curved_phase(strength: float, seed: int) -> Case:
     """Let the phase of the reference be curved by so many radians."""
-    return usual(of_optics(other_reference(strength)), seed)
+    return learned(of_optics(other_reference(strength)), seed)
 
 
 # ---------------------------------------------------------------- particles
@@ -291,7 +297,7 @@ def dropped(strength: float, seed: int) -> Case:
                   "Plane": plane},
     )  # fmt: skip
     nothing = Landings(np.zeros(0, int), *np.zeros((3, 0)))
-    return Case(path, nothing, {**TRACKED, "camera.frame_rate_hz": None})
+    return Case(path, nothing, {k: v for k, v in TRACKED.items() if k != "camera.frame_rate_hz"})
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@
 Every row of the table (``_hazard_rows.py``) is one kind of harm at some strengths.  Over all movies
 of a row and strength it is told: how many particles have a row, and an ``ok`` one; the mean of
 value over truth of the ``ok`` rows, weighted by their σ, with its standard error from their
-scatter; the systematic error that they state; the bias over both together; the largest error of an ``ok`` row over σ and
-the systematic error together; ``ok`` rows that are of no particle; the flags and the lines that
-name the cause.
+scatter; the systematic error that they state; the bias over both together; the largest error of an
+``ok`` row over its own σ and systematic error; ``ok`` rows that are of no particle; the flags and
+the lines that name the cause.
 
 A row keeps its promise where the bias of its ``ok`` rows lies within `SIGMAS` of both errors
 together, no more than one of 500 is beyond `BEYOND`, and no more are of no particle than
@@ -47,7 +47,7 @@ SETUP: Mapping[str, Any] = {
     "background.method": "sliding",
     "particle.mass_kda": 205.0,
     "detection.false_alarms_per_movie": FALSE_ALARMS,
-    "calibration.gradient_per_kda": None,
+    "compute.workers": 1,
 }
 
 
@@ -94,7 +94,7 @@ def analyse(row: Row, strength: float, seed: int) -> tuple[pd.DataFrame, dict[st
     case = row.make(strength, seed)
     setup = {} if row.diffusion else SETUP
     start = time.perf_counter()
-    settings = {k: v for k, v in {**setup, **case.settings}.items() if v is not None}
+    settings = {**setup, **case.settings}
     name = None if isinstance(case.counts, Path) else "movie"
     result = ia.fit_movie(case.counts, settings=settings, name=name)
     table = (diffusion if row.diffusion else masses)(case, result)
