@@ -150,8 +150,13 @@ def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
 
     moved = dict.fromkeys(("x_nm", "y_nm"), spread(15.0**2 / (2 * one)))
     found = Extension.of(rows(40), told, moved)
-    assert found.variance_nm2 == pytest.approx(15.0**2, rel=1e-6)
+    width_se = 1000.0 / math.sqrt(40)
+    assert 15.0**2 < found.variance_nm2 < 15.0**2 + width_se  # no less than it wiggles
     assert found.flagged.all()
+    exact = Evidence(*told[:4], told.sigma_spread_nm2 / 1000, *told[5:])
+    wide = Evidence(*exact[:3], np.full(40, 35.0**2), *exact[4:])
+    within = Extension.of(rows(40), wide, moved)  # most of it is within a frame
+    assert within.variance_nm2 == pytest.approx(35.0**2, rel=1e-3)
     assert not Extension.of(rows(40), told, moved, 15.0).flagged.any()  # the model has it
     still = Extension.of(rows(40), told, dict.fromkeys(moved, spread(0.0)))
     assert not still.flagged.any()
@@ -256,6 +261,12 @@ def test_steps_of_a_particle_that_is_there_are_told_from_others() -> None:
         "sigma_mass_kda": 3.0, "n_before": 80, "n_after": 80, "status": "ok",
     })  # fmt: skip
     assert at_a_shared_place(table).tolist() == [False, True, False, True, True, False, False]
+    table.loc[1, "x_nm"] = 190.0  # beside it, as of a particle that moved
+    assert at_a_shared_place(table, 370.0)[1]
+    assert not at_a_shared_place(table, 300.0)[1]
+    table.loc[1, "mass_kda"] = -50.0  # which no small move makes
+    assert not at_a_shared_place(table, 370.0)[1]
+    table.loc[1, ["x_nm", "mass_kda"]] = 40.0, -12.0
     table.loc[1, "frame"] = 10  # before the particle came: another one
     assert not at_a_shared_place(table)[1]
 
