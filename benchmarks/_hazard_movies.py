@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,14 @@ SHAPE, COUNT, APART_PX = (500, 96, 96), 16, 12.0
 LARGE, MANY, LARGE_APART_PX = (700, 160, 160), 36, 14.0  # of which optics can be learned
 PIXEL_NM, GAIN, LEVEL_E = 84.0, 4.0, 1e5
 NOMINAL = Instrument(emission="reciprocal")
+
 _REACH_NM = 1.5 * PIXEL_NM * max(LARGE[1:])
+
+
+@cache
+def nominal() -> Pictures:
+    """Prepare the pictures of the expected microscope."""
+    return Pictures(NOMINAL, _REACH_NM)
 
 
 @dataclass(frozen=True)
@@ -85,15 +93,15 @@ def landings(
     return draw_landings(SHAPE, COUNT, seed=seed, masses=masses, apart_px=APART_PX)
 
 
-def alike(instrument: Instrument = NOMINAL) -> Draw:
-    """Draw particles through one microscope."""
-    pictures = Pictures(instrument, _REACH_NM)
+def alike() -> Draw:
+    """Draw particles as they should be."""
+    pictures = nominal()
     return lambda place, _: pictures.contrast(*place.away(), place.mass_kda)[None]
 
 
 def of_optics(optics: Optics, illumination_na: float = 0.0) -> Draw:
     """Draw every particle through the microscope of its place."""
-    middle = Pictures(NOMINAL, _REACH_NM)
+    middle = nominal()
 
     def draw(place: Place, rng: np.random.Generator) -> Array:
         del rng
@@ -109,12 +117,12 @@ def of_optics(optics: Optics, illumination_na: float = 0.0) -> Draw:
 def of_foci(*foci_nm: float) -> Draw:
     """Draw a particle at several foci."""
     every = [Pictures(replace(NOMINAL, focus_nm=focus), _REACH_NM) for focus in foci_nm]
-    nominal = Pictures(NOMINAL, _REACH_NM).per_kda
+    per_kda = nominal().per_kda
 
     def draw(place: Place, rng: np.random.Generator) -> Array:
         del rng
         return np.array(
-            [p.contrast(*place.away(), place.mass_kda * nominal / p.per_kda) for p in every]
+            [p.contrast(*place.away(), place.mass_kda * per_kda / p.per_kda) for p in every]
         )
 
     return draw
@@ -122,7 +130,7 @@ def of_foci(*foci_nm: float) -> Draw:
 
 def of_heights(low_nm: float, high_nm: float) -> Draw:
     """Draw particles that are anywhere between two heights."""
-    pictures = Pictures(NOMINAL, _REACH_NM)
+    pictures = nominal()
 
     def draw(place: Place, rng: np.random.Generator) -> Array:
         at = pictures.at_height(rng.uniform(low_nm, high_nm))
@@ -133,7 +141,7 @@ def of_heights(low_nm: float, high_nm: float) -> Draw:
 
 def of_halves(apart_nm: float) -> Draw:
     """Draw particles of two halves, which lie in any direction."""
-    pictures = Pictures(NOMINAL, _REACH_NM)
+    pictures = nominal()
 
     def draw(place: Place, rng: np.random.Generator) -> Array:
         angle = rng.uniform(0, 2 * np.pi)
@@ -149,7 +157,7 @@ def of_places(offsets_nm: Array) -> Draw:
 
     Shapes: `offsets_nm` (places, 2).
     """
-    pictures = Pictures(NOMINAL, _REACH_NM)
+    pictures = nominal()
     return lambda place, _: np.array(
         [pictures.contrast(*place.away(*at), place.mass_kda) for at in offsets_nm.tolist()]
     )
@@ -164,7 +172,7 @@ def box(rms_nm: float, side: int = 5) -> Array:
 
 def vesicle(place: Place, diameter_nm: float, rng: np.random.Generator) -> Array:
     """Draw a shell of many dipoles that touches the glass."""
-    pictures, count = Pictures(NOMINAL, _REACH_NM), 24
+    pictures, count = nominal(), 24
     z = np.linspace(-1 + 1 / count, 1 - 1 / count, count)
     turn = np.pi * (3 - np.sqrt(5)) * np.arange(count) + rng.uniform(0, 2 * np.pi)
     x, y = np.sqrt(1 - z**2) * np.array([np.cos(turn), np.sin(turn)]) * diameter_nm / 2
@@ -272,13 +280,13 @@ def film(
     counts = np.empty(shape)
     for t in range(frames):
         part = t / frames
-        light = still * shift(mobile, (0.0, moved_px * part), order=3, mode="nearest")
+        light = still * (shift(mobile, (0.0, moved_px * part), mode="nearest") if moved_px else 1)
         light = LEVEL_E * light[inner]
         for first, pictures, weights in seen:
             if t >= first:
                 light = light * (1 + np.einsum("j,jyx->yx", weights[t - first], pictures))
         if drift_px:
-            light = shift(light, (drift_px * part / 2, drift_px * part), order=3, mode="nearest")
+            light = shift(light, (drift_px * part / 2, drift_px * part), mode="nearest")
         light = light * (1 + power_noise * rng.standard_normal())
         electrons = light + np.sqrt(light) * rng.standard_normal((rows, columns))
         counts[t] = (record or camera())(electrons)

@@ -29,6 +29,7 @@ from _hazard_movies import (
     breathing,
     film,
     landings,
+    nominal,
     of_foci,
     of_halves,
     of_heights,
@@ -49,7 +50,7 @@ FRAME_MS = 1e3 / 331.0
 
 def recorded(standards: Instrument = NOMINAL, relative: float = LINE_SE) -> dict[str, Any]:
     """Give a calibration whose standards were measured with a microscope."""
-    sign = Pictures(standards).sign
+    sign = nominal().sign if standards == NOMINAL else Pictures(standards).sign
     return {
         "calibration.gradient_per_kda": sign * PEAK_PER_KDA,
         "calibration.gradient_se_per_kda": relative * PEAK_PER_KDA,
@@ -64,7 +65,7 @@ def recorded(standards: Instrument = NOMINAL, relative: float = LINE_SE) -> dict
 
 def unrecorded() -> dict[str, Any]:
     """Give a gradient from elsewhere: nobody says with what optics it was measured."""
-    return {"calibration.gradient_per_kda": Pictures(NOMINAL).sign * PEAK_PER_KDA}
+    return {"calibration.gradient_per_kda": nominal().sign * PEAK_PER_KDA}
 
 
 def case(counts: Any, truth: Landings, others: Landings | None = None, **settings: Any) -> Case:
