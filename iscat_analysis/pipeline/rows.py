@@ -72,7 +72,8 @@ def reported_rows(
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
     changing_light = ""
     if found.heading == "landing":
-        fits, changing_light = _with_changing(fits, evidence)
+        resolution_nm = config.optics.wavelength_nm / config.optics.na
+        fits, changing_light = _with_changing(fits, evidence, resolution_nm)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -103,9 +104,11 @@ def reported_rows(
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
+def _with_changing(
+    fits: pd.DataFrame, evidence: Evidence | None, resolution_nm: float
+) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
-    fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits))
+    fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits, resolution_nm))
     if evidence is None:
         return fits, ""
     unseen, frames = may_rise(fits, evidence)

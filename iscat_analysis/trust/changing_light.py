@@ -2,7 +2,8 @@
 
 The light of a particle that settles, bleaches or breathes changes repeatedly at its place, and each
 change is found as a step.  A second particle at exactly the same place is rare, and cannot be told
-from that.
+from that.  A particle that moves by a few nanometres, or wiggles, leaves a faint step beside it,
+within the distance that the microscope resolves.
 
 If particles take several frames to land, the rise of a faint one drowns in the noise of single
 frames.  It is then fitted as a step, and its mass is too small.  Bright ones show that this
@@ -25,6 +26,10 @@ SAME_NM = 150.0
 
 # Mass of a particle over that of a step, from which on the step may be a change of its light.
 _LEAST_MASS_RATIO = 3.0
+# Mass of a particle over that of a step beside it, from which on it may have moved: 20 nm change a
+# picture by a fifth.
+_LEAST_MASS_RATIO_BESIDE = 5.0
+_BESIDE = 0.61  # λ/NA within which that is
 # Ratio of masses up to which two steps close in time may be two halves of one landing.
 _MOST_MASS_RATIO = 3.0
 # Expected gain in log-likelihood of a rise over a step, from which on rises are always seen.
@@ -35,11 +40,12 @@ _LEAST_SHARE_CONTINUING = 0.1
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
-def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
+def at_a_shared_place(table: pd.DataFrame, resolution_nm: float = 0.0) -> BoolArray:
     """Flag steps that may be changes of the light of a particle that is there already.
 
-    These are steps much smaller than that particle.  Of two steps of the same sign, mass and place
-    within one window, both are flagged.
+    These are steps much smaller than that particle, at its place or, smaller still, beside it.  Of
+    two steps of the same sign, mass and place within one window, both are flagged.  A resolution
+    is λ/NA.
 
     Shapes: result (rows,).
     """
@@ -53,16 +59,24 @@ def at_a_shared_place(table: pd.DataFrame) -> BoolArray:
     mass, frame = table["mass_kda"].to_numpy(float)[real], table["frame"].to_numpy(float)[real]
     error = table["sigma_mass_kda"].to_numpy(float)[real]
     window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[real]
-    for i, j in scipy.spatial.cKDTree(place).query_pairs(SAME_NM):
+    farthest = max(SAME_NM, _BESIDE * resolution_nm)
+    for i, j in scipy.spatial.cKDTree(place).query_pairs(farthest):
         if abs(mass[i]) < abs(mass[j]):
             i, j = j, i  # i is the larger
         apart = abs(frame[i] - frame[j])
         near = apart < max(window[i], window[j])
         there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
         gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
-        if (there or near) and not gone and abs(mass[i]) > _LEAST_MASS_RATIO * abs(mass[j]):
+        same = math.dist(place[i], place[j]) < SAME_NM
+        least = _LEAST_MASS_RATIO if same else _LEAST_MASS_RATIO_BESIDE
+        if (there or near) and not gone and abs(mass[i]) > least * abs(mass[j]):
             flagged[real[j]] = True
-        elif near and mass[i] * mass[j] > 0 and abs(mass[i]) <= _MOST_MASS_RATIO * abs(mass[j]):
+        elif (
+            same
+            and near
+            and mass[i] * mass[j] > 0
+            and abs(mass[i]) <= _MOST_MASS_RATIO * abs(mass[j])
+        ):
             flagged[real[[i, j]]] = True
     return flagged
 

@@ -5,7 +5,9 @@ which is weak, since a wider picture is nearly a fainter one.  Their length, for
 at random: parts that are apart make pictures long, each its own way, and a covariance of places has
 a mean variance q at least as large as what one axis has beyond the other.  And time: particles that
 wiggle from frame to frame have positions that scatter from frame to frame by more than the noise of
-places without a particle, on the side of the step where they are.
+places without a particle, on the side of the step where they are.  What moves within a frame does
+not scatter from frame to frame.  Length and time thus say that there is a spread, and how large it
+is at least; how large it is, the width says.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import chdtrc, chdtri
+from scipy.special import chdtrc, chdtri, log_ndtr
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
@@ -43,6 +45,8 @@ class Extension:
     ----------
     variance_nm2, variance_se_nm2 : float
         Mean variance of places along each axis beyond what the model has, and its error [nm²].
+    is_common : bool
+        Whether all particles are extended.
     flagged : ndarray of bool
         Rows whose masses are too small because of it.
     mass_shift_kda : ndarray
@@ -51,6 +55,7 @@ class Extension:
 
     variance_nm2: float
     variance_se_nm2: float
+    is_common: bool
     flagged: BoolArray
     mass_shift_kda: FloatArray
 
@@ -71,29 +76,24 @@ class Extension:
             return None
         own = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         many = good & known
-        mean, error = math.nan, math.nan
+        mean, error, significance = math.nan, math.nan, 0.0
         shift = np.zeros(len(table))
         if many.sum() >= FEWEST:
-            mean, error = max(
-                (
-                    _mean(q[many], se[many]),
-                    _length(*(part[many] for part in evidence[7:10])),
-                    _wiggle(table[many], in_time, wiggle_nm),
-                ),
-                key=lambda found: found[0] / found[1],
-            )
-        if mean > _SYSTEMATIC_SIGMAS * error:
-            shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * mean
-        if mean > _SIGNIFICANT * error:
+            mean, error = _mean(q[many], se[many])
+            least = [
+                _length(*(part[many] for part in evidence[7:10])),
+                _wiggle(table[many], in_time, wiggle_nm),
+            ]
+            significance = max(size / sigma for size, sigma in [(mean, error), *least])
+            if significance > _SYSTEMATIC_SIGMAS:
+                clear = [size for size, sigma in least if size > _SYSTEMATIC_SIGMAS * sigma]
+                mean, error = _at_least(mean, error, max(clear, default=0.0))
+                shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * math.hypot(mean, error)
+        if significance > _SIGNIFICANT:
             own = own | (
                 known & (shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float))
             )
-        return cls(mean, error, own, shift)
-
-    @property
-    def is_common(self) -> bool:
-        """Whether all particles are extended."""
-        return bool(self.variance_nm2 > _SIGNIFICANT * self.variance_se_nm2)
+        return cls(mean, error, significance > _SIGNIFICANT, own, shift)
 
     @property
     def message(self) -> str:
@@ -131,6 +131,13 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     mean = float(np.average(q[kept], weights=weight))
     chi2_reduced = float(np.sum(weight * (q[kept] - mean) ** 2)) / max(int(kept.sum()) - 1, 1)
     return mean, math.sqrt(max(chi2_reduced, 1.0) / float(weight.sum()))
+
+
+def _at_least(mean: float, error: float, least: float) -> tuple[float, float]:
+    """Mean and standard deviation of a normal law that is cut off below."""
+    cut = (least - mean) / error
+    rise = math.exp(-(cut**2) / 2 - float(log_ndtr(-cut))) / math.sqrt(2 * math.pi)
+    return mean + error * rise, error * math.sqrt(max(1 + cut * rise - rise**2, 0.0))
 
 
 def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[float, float]:

@@ -23,12 +23,13 @@ import pandas as pd
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import LENGTHS
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
 
 FEWEST = 6
 """Events without which nothing is said of fluctuations."""
 
-_SIGNIFICANT = 2.0  # standard errors of the variance beyond which it is there; 1 of 300 by chance
+_SIGNIFICANT = 3.0  # standard errors of the variance beyond which it is there; 1 of 300 by chance
+_AMONG_OTHERS = 2.0  # standard errors that the events have without the one that says most
 _LEAST_LENGTHS = 3
 _CORRELATIONS = np.geomspace(1.0, 300.0, 25)  # frames
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})
@@ -84,24 +85,11 @@ class Fluctuation:
         if lengths.size < _LEAST_LENGTHS:
             return None
         squares, counts, strength = squares[:, enough], counts[:, enough], strength[good]
-        total = counts.sum(axis=0)
-        excess = squares.sum(axis=0) / total - _without(pooled, lengths, float(np.median(there)))
-        left = squares - counts * (squares.sum(axis=0) / total)
-        chi2 = 2 * (squares.sum(axis=0) / total) ** 2 / total
-        error2 = np.maximum(np.sum(left**2, axis=0) / total**2, chi2)
-        expected = (strength @ counts) / total * lengths
-        best = (0.0, 0.0, 1.0, 1.0)  # gain, s², its error, τ
-        # what is slower than a window is a course, and not a fluctuation
-        for tau in _CORRELATIONS[np.median(there) >= _CORRELATIONS].tolist():
-            shape = expected * np.array([_difference(int(n), tau) for n in lengths])
-            known = float(np.sum(shape**2 / error2))
-            s2 = float(np.sum(shape * excess / error2)) / known
-            if s2 > 0 and s2**2 * known > best[0]:
-                best = s2**2 * known, s2, known**-0.5, tau
-        # blocks of different lengths share frames: their errors are not independent
-        s2, error, tau = best[1], best[2] * math.sqrt(2), best[3]
-        if s2 <= _SIGNIFICANT * error:
+        level = _without(pooled, lengths, float(np.median(there)))
+        best = _Search(squares, counts, strength, lengths, level, float(np.median(there))).best()
+        if best is None:
             return None
+        s2, error, tau = best
         remains = np.array([_of_mean(int(n), tau) for n in there])
         added = np.nan_to_num(mass**2 * s2 * remains)
         return cls(math.sqrt(s2), error / (2 * math.sqrt(s2)), tau, added)
@@ -121,6 +109,59 @@ class Fluctuation:
         return {
             "relative": self.relative, "relative_se": self.relative_se, "frames": self.frames,
         }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Squares between blocks of all events, and the search for s² and τ in them.
+
+    Events count as their strength, which is best for a small s².  Whether it is there is judged by
+    its error if particles do not fluctuate, about which squares are χ²; how large it is, by the
+    scatter between events.
+
+    Shapes: `squares, counts` (events, lengths), `strength` (events,), `lengths, level` (lengths,).
+    """
+
+    squares: FloatArray
+    counts: FloatArray
+    strength: FloatArray
+    lengths: FloatArray
+    level: FloatArray
+    window: float
+
+    def best(self) -> tuple[float, float, float] | None:
+        """s², its error and τ; None where it is not seen, or in one event only."""
+        every = np.ones(self.strength.size, dtype=bool)
+        s2, error, _ = self._of(every, steady=True)
+        if s2 <= _SIGNIFICANT * error:
+            return None
+        beyond = self.strength * (self.squares - self.counts * self.level).sum(axis=1)
+        every[np.argmax(beyond)] = False
+        s2, error, _ = self._of(every, steady=True)
+        if s2 <= _AMONG_OTHERS * error:
+            return None
+        found = self._of(np.ones_like(every), steady=False)
+        return found if found[0] > 0 else None
+
+    def _of(self, used: BoolArray, *, steady: bool) -> tuple[float, float, float]:
+        weight, counts = self.strength[used, None], self.counts[used]
+        information = np.sum(weight**2 * counts, axis=0)
+        beyond = self.squares[used] - counts * self.level
+        excess = np.sum(weight * beyond, axis=0) / information
+        error2 = 2 * self.level**2 / information
+        if not steady:
+            left = weight * (beyond - counts * weight * excess)
+            error2 = np.maximum(error2, np.sum(left**2, axis=0) / information**2)
+        best = (0.0, 0.0, 1.0, 1.0)  # gain, s², its error, τ
+        # what is slower than a window is a course, and not a fluctuation
+        for tau in _CORRELATIONS[self.window >= _CORRELATIONS].tolist():
+            shape = self.lengths * np.array([_difference(int(n), tau) for n in self.lengths])
+            known = float(np.sum(shape**2 / error2))
+            s2 = float(np.sum(shape * excess / error2)) / known
+            if s2 > 0 and s2**2 * known > best[0]:
+                best = s2**2 * known, s2, known**-0.5, tau
+        # blocks of different lengths share frames: their errors are not independent
+        return best[1], best[2] * math.sqrt(2), best[3]
 
 
 def _without(pooled: EmpiricalSpread, lengths: FloatArray, window: float) -> FloatArray:
