@@ -76,6 +76,7 @@ class EquilibriumFit:
     landing_power: float
     landing_power_se: float
     masses_kda: FloatArray
+    detected: FloatArray
     width_kda: float
     tail_kda: float
     limit_kda: float
@@ -131,6 +132,7 @@ def fit_equilibrium(
         landing_power=constants["power"] if power is None else power,
         landing_power_se=constant_errors.get("power", 0.0),
         masses_kda=series.modes(full),
+        detected=series.detected(full),
         width_kda=math.sqrt(float(shared.variance[0])),
         tail_kda=shared.tail,
         limit_kda=shared.limit[0],
