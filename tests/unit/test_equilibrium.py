@@ -195,7 +195,7 @@ def test_a_monomer_that_is_hardly_detected_gives_no_kd() -> None:
     totals = DIMER.to_numpy(float)
     tables = draw_series(np.random.default_rng(12), "dimer", totals, 10.0, [40.0], number=1000)
     seen = [table[table["mass_kda"] > 65][["mass_kda"]].head(200) for table in tables]
-    with pytest.raises(ia.DataError, match="of the species of about .* K_D is not determined"):
+    with pytest.raises(ia.DataError, match=r"of the species of about .* K_D is not determined"):
         ia.fit_kd(DIMER, tables=seen, model="dimer", masses_kda=[40.0])
 
 
