@@ -11,9 +11,8 @@ from typing import Any, get_args
 
 import numpy as np
 import pandas as pd
-from scipy.ndimage import gaussian_filter1d
-from scipy.signal import find_peaks, peak_prominences
 
+from iscat_analysis.answers.monomer import monomer_of
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
 from iscat_analysis.movie.text_tables import refuse_twice, separator, without_remarks
@@ -25,6 +24,7 @@ from iscat_analysis.report.style import publish
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS
+from iscat_analysis.species.describe import LEAST_EFFICIENCY
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import Model, landing_logits
@@ -43,13 +43,8 @@ CONCENTRATIONS: dict[Model, tuple[str, ...]] = {
 
 _WRONG = 0.01  # p-value below which the model is doubted
 _FAR = 3.0  # standard errors of a table that is named
+_OTHER_MASS = 0.15  # of a mass that was given: farther away is another species
 _POINTS = 200  # of the curve
-_POSSIBLE_PEAKS = (0.0, 11.5)  # ln of masses in kDa
-_PEAK_POINTS = 2000
-_SMOOTHING = 0.07  # of ln m: a third of what keeps peaks at m and 2 m apart
-_LEAST_PEAK = 0.05  # prominence of a peak, over the height of the highest
-_CLEAR_PEAK = 4.0  # the same in standard errors
-_NEAR_TWICE = 0.16  # of ln m: the lighter peak is shifted where much of it is missed
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +165,8 @@ def fit_kd(
     ConfigError
         Options are impossible.
     DataError
-        Samples or tables cannot be read, hold too little, or `out` may not be written.
+        Samples or tables cannot be read, hold too little, or hardly any of the lightest species is
+        detected; or `out` may not be written.
 
     Examples
     --------
@@ -238,7 +234,7 @@ def fit_kd(
             )
     masses: tuple[float, ...]
     if masses_kda is None:
-        monomer, taken = _monomer(found)
+        monomer, taken = monomer_of(found)
         masses = (monomer,)
         notes.append(taken)
     else:
@@ -249,12 +245,20 @@ def fit_kd(
         [_to_fit(table) for table in found], totals, model=model, masses_kda=masses,
         power=landing_power, inactive=inactive,
     )  # fmt: skip
+    lightest = int(np.argmin(fit.masses_kda))
+    if fit.detected[lightest] < LEAST_EFFICIENCY:
+        raise DataError(
+            f"{name}: of the species of about {fit.masses_kda[lightest]:.3g} kDa only "
+            f"{100 * fit.detected[lightest]:.2g} % are detected (half are at {fit.limit_kda:.3g} "
+            "kDa), so that K_D is not determined; a lower threshold of detection would tell, or "
+            "`limit_kda` if it is known"
+        )
     result = Binding(
         model,
         fit,
         _laid_out(rows, found, fit),
         _curve(totals, fit, model),
-        (*notes, *_notes(found, fit, totals, inactive=inactive)),
+        (*notes, *_notes(found, fit, totals, masses, inactive=inactive)),
     )
     if notify is not None:
         for note in result.notes:
@@ -395,46 +399,6 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
 _MOVIES = (".tif", ".tiff", ".mp")
 
 
-def _monomer(tables: Sequence[EventTable]) -> tuple[float, str]:
-    """Find the monomer in the events of all tables, and say what was taken.
-
-    Every table counts alike.  Two peaks of the density of ln m, one at about twice the other, are
-    monomers and dimers; of several such pairs the one with most events is taken.
-    """
-    points = np.linspace(*_POSSIBLE_PEAKS, _PEAK_POINTS)
-    step = points[1] - points[0]
-    edges = np.append(points - step / 2, points[-1] + step / 2)
-    logs = [np.log(np.abs(table.mass_kda)) for table in tables]
-    shares = [np.histogram(one, edges)[0] / one.size for one in logs]
-    density = gaussian_filter1d(np.mean(shares, axis=0), _SMOOTHING / step)
-    events = sum(one.size for one in logs)
-    # A peak of few events is noise: those under its kernel have the error of counts.
-    noise = np.sqrt(density * step / (2 * math.sqrt(math.pi) * _SMOOTHING) / events)
-    found = find_peaks(density)[0]
-    prominent = peak_prominences(density, found)[0]
-    clear = (prominent > _LEAST_PEAK * density.max()) & (prominent > _CLEAR_PEAK * noise[found])
-    masses, heights = np.exp(points[found[clear]]), density[found[clear]]
-    pairs = [
-        (heights[one] + heights[two], one, two)
-        for one in range(masses.size)
-        for two in range(one + 1, masses.size)
-        if abs(math.log(masses[two] / (2 * masses[one]))) < _NEAR_TWICE
-    ]
-    if not pairs:
-        seen = ", ".join(f"{mass:.3g}" for mass in masses) or "none"
-        raise DataError(
-            f"{tables[0].name}: which peak of the series is the monomer cannot be told: none lies "
-            f"at twice the mass of another (peaks at {seen} kDa); give `masses_kda`"
-        )
-    _, one, two = max(pairs)
-    # The dimer's peak is whole where that of the monomer may be cut by what is missed.
-    monomer = float(masses[two]) / 2
-    return monomer, (
-        f"the monomer was taken for the peak at {masses[one]:.3g} kDa, its dimer for that at "
-        f"{masses[two]:.3g} kDa; `masses_kda` names another"
-    )
-
-
 def _to_fit(table: EventTable) -> Events:
     """Select a table's events; without a limit of detection, it is fitted too."""
     return replace(table.events, efficiency=None) if table.edge_kda is not None else table.events
@@ -467,9 +431,21 @@ def _curve(totals: FloatArray, fit: EquilibriumFit, model: Model) -> pd.DataFram
 
 
 def _notes(
-    tables: Sequence[EventTable], fit: EquilibriumFit, totals: FloatArray, *, inactive: bool
+    tables: Sequence[EventTable],
+    fit: EquilibriumFit,
+    totals: FloatArray,
+    masses_kda: Sequence[float],
+    *,
+    inactive: bool,
 ) -> tuple[str, ...]:
     notes = list(dict.fromkeys(note for table in tables for note in table.notes))
+    for given, fitted in zip(masses_kda, fit.masses_kda, strict=False):
+        if abs(fitted / given - 1) > _OTHER_MASS:
+            notes.append(
+                f"no species of {given:.3g} kDa was found, but one of {fitted:.3g}: K_D is wrong "
+                "where that is another species, as the dimer of a monomer that is missed; look at "
+                "`masses_kda`"
+            )
     if fit.p_value < _WRONG:
         far = [t.name for t, pull in zip(tables, fit.pull, strict=True) if abs(pull) > _FAR]
         named = f" (farthest: {', '.join(far[:3])})" if far else ""

@@ -164,6 +164,8 @@ def find_species(
         scale_error=table.scale_error,
         window_frames=table.window_frames,
         choice=choice,
+        limit_known=table.edge_kda is None,
+        errors_known=table.errors_known,
     )
     if found.events < LEAST_EVENTS:
         kind = "event" if branch == "magnitude" else f"{branch} event"

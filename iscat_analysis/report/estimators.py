@@ -14,10 +14,11 @@ import numpy as np
 from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
 
 from iscat_analysis.report.numbers import LABELS, UNITS, number, percent
 from iscat_analysis.report.page import render_page
-from iscat_analysis.report.style import BLUE, INK, log_y, new_figure, publish
+from iscat_analysis.report.style import BLUE, GREY, INK, log_y, new_figure, publish
 
 CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib", "figures"})
 """Everything the score of a challenge leaves in its folder."""
@@ -30,7 +31,7 @@ _AXES = {
     "mass": ("mass [kDa]", True),
     "height": ("height [nm]", False),
     "focus": ("focus [nm]", False),
-    "neighbour": ("distance of a neighbour [nm]", False),
+    "density": ("other particles per µm²", True),
     "wrong_focus": ("error of the focus that estimators are told [nm]", False),
 }
 
@@ -113,7 +114,39 @@ def contest_sections(study: Mapping[str, Any], drawn: Mapping[str, Markup]) -> l
             "tables": [_best_table(curves)],
         }
     )
+    if "estimators_map" in drawn:
+        sections.append(_map_section(study["estimator_map"], drawn["estimators_map"]))
     return sections
+
+
+def _map_section(found: Mapping[str, Any], svg: Markup) -> dict[str, Any]:
+    """Say who is best where, in a map and with all who are as good in a table."""
+    rows = [
+        [LABELS[p], number(height), number(photons), *_cell(found["parameters"][p], r, c)]
+        for p in LABELS if p in found["parameters"]
+        for r, height in enumerate(found["height_nm"])
+        for c, photons in enumerate(found["photons"])
+    ]  # fmt: skip
+    columns = ["parameter", _numeric("height [nm]"), _numeric("photons"), "best",
+               _numeric("information kept"), "as good"]  # fmt: skip
+    return {
+        "id": "estimators-map",
+        "title": f"Who is best where, mode {found['mode']}",
+        "charts": [
+            {"id": "estimators-map-chart", "title": "Best estimator by light and height",
+             "wide": True, "svg": svg,
+             "caption": "Numbers are the information that the best one keeps, of "
+             f"{found['trials']} particles each; + where another is as good, by the interval of "
+             "the ratio of mean square errors on the same counts."},
+        ],
+        "tables": [{"caption": "The same, with all that are as good", "columns": columns,
+                    "rows": rows}],
+    }  # fmt: skip
+
+
+def _cell(table: Mapping[str, Any], row: int, column: int) -> list[Any]:
+    best, kept, equal = (table[key][row][column] for key in ("best", "kept", "equal"))
+    return [best or "—", number(kept, 2), ", ".join(equal or ()) or "—"]
 
 
 def contest_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
@@ -122,6 +155,8 @@ def contest_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     for axis in _AXES:
         if axis in curves:
             yield f"estimators_{axis}", _curve_figure(axis, curves[axis])
+    if study["estimator_map"]["parameters"]:
+        yield "estimators_map", _map_figure(study["estimator_map"], list(study["estimators"]))
     if study["detection"]["mass_kda"] and study["detection"]["estimators"]:
         yield "estimators_recall", _recall_figure(study["detection"])
 
@@ -331,6 +366,42 @@ def _curve_figure(axis: str, curve: Mapping[str, Any]) -> Figure:
         if not place:
             axes.set_ylabel("root mean square error")
     _legend(figure)
+    return figure
+
+
+def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
+    """Draw who is best at each height and light: a colour and a letter for each estimator."""
+    tables = {p: found["parameters"][p] for p in LABELS if p in found["parameters"]}
+    winners = {who for table in tables.values() for row in table["best"] for who in row if who}
+    letters = {who: chr(ord("A") + k) for k, who in enumerate(w for w in names if w in winners)}
+    colours = {who: _COLOURS[names.index(who) % len(_COLOURS)] for who in letters}
+    figure = new_figure(1.1 + 2.4 * len(tables), 3.6)
+    every = figure.subplots(1, len(tables), squeeze=False)[0]
+    for place, (axes, (name, table)) in enumerate(zip(every, tables.items(), strict=True)):
+        for row, column in np.ndindex(len(found["height_nm"]), len(found["photons"])):
+            best, kept, equal = (table[key][row][column] for key in ("best", "kept", "equal"))
+            colour = colours.get(best, GREY)
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, alpha=0.45,
+                                     edgecolor="white", linewidth=1.5))  # fmt: skip
+            text = f"{letters[best]} {number(kept, 2)}{'+' if equal else ''}" if best else "—"
+            axes.text(column, row, text, ha="center", va="center", fontsize=7.5, color=INK)
+        axes.set_xlim(-0.5, len(found["photons"]) - 0.5)
+        axes.set_ylim(-0.5, len(found["height_nm"]) - 0.5)
+        axes.set_xticks(range(len(found["photons"])), [f"{v:g}" for v in found["photons"]])
+        axes.set_yticks(range(len(found["height_nm"])), [f"{v:.0f}" for v in found["height_nm"]])
+        axes.tick_params(length=0)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        axes.set_title(LABELS[name])
+        axes.set_xlabel("collected photons")
+        if not place:
+            axes.set_ylabel("height [nm]")
+    patches = [
+        Patch(facecolor=colours[who], alpha=0.45, label=f"{letter} {who}")
+        for who, letter in letters.items()
+    ]
+    figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 5) or 1,
+                  fontsize=8)  # fmt: skip
     return figure
 
 

@@ -362,7 +362,8 @@ class Distribution(Document):
         "as the window, and half of those that stay stay_frames are found; count is of the events "
         "found, count_corrected and fraction are of the particles that landed; an outlier has "
         "fewer than three events, and no fraction; a species that is detected less than once in "
-        "20 times is not determined, and count_corrected, fraction and interval are null"
+        "20 times, or may be a flank of a lighter one, is not determined, and count_corrected, "
+        "fraction and interval are null"
     )
     selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")
     support: Number = key("Share of simulated repetitions in which BIC chose the same number")

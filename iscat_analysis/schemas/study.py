@@ -157,6 +157,9 @@ class Benchmark(Document):
     ranking: list[Ranked] = maybe("With --estimator: best first")
     paired: dict[str, Any] = maybe("Ratios of mean square errors on the same counts, by mode")
     estimator_curves: dict[str, Any] = maybe("Errors of estimators against all that was varied")
+    estimator_map: dict[str, Any] = maybe(
+        "Who keeps most of the information, and who is as good, by height (rows) and photons"
+    )
     detection: dict[str, Any] = maybe("Recall of estimators against mass")
     curves: dict[str, Any] = maybe("Spread and bounds against photons and against height")
     histograms: dict[str, Any] = maybe("Pulls, and ranks of posteriors")

@@ -34,6 +34,11 @@ LEAST_EFFICIENCY = 0.05
 """Of a species that is detected less often it is not determined how many particles came, nor, where
 it is free, what they weigh."""
 
+LEAST_WIDTH = 0.8
+"""Where nobody knows what is detected, and the lightest species is narrower than this part of a
+whole peak, it may be a flank of a lighter one: the product of that peak and of a detector that
+rises over as much as one width is a peak of 0.7 widths."""
+
 LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
@@ -50,15 +55,16 @@ the error of the mass scale, 0 where none is known, and the interval of the mass
 other one is found (NaN where the window is not known, or where it is too short for that).
 Intervals are 95 %, `fraction` and `count_corrected` are of the
 particles that came, the other counts of those that were seen; `outlier` where these are fewer than
-`LEAST_SPECIES`.  A species of less `efficiency` than `LEAST_EFFICIENCY` is not determined: the mass
-is where its events lie at the lowest, without error or interval, and what came of it is NaN, as is
-its fraction; those of the others are among the others."""
+`LEAST_SPECIES`.  A species of less `efficiency` than `LEAST_EFFICIENCY`, or that may be a flank of
+a lighter one, is not determined: the mass is where its events lie, without error or interval, and
+what came of it is NaN, as is its fraction; those of the others are among the others."""
 
 _TWO_SIDED_95 = 1.959964
 _INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
 _MOST_RELATIVE_WIDTH = 0.4  # width over mass
 _NO_LADDER = 0.01  # p-value
+_CLEAR_OF_EDGE = 5.0  # widths of a peak, whose lightest of 1000 events lies 3.2 below it
 _DIGITS = 6  # of the curves in summary.json
 
 
@@ -146,8 +152,13 @@ def describe(
     scale_error: Callable[[FloatArray], FloatArray] | None = None,
     window_frames: int | None = None,
     choice: Choice | None = None,
+    limit_known: bool = True,
+    errors_known: bool = True,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
+
+    Without `limit_known` the efficiency is a guess, from the lightest event; without `errors_known`
+    the sigmas stand for errors that nobody knows.
 
     Notes
     -----
@@ -189,7 +200,10 @@ def describe(
         searched=found.searched,
     )  # fmt: skip
     scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
-    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames)
+    flank = np.zeros(best.mean.shape, dtype=bool)
+    if not limit_known and found.structure is None:
+        flank = _flanks(events, best, errors_known=errors_known)
+    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, flank)
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
     fits, bic = found.tried, [fit.bic(events.x.size) for fit in found.tried]
     bandwidth = bandwidth_of(events, len(species))
@@ -211,7 +225,12 @@ def describe(
         branch=branch,
         draws=draws,
         seed=seed,
-        notes=(*notes, *_remarks(species), *_brief(species, window_frames), *_doubts(ladder)),
+        notes=(
+            *notes,
+            *_remarks(species, flank),
+            *_brief(species, window_frames),
+            *_doubts(ladder),
+        ),
         ladder=ladder,
     )
 
@@ -223,6 +242,7 @@ def _table(
     lands: BoolArray,
     scale: FloatArray,
     window_frames: int | None,
+    flank: BoolArray,
 ) -> pd.DataFrame:
     """Lay out the species, with intervals from the repetitions and from the mass scale."""
     best = found.best
@@ -231,10 +251,10 @@ def _table(
     seen = share.sum(axis=0)
     outlier = seen < LEAST_SPECIES - 0.5
     efficiency = best.chance(events).mean(axis=0)
-    undetectable = efficiency < LEAST_EFFICIENCY
-    undetectable[known:] = False
+    undetermined = (efficiency < LEAST_EFFICIENCY) | flank
+    undetermined[known:] = False
     some = np.arange(best.weight.size) < known
-    some &= ~undetectable
+    some &= ~undetermined
     some &= ~outlier | outlier[some].all()
 
     def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
@@ -281,12 +301,42 @@ def _table(
     unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
     if found.structure is None:
         unknown += ["mass_se", "mass_low", "mass_high"]
-    table.loc[undetectable, unknown] = math.nan
+    table.loc[undetermined, unknown] = math.nan
     if found.structure is not None:
         table["background"] = np.arange(best.weight.size) >= known
     if found.steps:
         table.insert(0, "n", [*found.steps, *[0] * (best.weight.size - known)])
     return table
+
+
+def _flanks(events: Events, best: Mixture, *, errors_known: bool) -> BoolArray:
+    """Tell which species may be what is seen of lighter ones: the lightest, and narrow.
+
+    A whole peak is as wide as the errors of its events, or as most of the heavier species where
+    these errors are unknown.  With neither, nobody can tell.  One that begins far above the
+    lightest event is no flank: what is lighter was detected.
+
+    Shapes: result (k,).
+    """
+    share = best.shares(events)
+    seen = share.sum(axis=0)
+    middle = (events.x @ share) / seen
+    width = np.sqrt(np.sum(share * (events.x[:, np.newaxis] - middle) ** 2, axis=0) / seen)
+    near_edge = middle - events.x.min() < _CLEAR_OF_EDGE * width
+    found = np.zeros(best.mean.shape, dtype=bool)
+    species = np.flatnonzero(seen >= LEAST_SPECIES - 0.5)
+    for place, one in enumerate(species):
+        heavier = width[species[place + 1 :]]
+        if errors_known:
+            whole = float(np.median(events.sigma))
+        elif heavier.size:
+            whole = float(np.median(heavier))
+        else:
+            whole = math.inf if species.size == 1 else 0.0
+        found[one] = near_edge[one] and width[one] < LEAST_WIDTH * whole
+        if not found[one]:
+            break
+    return found
 
 
 def _fractions(weight: FloatArray, some: BoolArray) -> FloatArray:
@@ -344,19 +394,27 @@ def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
-def _remarks(species: pd.DataFrame) -> list[str]:
+def _remarks(species: pd.DataFrame, flank: BoolArray) -> list[str]:
     """List reasons to doubt single species."""
     if "background" in species:
+        flank = flank[~species["background"]]
         species = species[~species["background"]]
-    undetectable = species["efficiency"] < LEAST_EFFICIENCY
+    undetectable = (species["efficiency"] < LEAST_EFFICIENCY) & ~flank
     cases = (
+        (
+            pd.Series(flank, index=species.index),
+            "what lies at {} kDa may be all that is seen of a lighter species, for it is the only "
+            "peak, or narrower than a whole one: its mass and number are not determined, and "
+            "fractions are of the others; `limit_kda` says what is detected, or `above_kda` from "
+            "where on everything is",
+        ),
         (
             undetectable,
             f"of what lies at {{}} kDa or below fewer than {100 * LEAST_EFFICIENCY:g} % are "
             "detected: its mass and number are not determined, and fractions are of the others",
         ),
         (
-            (species["efficiency"] < 0.5) & ~undetectable,
+            (species["efficiency"] < 0.5) & ~undetectable & ~flank,
             "fewer than half of the particles of {} kDa are detected: their mass and number rest "
             "on the detection model",
         ),

@@ -34,6 +34,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import product
 
 import numpy as np
 from scipy.special import chdtrc
@@ -52,7 +53,7 @@ from iscat_analysis.species.maximum import Maximum, Problem, maximise
 from iscat_analysis.species.series import Series
 
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
-_GRID = 25
+_GRID, _POWERS = 25, 9  # of ln K_D and of the exponent: where a start is sought
 _SIGMAS = 1.959964
 _TURNED = 0.6  # of a peak's width: tails from which other maxima are sought
 _HIGHER = 1e-3  # of log-likelihood: another maximum than the one that was found
@@ -76,6 +77,7 @@ class EquilibriumFit:
     landing_power: float
     landing_power_se: float
     masses_kda: FloatArray
+    detected: FloatArray
     width_kda: float
     tail_kda: float
     limit_kda: float
@@ -131,6 +133,7 @@ def fit_equilibrium(
         landing_power=constants["power"] if power is None else power,
         landing_power_se=constant_errors.get("power", 0.0),
         masses_kda=series.modes(full),
+        detected=series.detected(full),
         width_kda=math.sqrt(float(shared.variance[0])),
         tail_kda=shared.tail,
         limit_kda=shared.limit[0],
@@ -249,14 +252,17 @@ class _Equilibrium:
         """Give maxima, the highest first, from what was found with free weights.
 
         A tail, the background's bends and a limit of detection can stand for each other: there may
-        be one maximum for tails of either sign.  Of K_D the start is the best of a grid.
+        be one maximum for tails of either sign.  Of the constants the start is the best of a grid:
+        where the equilibrium is another, a large K_D with an exponent far from the usual one is.
         """
-        logits = free.theta[self.at :]
-        grid = np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]
-        others = self.first[self.at + 1 :]
-        far = [np.sum(np.abs(self._logits(np.append(one, others)) - logits)) for one in grid]
-        theta = np.append(free.theta[: self.at], grid[int(np.argmin(far))])
-        found = [self.near(theta)]
+        logits, first = free.theta[self.at :], self.first[self.at :]
+        axes = [np.linspace(self.low[self.at], self.high[self.at], _GRID)[1:-1]]
+        if self.power is None:
+            axes.append(np.linspace(self.low[self.at + 1], self.high[self.at + 1], _POWERS)[1:-1])
+        starts = [np.append(one, first[len(axes) :]) for one in product(*axes)]
+        far = [np.sum(np.abs(self._logits(one) - logits)) for one in starts]
+        begin = np.append(free.theta[: self.at], starts[int(np.argmin(far))])
+        found = [maximise(self.problem(), begin)]
         for tail in (-_TURNED, _TURNED):
             turned = self.series.turned(found[0].theta, tail * self.series.width)
             found.append(maximise(self.problem(), turned))
@@ -299,7 +305,8 @@ def _interval(
 ) -> tuple[tuple[float, float, FloatArray], Maximum]:
     """Give the interval of K_D with points of the profile of ln K_D, and its highest point.
 
-    The profile is followed from every maximum, and the highest counts.
+    The profile is followed from every maximum, and the highest counts.  Where two ways have met,
+    they go on as one.
     """
     at, found, problem = equilibrium.at, maxima[0], equilibrium.problem()
     best, least, most = float(found.theta[at]), float(problem.low[at]), float(problem.high[at])
@@ -311,12 +318,20 @@ def _interval(
 
     @cache
     def deviance(ln_kd: float) -> float:
+        climbed: list[tuple[float, Maximum, Maximum]] = []
         for branch in branches:
-            nearest = branch[min(branch, key=lambda place: abs(place - ln_kd))]
-            low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
-            low[at] = high[at] = start[at] = ln_kd
-            held = replace(problem, low=low, high=high)
-            branch[ln_kd] = maximise(held, start, nearest.curvature)
+            place = min(branch, key=lambda place: abs(place - ln_kd))
+            nearest = branch[place]
+            for other, begun, top in climbed:
+                if other == place and abs(begun.value - nearest.value) < _SAME:
+                    branch[ln_kd] = top
+                    break
+            else:
+                low, high, start = problem.low.copy(), problem.high.copy(), nearest.theta.copy()
+                low[at] = high[at] = start[at] = ln_kd
+                held = replace(problem, low=low, high=high)
+                branch[ln_kd] = maximise(held, start, nearest.curvature)
+                climbed.append((place, nearest, branch[ln_kd]))
         return 2 * max(found.value - max(branch[ln_kd].value for branch in branches), 0.0)
 
     first = _SIGMAS * float(found.errors()[at])

@@ -58,6 +58,7 @@ _SOFT, _SOFTNESS = 0.6, 0.3  # of a peak's width: spread of the limit of detecti
 # Of the lightest mass: where the limit may lie about the lower end of the events
 _LIMIT_SPREAD = 0.5
 _EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
+_ABOVE_RISE = 3.0  # of a peak's width: how far above that edge the limit may lie
 _NODES = 64
 _NOISE_KINDS = 8  # of noise, in each table
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
@@ -139,7 +140,7 @@ class Series:
             edge = np.concatenate([t.x for t in self.tables if t.learned])
             rise = float(np.quantile(edge, _EDGE_QUANTILE)) if edge.size else self.ends[0]
             low += [self.ends[0] - 3 * self.width, 0.25 * self.width]
-            high += [max(1.3 * lightest, rise + self.width), 1.6 * self.width]
+            high += [max(1.3 * lightest, rise + _ABOVE_RISE * self.width), 1.6 * self.width]
             start += [rise, _SOFT * self.width]
             scale += [self.width, self.width]
         self.shares = len(start)
@@ -283,6 +284,18 @@ class Series:
                 shift = float(scipy.optimize.brentq(excess, 0.0, tail))
             found[number] += math.copysign(shift, now.tail)
         return found
+
+    def detected(self, theta: FloatArray) -> FloatArray:
+        """Give the share of each species that the learned limit lets through; else 1.
+
+        Shapes: result (k,).
+        """
+        now = self.shared(theta)
+        if not self.learned:
+            return np.ones(self.kinds)
+        limit, spread = now.limit
+        reach = np.sqrt(now.variance + self.noise + spread**2)
+        return np.asarray(ndtr((now.mean + now.tail - limit) / reach))
 
     def logits(self, theta: FloatArray) -> FloatArray:
         """Give the logits of the species of each table, the first 0.

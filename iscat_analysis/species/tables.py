@@ -83,6 +83,8 @@ class EventTable:
     notes: tuple[str, ...] = ()
     edge_kda: float | None = None
     """The lightest event, where nothing but it tells what was missed."""
+    errors_known: bool = True
+    """Whether the errors are of the table or of the user, and not `UNKNOWN_SIGMA_KDA`."""
 
     @property
     def events(self) -> Events:
@@ -91,10 +93,7 @@ class EventTable:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Notes for the user, also where the lightest event stands for the limit of detection.
-
-        Notes for the user, with one where the lightest event stands for the limit of detection.
-        """
+        """Notes for the user, with one where the lightest event stands for the limit."""
         if self.edge_kda is None:
             return self.notes
         return (
@@ -321,9 +320,10 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
     if "tick" in good:  # the camera dropped frames, and time went on
         frame = _numbers(good, "tick", name)
     notes = []
+    errors_known = sigma_kda is not None or bool(np.isfinite(sigma[np.isfinite(mass)]).any())
     if sigma_kda is not None:
         sigma = np.full(mass.shape, sigma_kda)
-    elif not np.isfinite(sigma[np.isfinite(mass)]).any():
+    elif not errors_known:
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
         notes.append(
             f"{name}: its events have no errors of their own, so that the width of a species holds "
@@ -354,6 +354,7 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         window_frames=window or None,
         scale_error=shared_error(rows),
         notes=tuple(notes),
+        errors_known=errors_known,
     )
 
 

@@ -11,14 +11,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.study.setting import Setting
-from iscat_analysis.study.simple_estimators import REACH_PX, gaussian, gaussian_slopes
-
-_EVALUATIONS = 200
+from iscat_analysis.study.simple_estimators import around, fit_gaussian, half_width, highest
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ class Baselines:
         plain = cls(
             polarity=float(np.sign(image.flat[np.nanargmax(np.abs(image))])) or 1.0,
             sigma_nm=0.21 * optics.wavelength_nm / optics.na,
-            half_px=max(2, round(optics.wavelength_nm / optics.na / pixel)),
+            half_px=half_width(optics, pixel),
         )
         gauss, peak = plain._gauss(likelihood, start), plain._peak(likelihood, start)
         return cls(
@@ -65,42 +62,18 @@ class Baselines:
 
     def _gauss(self, likelihood: Likelihood, start: Candidate) -> FloatArray:
         """Fit amplitude, centre, width and offset; NaN where it does not converge."""
-        grid, image = likelihood.grid, likelihood.measured_signal()
-        column = round(start.x_px - grid.x_nm[0] / grid.pixel_nm)
-        row = round(start.y_px - grid.y_nm[0] / grid.pixel_nm)
-        across = slice(max(column - self.half_px, 0), column + self.half_px + 1)
-        down = slice(max(row - self.half_px, 0), row + self.half_px + 1)
-        x, y, cut = grid.x_nm[across], grid.y_nm[down], np.nan_to_num(image[down, across])
-        unit = float(np.max(np.abs(cut))) or 1.0
-        cut = cut / unit
-
-        def residual(p: FloatArray) -> FloatArray:
-            return (gaussian(x, y, p) - cut).ravel()
-
-        def jacobian(p: FloatArray) -> FloatArray:
-            return gaussian_slopes(x, y, p).reshape(-1, 5)
-
-        pixel = grid.pixel_nm
-        begin = np.array([
-            self.polarity * 0.8, start.x_px * pixel, start.y_px * pixel, self.sigma_nm, 0.0,
-        ])  # fmt: skip
-        found = least_squares(
-            residual, begin, jacobian, method="lm", x_scale=np.array([1, 100, 100, 100, 1.0]),
-            max_nfev=_EVALUATIONS,
-        )  # fmt: skip
-        if not found.success or not np.all(np.isfinite(found.x)):
-            return np.full(4, np.nan)
-        return np.array([found.x[1], found.x[2], math.nan, found.x[0] * unit])
+        grid, image = likelihood.grid, np.nan_to_num(likelihood.measured_signal())
+        pixel, origin = grid.pixel_nm, np.array([grid.x_nm[0], grid.y_nm[0]])
+        begin = np.array([start.x_px, start.y_px]) - origin / pixel
+        cut = around(image.shape, begin, self.half_px)
+        found = fit_gaussian(image[cut], cut, begin, self.sigma_nm / pixel, self.polarity)[0]
+        x, y = found[1:3] * pixel + origin
+        return np.array([x, y, math.nan, found[0]])
 
     def _peak(self, likelihood: Likelihood, start: Candidate) -> FloatArray:
-        grid, image = likelihood.grid, likelihood.measured_signal() * self.polarity
-        pixel = grid.pixel_nm
-        near = (
-            np.hypot(
-                grid.x_nm / pixel - start.x_px, (grid.y_nm / pixel - start.y_px)[:, None]
-            ) <= REACH_PX
-        )  # fmt: skip
-        image = np.where(near & np.isfinite(image), image, -math.inf)
-        row, column = np.unravel_index(np.argmax(image), image.shape)
-        height = self.polarity * float(image[row, column])
-        return np.array([grid.x_nm[column], grid.y_nm[row], math.nan, height])
+        grid = likelihood.grid
+        pixel, origin = grid.pixel_nm, np.array([grid.x_nm[0], grid.y_nm[0]])
+        begin = np.array([start.x_px, start.y_px]) - origin / pixel
+        found = highest(likelihood.measured_signal(), begin, self.polarity, refined=False)
+        x, y = found[:2] * pixel + origin
+        return np.array([x, y, math.nan, found[2]])

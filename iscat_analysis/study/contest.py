@@ -44,11 +44,14 @@ PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 SNRS = (1.5, 2.5, 3.5, 5.0, 8.0, 16.0)
 HEIGHTS = (0.1, 0.3, 0.5, 0.7, 0.9)
 FOCI_NM = (-400.0, -200.0, 0.0, 200.0, 400.0)
-DISTANCES = (0.75, 1.0, 1.5, 2.0)
+DENSITIES = (0.03, 0.1, 0.3, 1.0)
 WRONG_NM = (0.0, 50.0, 100.0, 200.0)
 """Points of the curves: photons collected, masses by the signal-to-noise ratio of the matched
-filter, heights as shares of ``fit.z_range_nm``, changes of the focus, a neighbour's distance in
-λ/NA, and error of the focus that estimators are told."""
+filter, heights as shares of ``fit.z_range_nm``, changes of the focus, other particles of the same
+mass per µm², and error of the focus that estimators are told."""
+
+MAP_PHOTONS = (100.0, 500.0, 2.5e3, 1.25e4)
+"""Photons collected, at each of the heights, of the map of who is best where."""
 
 CURVE_SHARE = 4
 LEAST_CURVE = 20
@@ -76,11 +79,12 @@ def draw(
     seed: int,
     stream: int,
     source: Setting | None = None,
-    neighbour_nm: float = 0.0,
+    density_um2: float = 0.0,
     empty: bool = False,
 ) -> Draws:
-    """Draw counts: of `source`, where estimators are told another microscope; with a neighbour."""
+    """Draw counts: of `source`, where estimators are told another microscope; among others."""
     true = source or setting
+    side_nm = true.pixels * true.context.pixel_nm
     bounds = true.bounds.crb_joint
     pixel = setting.context.pixel_nm
     most = [RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]]
@@ -99,10 +103,10 @@ def draw(
         start = setting.start(truths[i], random)
         starts[i] = start.x_px * pixel, start.y_px * pixel, start.z_nm, start.mass_kda
         frame = true.level_e() + (0.0 if empty else true.signal_e(truths[i]))
-        if neighbour_nm:
-            angle = random.uniform(0, 2 * math.pi)
-            aside = neighbour_nm * np.array([math.cos(angle), math.sin(angle), 0.0, 0.0])
-            frame = frame + true.signal_e(truths[i] + aside)
+        if density_um2:
+            for _ in range(random.poisson(density_um2 * (side_nm / 1000) ** 2)):
+                place = random.uniform(-0.5, true.pixels - 0.5, 2) * pixel
+                frame = frame + true.signal_e(np.array([*place, *truths[i, 2:]]))
         counts = true.windows(np.broadcast_to(frame, (true.pixels, true.pixels)), random)
         before.append(counts.before_e)
         after.append(counts.after_e)
@@ -158,7 +162,8 @@ def compare_estimators(
     tables = {m: draw(s, trials, seed=seed, stream=1000 + k)
               for k, (m, s) in enumerate(settings.items())}  # fmt: skip
     fewer = max(trials // CURVE_SHARE, LEAST_CURVE)
-    points = _points(config, settings[mode], fewer, seed)
+    points = [*_points(config, settings[mode], fewer, seed),
+              *_map_points(config, settings[mode], fewer, seed)]  # fmt: skip
     rate = max(config.bounds.false_alarm_probability, FALSE_ALARMS / max(trials, 2 * FALSE_ALARMS))
     empty = draw(settings["mass"], trials, seed=seed, stream=1900, empty=True)
     jobs = [*(d.job for d in tables.values()), *(d.job for _, _, d in points), empty.job]
@@ -180,6 +185,7 @@ def compare_estimators(
         out["paired"][m] = _paired(drawn, seen, out["estimators"], m, seed)
     named = {name: given[len(tables) :] for name, given in answers.items()}
     out["estimator_curves"] = {"mode": mode, "trials": fewer, **_curves(points, named, seed)}
+    out["estimator_map"] = {"mode": mode, "trials": fewer, **_map(points, named, seed)}
     out["detection"] = _detection(points, named, settings["mass"], rate, seed)
     return out
 
@@ -228,6 +234,9 @@ def _paired(
 
 
 Point = tuple[str, float, Draws]
+"""Axis, abscissa, counts; of the map the height, with all photons one after the other."""
+
+MAP = "map"
 
 
 def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Point]:
@@ -258,13 +267,71 @@ def _points(config: Config, setting: Setting, count: int, seed: int) -> list[Poi
     for change in FOCI_NM:
         if (one := _refocused(config, mode, change)) is not None:
             add("focus", optics.focus_nm + change, one)
-    for distance in DISTANCES:
-        aside = distance * optics.wavelength_nm / optics.na
-        add("neighbour", aside, setting, neighbour_nm=aside)
+    for density in DENSITIES:
+        add("density", density, setting, density_um2=density)
     for wrong in WRONG_NM:
         if (true := _refocused(config, mode, wrong)) is not None:
             add("wrong_focus", wrong, setting, source=replace(true, truth=setting.truth))
     return found
+
+
+def _map_points(config: Config, setting: Setting, count: int, seed: int) -> list[Point]:
+    """Draw what the map shows, row by row."""
+    low, high = config.fit.z_range_nm
+    found: list[Point] = []
+    for share in HEIGHTS:
+        z_nm = low + share * (high - low)
+        for photons in MAP_PHOTONS:
+            one = make_setting(
+                config, setting.mode, context=setting.context, collected=photons, z_nm=z_nm
+            )
+            drawn = draw(one, count, seed=seed, stream=1500 + len(found))
+            found.append((MAP, z_nm, drawn))
+    return found
+
+
+def _map(
+    points: Sequence[Point], answers: Mapping[str, Sequence[Answer]], seed: int
+) -> dict[str, Any]:
+    """Tell who keeps most of the information at each height and light, and who is as good.
+
+    As good are those whose mean square error on the same counts is not larger, by its interval.
+    """
+    cells = [(number, drawn) for number, (axis, _, drawn) in enumerate(points) if axis == MAP]
+    heights = [value for axis, value, _ in points if axis == MAP][:: len(MAP_PHOTONS)]
+    out: dict[str, Any] = {}
+    for place, (number, drawn) in enumerate(cells):
+        weights, count = resamples(len(drawn.truths), seed), len(drawn.truths)
+        row, column = divmod(place, len(MAP_PHOTONS))
+        scored = {
+            who: score_estimates(given[number].columns, drawn.truths, drawn.limits, weights)
+            for who, given in answers.items()
+        }
+        for i, name in enumerate(drawn.limits.free):
+            table = out.setdefault(
+                name, {key: [[None] * len(MAP_PHOTONS) for _ in heights] for key in _CELL}
+            )
+            kept = {
+                who: one[name]["efficiency_crb"] * one[name]["answered"] / count
+                for who, one in scored.items()
+                if math.isfinite(one.get(name, {}).get("efficiency_crb", math.nan))
+                and not one[name]["below_bound"]
+            }
+            if not kept:
+                continue
+            best = max(kept, key=lambda who: kept[who])
+            truth, crb = drawn.truths[:, PARAMETERS.index(name)], drawn.limits.crb[:, i]
+            errors = {who: answers[who][number].columns[name] - truth for who in kept}
+            equal = [
+                who for who in kept if who != best
+                and not paired(errors[who], errors[best], crb, weights)["mse_ratio_ci95"][0] > 1
+            ]  # fmt: skip
+            for key, value in zip(_CELL, (best, kept[best], equal), strict=True):
+                table[key][row][column] = value
+    return {"photons": list(MAP_PHOTONS), "height_nm": heights, "parameters": out}
+
+
+_CELL = ("best", "kept", "equal")
 
 
 def _refocused(config: Config, mode: str, change_nm: float) -> Setting | None:
@@ -282,6 +349,8 @@ def _curves(
     """Tabulate error and bounds along each axis, for every parameter and estimator."""
     out: dict[str, Any] = {}
     for number, (axis, value, drawn) in enumerate(points):
+        if axis == MAP:
+            continue
         curve = out.setdefault(axis, {"at": [], "bounds": {}, "estimators": {}})
         curve["at"].append(value)
         for i, name in enumerate(drawn.limits.free):

@@ -120,13 +120,13 @@ Estimate = Callable[[FloatArray, FloatArray, EstimatorSetup], Any]
 
 @dataclass(frozen=True)
 class Estimator:
-    """Where an estimator is found; `module` is what has to be installed for it, if anything."""
+    """Where an estimator is found; `module` is what `install` installs for it, if anything."""
 
     name: str
     target: str
     about: str = ""
     module: str = ""
-    extra: str = ""
+    install: str = ""
 
     @property
     def missing(self) -> str:
@@ -134,7 +134,7 @@ class Estimator:
         package = self.module.partition(".")[0]
         if not package or find_spec(package) is not None:
             return ""
-        return f'not installed: pip install "iscat-analysis[{self.extra}]"'
+        return f"not installed: pip install {self.install}"
 
     def load(self) -> Estimate:
         """Import the function."""
@@ -158,6 +158,9 @@ class Estimator:
 
 _OURS = "iscat_analysis.study.simple_estimators"
 _PEERS = "iscat_analysis.study.peer_estimators"
+_PICASSO = '"iscat-analysis[picasso]"'
+# Its requirements, which the fit does not use, contradict ours: pandas < 2.
+_PISCAT = "--no-deps piscat==1.1.4"
 
 BUILT_IN = (
     Estimator("iscat", f"{_OURS}:iscat", "this program's fit, in the mode that is studied"),
@@ -169,10 +172,10 @@ BUILT_IN = (
     Estimator("centroid", f"{_OURS}:centroid", "centre of mass of the contrast"),
     Estimator("peak", f"{_OURS}:peak", "highest pixel"),
     Estimator("picasso-gausslq", f"{_PEERS}:picasso_gausslq", "Picasso's Gaussian, least squares",
-              "picasso", "picasso"),
+              "picasso", _PICASSO),
     Estimator("picasso-gaussmle", f"{_PEERS}:picasso_gaussmle",
-              "Picasso's Gaussian, maximum likelihood", "picasso", "picasso"),
-    Estimator("piscat", f"{_PEERS}:piscat", "PiSCAT's Gaussian, least squares", "piscat", "piscat"),
+              "Picasso's Gaussian, maximum likelihood", "picasso", _PICASSO),
+    Estimator("piscat", f"{_PEERS}:piscat", "PiSCAT's Gaussian, least squares", "piscat", _PISCAT),
     Estimator("trackpy", f"{_PEERS}:trackpy", "trackpy's refined centre of mass", "trackpy"),
 )  # fmt: skip
 """What can be named without a module; nothing of it is imported before it is run."""

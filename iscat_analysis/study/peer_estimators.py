@@ -1,9 +1,15 @@
 """Adapters of other programs' estimators: counts in their units, their results in ours.
 
-Their programs are imported when they are run, and are extras of this package.
+Their programs are imported when they are run.  Picasso is an extra of this package.  PiSCAT asks
+for a version of pandas that this package cannot use, and for windows; its fit needs neither, so
+that its one file is loaded from a PiSCAT that was installed without its requirements.
 """
 
 from __future__ import annotations
+
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,14 +61,13 @@ def piscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Tabl
 
     Shapes: `before, after` (n, y, x).
     """
-    from piscat.Localization.gaussian_2D_fit import fit_2D_Gaussian_varAmp
-
+    fit = _piscat_module("Localization/gaussian_2D_fit.py").fit_2D_Gaussian_varAmp
     spots, corner = _boxes(setup.image(before, after), setup)
     pixel = setup.pixel_size_nm
     width = np.sqrt(2) * setup.psf_sigma_nm / pixel  # its width is √2 of a standard deviation
     out = np.full((len(spots), 2, 6), np.nan)
     for i, spot in enumerate(spots.astype(float)):
-        _, found, error = fit_2D_Gaussian_varAmp(spot, width, width)
+        _, found, error = fit(spot, width, width)
         if found is not None:
             out[i] = found, error
     return {
@@ -73,6 +78,20 @@ def piscat(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Tabl
         "sigma_y_nm": out[:, 1, 2] * pixel,
         "sigma_amplitude": out[:, 1, 0],
     }
+
+
+def _piscat_module(file: str) -> Any:
+    """Load one file of PiSCAT without the rest of it."""
+    package = find_spec("piscat")
+    folders = package.submodule_search_locations if package is not None else None
+    if not folders:
+        raise ImportError("piscat is not installed")
+    spec = spec_from_file_location(Path(file).stem, Path(folders[0]) / file)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"piscat has no {file}")
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def trackpy(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Table:

@@ -14,6 +14,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.signal import fftconvolve
 
+from iscat_analysis.config import Optics
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.pieces import psf
@@ -70,9 +71,10 @@ def gauss_ls(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> Ta
     Shapes: `before, after` (n, y, x).
     """
     images = setup.image(before, after)
+    width = setup.psf_sigma_nm / setup.pixel_size_nm
 
     def fit(i: int, cut: tuple[slice, slice], start_px: FloatArray) -> FloatArray:
-        return fit_gaussian(images[i][cut], cut, start_px, setup)
+        return fit_gaussian(images[i][cut], cut, start_px, width, setup.polarity)
 
     return _fitted(images, setup, fit)
 
@@ -86,12 +88,13 @@ def gauss_mle(before: FloatArray, after: FloatArray, setup: EstimatorSetup) -> T
     """
     images = setup.image(before, after)
     ratio = setup.n_after / max(setup.n_before, 1)
+    width = setup.psf_sigma_nm / setup.pixel_size_nm
 
     def fit(i: int, cut: tuple[slice, slice], start_px: FloatArray) -> FloatArray:
         expected = np.maximum(ratio * before[i][cut], 1e-9)
         unit = expected if setup.interferes else np.full_like(expected, float(setup.n_after))
         return fit_gaussian(
-            images[i][cut], cut, start_px, setup, counts=after[i][cut],
+            images[i][cut], cut, start_px, width, setup.polarity, counts=after[i][cut],
             background=expected, unit=unit,
         )  # fmt: skip
 
@@ -125,7 +128,8 @@ def fit_gaussian(
     image: FloatArray,
     cut: tuple[slice, slice],
     start_px: FloatArray,
-    setup: EstimatorSetup,
+    sigma_px: float,
+    polarity: float,
     *,
     counts: FloatArray | None = None,
     background: FloatArray | None = None,
@@ -168,8 +172,7 @@ def fit_gaussian(
             steep = np.where(near, 1 / np.sqrt(mean), (1 - counts / mean) / np.where(near, 1, r))
             return (slopes(p) * (steep * unit)[..., None]).reshape(-1, 5)
 
-    sigma_px = setup.psf_sigma_nm / setup.pixel_size_nm
-    begin = np.array([setup.polarity * 0.8, *start_px, sigma_px, 0.0])
+    begin = np.array([polarity * 0.8, *start_px, sigma_px, 0.0])
     found = least_squares(residual, begin, jacobian, method="lm", max_nfev=_EVALUATIONS)
     if not found.success or not np.all(np.isfinite(found.x)):
         return np.full((2, 5), np.nan)
@@ -252,7 +255,7 @@ def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup
     images, pixel = setup.image(before, after), setup.pixel_size_nm
     out = np.full((len(images), 2), np.nan)
     for i, image in enumerate(images):
-        cut = _around(image, setup.start[i, :2] / pixel, setup)
+        cut = around(image.shape, setup.start[i, :2] / pixel, half_width(setup.optics, pixel))
         part = image[cut]
         if min(part.shape) < 4:
             continue
@@ -279,10 +282,14 @@ def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup
     return {"x_nm": out[:, 0], "y_nm": out[:, 1]}
 
 
-def _around(image: FloatArray, start_px: FloatArray, setup: EstimatorSetup) -> tuple[slice, slice]:
-    """Cut a square of about two widths of the spot around a start."""
-    half = max(2, round(setup.optics.wavelength_nm / setup.optics.na / setup.pixel_size_nm))
-    rows, columns = image.shape
+def half_width(optics: Optics, pixel_nm: float) -> int:
+    """Give half a square of about two widths of the spot [pixels]."""
+    return max(2, round(optics.wavelength_nm / optics.na / pixel_nm))
+
+
+def around(shape: tuple[int, ...], start_px: FloatArray, half: int) -> tuple[slice, slice]:
+    """Cut a square around a start, as much of it as lies in the image."""
+    rows, columns = shape
     column, row = (round(float(v)) for v in start_px)
     return (
         slice(min(max(row - half, 0), rows - 1), min(max(row + half + 1, 1), rows)),
@@ -297,10 +304,10 @@ def _fitted(
 ) -> Table:
     """Fit every region from its start."""
     pixel = setup.pixel_size_nm
-    found = np.stack([
-        fit(i, _around(image, setup.start[i, :2] / pixel, setup), setup.start[i, :2] / pixel)
-        for i, image in enumerate(images)
-    ])  # fmt: skip
+    starts, half = setup.start[:, :2] / pixel, half_width(setup.optics, pixel)
+    found = np.stack(
+        [fit(i, around(images.shape[1:], start, half), start) for i, start in enumerate(starts)]
+    )
     return {
         "x_nm": found[:, 0, 1] * pixel,
         "y_nm": found[:, 0, 2] * pixel,
@@ -314,26 +321,36 @@ def _fitted(
 def _highest(
     images: FloatArray, setup: EstimatorSetup, polarity: int, *, refined: bool = True
 ) -> Table:
-    """Find the maximum near each start, between pixels by parabolas."""
+    """Find the maximum near each start."""
     pixel = setup.pixel_size_nm
-    rows, columns = images.shape[1:]
-    y, x = np.mgrid[:rows, :columns]
-    out = np.full((len(images), 3), np.nan)
-    turned: FloatArray = polarity * images
-    for i, image in enumerate(turned):
-        column, row = setup.start[i, :2] / pixel
-        near = np.where(np.hypot(x - column, y - row) <= REACH_PX, image, -np.inf)
-        down, across = (int(k) for k in np.unravel_index(np.argmax(near), near.shape))
-        if not np.isfinite(near[down, across]):
-            continue
-        shift, top = [0.0, 0.0], float(image[down, across])
-        lines = (image[down], across), (image[:, across], down)
-        for k, (line, at) in enumerate(lines if refined else ()):
-            if 0 < at < line.size - 1:
-                before, middle, behind = line[at - 1 : at + 2]
-                bend = before - 2 * middle + behind
-                if bend < 0:
-                    shift[k] = float((before - behind) / (2 * bend))
-                    top -= float((before - behind) ** 2 / (8 * bend))
-        out[i] = (across + shift[0]) * pixel, (down + shift[1]) * pixel, polarity * top
-    return {"x_nm": out[:, 0], "y_nm": out[:, 1], "amplitude": out[:, 2]}
+    out = np.stack([
+        highest(image, start, polarity, refined=refined)
+        for image, start in zip(images, setup.start[:, :2] / pixel, strict=True)
+    ])  # fmt: skip
+    return {"x_nm": out[:, 0] * pixel, "y_nm": out[:, 1] * pixel, "amplitude": out[:, 2]}
+
+
+def highest(
+    image: FloatArray, start_px: FloatArray, polarity: float, *, refined: bool
+) -> FloatArray:
+    """Give column, row and height of the maximum near a start, between pixels by parabolas.
+
+    Shapes: `image` (ny, nx), `start_px` (2,), result (3,), NaN where no pixel is known.
+    """
+    turned: FloatArray = polarity * image
+    y, x = np.indices(image.shape)
+    near = (np.hypot(x - start_px[0], y - start_px[1]) <= REACH_PX) & np.isfinite(turned)
+    if not near.any():
+        return np.full(3, np.nan)
+    candidates = np.where(near, turned, -np.inf)
+    down, across = (int(k) for k in np.unravel_index(np.argmax(candidates), image.shape))
+    shift, top = [0.0, 0.0], float(turned[down, across])
+    lines = (turned[down], across), (turned[:, across], down)
+    for k, (line, at) in enumerate(lines if refined else ()):
+        if 0 < at < line.size - 1:
+            before, middle, behind = line[at - 1 : at + 2]
+            bend = before - 2 * middle + behind
+            if bend < 0:
+                shift[k] = float((before - behind) / (2 * bend))
+                top -= float((before - behind) ** 2 / (8 * bend))
+    return np.array([across + shift[0], down + shift[1], polarity * top])

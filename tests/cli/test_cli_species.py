@@ -83,6 +83,23 @@ def test_notes_name_options(events: Path, tmp_path: Path, capsys) -> None:
     assert "--above cuts where all are still detected" in error
 
 
+def test_a_flank_of_what_is_missed_is_not_determined(tmp_path: Path, capsys) -> None:
+    """Of 40 kDa a twentieth is seen, as a peak near 60 that is narrower than those of others."""
+    path = tmp_path / "bare.csv"
+    for light, said in ((40.0, 1), (66.0, 0)):
+        random = np.random.default_rng(5)
+        mass = random.normal(np.repeat([light, 150.0], [8000, 1000]), 12.0)
+        limit = 65.0 if said else 20.0
+        pd.DataFrame({"mass_kda": mass[random.normal(mass, 8.0) > limit]}).to_csv(path, index=False)
+        assert main(["species", str(path), "--k", "2", "--draws", "4"]) == 0
+        shown = capsys.readouterr()
+        assert shown.out.count("not determined") == said
+        assert shown.err.count("all that is seen of a lighter species") == said
+    known = ["--limit", "20:8", "--draws", "4"]
+    assert main(["species", str(path), "--k", "2", *known]) == 0
+    assert "not determined" not in capsys.readouterr().out
+
+
 def test_samples_are_compared_with_the_first(events: Path, tmp_path: Path, capsys) -> None:
     other = tmp_path / "other.csv"
     table = draw_table(np.random.default_rng(3), {66.0: 150, 132.0: 350}, efficiency=EFFICIENCY)

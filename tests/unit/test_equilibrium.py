@@ -190,6 +190,15 @@ def test_a_mass_in_another_unit_is_refused(dimers) -> None:
         ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66e3])
 
 
+def test_a_monomer_that_is_hardly_detected_gives_no_kd() -> None:
+    """Of monomers of 40 kDa one in a hundred passes 65 kDa."""
+    totals = DIMER.to_numpy(float)
+    tables = draw_series(np.random.default_rng(12), "dimer", totals, 10.0, [40.0], number=1000)
+    seen = [table[table["mass_kda"] > 65][["mass_kda"]].head(200) for table in tables]
+    with pytest.raises(ia.DataError, match=r"of the species of about .* K_D is not determined"):
+        ia.fit_kd(DIMER, tables=seen, model="dimer", masses_kda=[40.0])
+
+
 def test_the_monomer_is_taken_from_two_peaks() -> None:
     """40 kDa explained peaks at 80 and 160 kDa as well, and were taken."""
     totals = DIMER.to_numpy(float)

@@ -187,7 +187,7 @@ def test_estimators_are_found_by_name_or_function(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(ia.ConfigError, match="neither PACKAGE:FUNCTION nor one of iscat"):
         find_estimator("gauss")
     monkeypatch.setattr("iscat_analysis.study.estimators.find_spec", lambda _: None)
-    with pytest.raises(ia.ConfigError, match=r"iscat-analysis\[piscat\]"):
+    with pytest.raises(ia.ConfigError, match="--no-deps piscat"):
         find_estimator("piscat").load()
 
 
@@ -260,7 +260,7 @@ def test_an_amplitude_of_any_unit_becomes_a_mass(drawn) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of what trackpy asks of pandas
-@pytest.mark.parametrize("name", [one.name for one in BUILT_IN if not one.extra])
+@pytest.mark.parametrize("name", [one.name for one in BUILT_IN if not one.install])
 def test_every_built_in_estimator_finds_a_bright_particle(name: str, in_focus) -> None:
     """Within a sixth of a wavelength, where the spot is about as round as a Gaussian."""
     found = answer(find_estimator(name).load(), in_focus.job)
