@@ -114,6 +114,11 @@ class Reader:
             return self
         return Reader(movie, camera, self.first, self.last, self._room_bytes, dark_e=self._dark_e)
 
+    def forget_sample(self) -> None:
+        """Release the frames of the sample of the pixels, where there is one."""
+        if self.sampled is not self:
+            self.sampled.forget()
+
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames of the movie, without keeping them."""
         return self._movie.read(start, stop)

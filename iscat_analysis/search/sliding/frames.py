@@ -85,7 +85,7 @@ class Chunk:
     def _copied(
         self, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
     ) -> NDArray[Any]:
-        """Copy a region; of a file that is let go a few frames at a time, as each maps megabytes."""
+        """Copy a region; of a file that is let go a few frames at a time: each maps megabytes."""
         if self.let_go is _nothing or frames.stop - frames.start <= _COPIED:
             counts = _region(self.counts, frames, rows, columns)
             self.let_go()
