@@ -5,9 +5,9 @@
 
 Each job is ``iscat fit`` in a process of its own, on plain numbers: a block of frames with
 particles that land in its first half and leave in its second one, and links to it, so that a movie
-of any length takes the room of a block.  Reported are megabytes of input per second of processor time,
-the peak memory of all its processes and the seconds of its parts.  Of three series, in pixels,
-frames and particles, the slope of processor time is printed, both on logarithmic scales: each job
+of any length takes the room of a block.  Reported are megabytes of input per second of processor
+time, the peak memory of all its processes and the seconds of its parts.  Of three series, in
+pixels, frames and particles, the slope of processor time is printed, on logarithmic scales: a job
 costs what its start costs, a job of the smallest kind, and what grows; the growing part may have a
 slope of 1.05 at most.  From one and two workers, and jobs of one and several chunks, follow what a
 job costs once, per chunk and per megabyte; more workers are extrapolated from that.

@@ -129,7 +129,10 @@ def analyse_chunk(
     wanted = context.config.background.follows_pattern
     still, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
     own = EVERYWHERE if tile is None else tile.inner
-    fitter = ChunkFitter(context, still, window, pool, pattern, excess_noise=excess_noise, own=own)
+    fitter = ChunkFitter(
+        context, still, window, pool, pattern, excess_noise=excess_noise, own=own,
+        controlled=part.controlled,
+    )  # fmt: skip
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam), core)
     if tile is not None:

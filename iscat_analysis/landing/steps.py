@@ -91,7 +91,9 @@ class ChunkFitter:
         *,
         excess_noise: ExcessNoise | None = None,
         own: Box = EVERYWHERE,
+        controlled: bool = True,
     ) -> None:
+        self._controlled = controlled
         self._excess_noise = excess_noise
         self._own = own  # pixels of the chunk that count: those of the core of a tile
         self._context = context
@@ -172,7 +174,7 @@ class ChunkFitter:
             lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
         )
         fitted = self._judged([one for one in found if one is not None])
-        if fitted and not self._pattern:
+        if fitted and not self._pattern and self._controlled:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
                 context=self._context, chunk=self._chunk, window=self._window,

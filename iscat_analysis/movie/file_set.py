@@ -14,7 +14,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import merge
 from iscat_analysis.movie.ome import OmeSet
 from iscat_analysis.movie.stack import Frames
-from iscat_analysis.records import StackMetadata
+from iscat_analysis.records import InPlace, PlacedSource, StackMetadata
 
 
 class FileSet:
@@ -46,6 +46,15 @@ class FileSet:
                 member, image = where[first]
                 block[first:last] = self._members[member].read(image, image + last - first)
         return block
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Give frames where they lie, if one file holds all of them in a row."""
+        where = self._where[start:stop]
+        if not len(where) or not (np.diff(where, axis=0) == [0, 1]).all():
+            return None
+        member, image = self._members[int(where[0, 0])], int(where[0, 1])
+        placed = isinstance(member, PlacedSource)
+        return member.in_place(image, image + stop - start) if placed else None
 
     def close(self) -> None:
         """Release the files."""

@@ -217,6 +217,7 @@ def _landing_light(
         noise_survey = survey_noise(reader_of(seen, config, camera, span), config)
         left_open = config.background.drift_correction == "auto"
         motion = motion_message(noise_survey) if left_open else ""
+        noise_survey.reader.forget_sample()
         if not motion:
             sum_first_chunk(noise_survey.reader, config, noise_survey.window)
         return noise_survey, motion

@@ -27,6 +27,7 @@ from iscat_analysis import executors as places
 from iscat_analysis.errors import SchedulerError
 from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.search.sliding import chunks as chunks_module
 from iscat_cli import main_fit
 
 pytestmark = [
@@ -192,6 +193,24 @@ def test_chunks_of_a_movie_give_the_same_bytes_when_a_worker_is_killed(
     assert [total for stage, _, total in told if stage == "landing"] == chunks * [FRAMES]
     assert told[-1] == ("landing", FRAMES, FRAMES)
     assert _content(out) == _content(here)
+
+
+@pytest.mark.large
+def test_tiles_of_a_field_give_the_same_bytes(
+    cluster: Workers, landing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two tiles of each of two chunks are jobs; the sums over the field are made once for both."""
+    monkeypatch.setattr(chunks_module, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_: ((1, 2), FRAMES // 2))
+    cluster.add(2)
+    config = ia.configure(LANDING)
+    for name, file in (("here", None), ("far", cluster.file)):
+        out = tmp_path / f"{name}.iscat"
+        with places.open_executor(scheduler_file=file) as executor:
+            fit_stack(landing, config, out=out, command="iscat-fit", executor=executor)
+    found = json.loads((tmp_path / "far.iscat" / "summary.json").read_text())["landing"]
+    assert (found["chunks"], found["tiles"]) == (2, 2)
+    assert _content(tmp_path / "far.iscat") == _content(tmp_path / "here.iscat")
 
 
 def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(

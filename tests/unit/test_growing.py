@@ -88,7 +88,7 @@ class Recorder:
         return True
 
 
-@pytest.mark.parametrize("kind", ["tif", "zarr"])
+@pytest.mark.parametrize("kind", [pytest.param("tif", marks=pytest.mark.large), "zarr"])
 def test_a_movie_that_grows_ends_as_the_finished_file(
     kind: str, config: Config, counts: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

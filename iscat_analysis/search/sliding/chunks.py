@@ -54,6 +54,7 @@ _AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fi
 _FEWEST_AT_ONCE = 8
 _TOGETHER = 4  # sums over the field that are made at a time
 _SPAN_BYTES = 4e9  # of the frames of a chunk of a large field: they stay in the system's cache
+_CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
 _TILE_BYTES = 100  # of a pixel of a tile, beside its blocks and maps
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -112,6 +113,11 @@ class Reader:
         if movie is self._movie:
             return self
         return Reader(movie, camera, self.first, self.last, self._room_bytes, dark_e=self._dark_e)
+
+    def forget_sample(self) -> None:
+        """Release the frames of the sample of the pixels, where there is one."""
+        if self.sampled is not self:
+            self.sampled.forget()
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames of the movie, without keeping them."""
@@ -339,11 +345,12 @@ def counts_budget(config: Config) -> int:
 
 @dataclass(frozen=True)
 class Part:
-    """A chunk of a movie, or one tile of it."""
+    """A chunk of a movie, or one tile of it; in some the noise where nothing lands is measured."""
 
     core: tuple[int, int]
     span: tuple[int, int]
     tile: Tile | None = None
+    controlled: bool = True
 
 
 def plan_parts(
@@ -366,13 +373,17 @@ def plan_parts(
     count = math.ceil((last - first) / core)
     even = math.ceil((last - first) / count / stride) * stride
     halo = halo_frames(window, stride)
+    every = max(1, count * len(tiles) // _CONTROLLED)
     return [
         [
-            Part((begin, end), (max(begin - halo, first), min(end + halo, last)), tile)
-            for tile in tiles
+            Part(
+                (begin, end), (max(begin - halo, first), min(end + halo, last)), tile,
+                controlled=(number * len(tiles) + place) % every == 0,
+            )
+            for place, tile in enumerate(tiles)
         ]
-        for begin, end in pairwise([*range(first, last, even), last])
-    ]
+        for number, (begin, end) in enumerate(pairwise([*range(first, last, even), last]))
+    ]  # fmt: skip
 
 
 def halo_px(config: Config) -> int:

@@ -26,6 +26,7 @@ _LEAST_CHANGE_RATIO = 8.0
 # Of the light of a frame's first and last rows, and of these over the middle one's
 _LEAST_EDGE_LIGHT = 0.1
 _EDGE_E = 400.0  # photoelectrons of a row, without which it tells nothing
+_COPIED = 32  # frames of a region that are copied together from a file
 _LIGHT_QUANTILE = 0.75  # quantile of the light of frames
 
 
@@ -68,8 +69,7 @@ class Chunk:
         self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
-        counts = _region(self.counts, here, rows, columns)
-        self.let_go()
+        counts = self._copied(here, rows, columns)
         return Patch(
             first=self.first + here.start,
             counts=counts,
@@ -81,6 +81,18 @@ class Chunk:
             mean_e=self.mean_e[pixels],
             usable=self.usable[pixels],
         )
+
+    def _copied(
+        self, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
+    ) -> NDArray[Any]:
+        """Copy a region; of a file that is let go a few frames at a time: each maps megabytes."""
+        if self.let_go is _nothing or frames.stop - frames.start <= _COPIED:
+            counts = _region(self.counts, frames, rows, columns)
+            self.let_go()
+            return counts
+        edges = range(frames.start, frames.stop, _COPIED)
+        parts = (slice(start, min(start + _COPIED, frames.stop)) for start in edges)
+        return np.concatenate([self._copied(part, rows, columns) for part in parts])
 
 
 @dataclass(frozen=True)
