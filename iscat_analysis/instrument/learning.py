@@ -192,6 +192,7 @@ def why_not(config: Config) -> str:
             "in mode track over a background that is not learned with the tracks",
         ),
         (optics.scheme == "darkfield", "from dark field"),
+        (config.particle.is_sphere, f'with particle.model = "{config.particle.model}"'),
         (optics.convention != "exact", f'with optics.convention = "{optics.convention}"'),
         (optics.psf != "model", f'with optics.psf = "{optics.psf}"'),
         (config.background.method == "known", 'with background.method = "known"'),

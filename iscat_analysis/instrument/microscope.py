@@ -59,6 +59,11 @@ def refuse_uncalibratable(config: Config) -> None:
         )
     if config.optics.convention == "dong2021":
         raise ConfigError('optics.convention = "dong2021" cannot be calibrated: use "exact"')
+    if config.particle.is_sphere:
+        raise ConfigError(
+            f'particle.model = "{config.particle.model}": optics are learned from dipoles; record '
+            "some, and give the file with their optics as optics.file"
+        )
 
 
 def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:

@@ -41,7 +41,7 @@ _ADVICE = {
     Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.diameter_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
-    "neighbours.",
+    "neighbours; particles of 40 nm and more need mode size.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "

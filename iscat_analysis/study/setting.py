@@ -187,6 +187,11 @@ def make_setting(
     context: AnalysisContext | None = None,
 ) -> Setting:
     """Set up one experiment."""
+    if config.particle.is_sphere:
+        raise ConfigError(
+            f'particle.model = "{config.particle.model}": these studies are of dipoles; simulate '
+            "spheres (iscat simulate) and fit them (iscat-fit --mode size)"
+        )
     pixel_nm = config.camera.pixel_size_nm
     side = config.fit.roi_px(pixel_nm) if pixel_nm else config.bounds.pixels
     changes: dict[str, Mapping[str, Any]] = {

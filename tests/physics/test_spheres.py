@@ -339,6 +339,20 @@ def test_the_diameter_is_found_and_a_dipole_does_not_fit() -> None:
     assert set(fitted(dipole, counts, "joint")["status"]) == {"poor_fit"}
 
 
+def test_a_vesicle_among_proteins_is_no_heavy_protein() -> None:
+    """The focus is where 5 nm above the glass is imaged at 0; the vesicle's centre is higher."""
+    vesicle = ia.Particle(
+        kind="custom", model="mie", index=1.40, density_kg_m3=1100, diameter_nm=60.0
+    )
+    focus = (30.0 - 5.0) * (1 - OPTICS.n_immersion / OPTICS.n_sample)
+    lifted = OPTICS.model_copy(update={"focus_nm": focus})
+    rng = np.random.default_rng(3)
+    light = 1e6 * (1 + np.array([ia.psf(lifted, vesicle, CAMERA, pixels=23)] * 3))
+    counts = [rng.poisson(1e6, light.shape), rng.poisson(light)]
+    protein = ia.Particle(mass_kda=3000.0)
+    assert set(fitted(protein, counts, "mass")["status"]) == {"poor_fit"}
+
+
 @pytest.mark.large
 @pytest.mark.parametrize(
     ("kind", "diameter"),
