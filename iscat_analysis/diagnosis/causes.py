@@ -38,6 +38,8 @@ _LEAST_SCALE_CHANGE = 0.01  # change of the scale that makes it worth a line
 _LEAST_CHANGE_RATIO = 10.0  # times less change along the axis of time than along both of space
 _LOOKED_AT = 96  # frames, rows and columns in which axes are judged
 _ENOUGH_STEPS = 30
+_FEWEST_RESIDUES, _MOST_RESIDUES = 12, 0.5  # of them, and for each other row, without a word
+_AT_ONCE = 0.6  # of them, within two windows
 _MOST_POOR_SHARE = 0.5  # of fits that are poor
 _SMEARED_NM = 20.0  # from where most fits of bright particles are,
 _DESCRIBED_NM = 15.0  # and where hardly any is
@@ -319,6 +321,30 @@ def smear_warning(config: Config, table: pd.DataFrame, smear_nm: FloatArray) -> 
         f"exposure, and {poor.mean():.0%} of the fits are poor: along z that turns the phase by "
         "too much for one picture, and optics, gain and noise cannot be judged; expose for less"
         f"{advice}"
+    )
+
+
+def residue_warning(table: pd.DataFrame, window: int) -> str:
+    """Say in one sentence that most of what was found is no particle, and when it was.
+
+    Light that changes all over the field leaves residues everywhere, for as long as a window has
+    frames of both sides.
+    """
+    left = table["status"] == Status.SIDELOBE.value
+    frames = np.sort(table.loc[left, "frame"].to_numpy(float))
+    if len(frames) < max(_FEWEST_RESIDUES, _MOST_RESIDUES * float((~left).sum())):
+        return ""
+    last = np.searchsorted(frames, frames + 2 * window, side="right")
+    first = int(np.argmax(last - np.arange(len(frames))))
+    inside = frames[first : last[first]]
+    where = "all through the movie"
+    if len(inside) > _AT_ONCE * len(frames):
+        where = f"{len(inside)} of them in frames {inside[0]:.0f}:{inside[-1] + 1:.0f}"
+    return (
+        f"{len(frames)} rows are residues and no particles (status sidelobe), {where}: light that "
+        "changes all over the field leaves them, as where one of two patterns of the illumination "
+        "moves against the other; find what moves, a window, a mirror or the coverslip, leave "
+        "these frames out (fit.frames), or shorten background.window_frames"
     )
 
 

@@ -433,6 +433,9 @@ def in_uneven_field(
                 values, before, names = trial, after, others
                 kept.remove(kind)
         kept.append(terms)
+        while view.jumps and JUMPS[len(view.jumps) - 1] not in names:
+            view = replace(view, jumps=view.jumps[:-1])
+            pictures = view.placed(pictures)
     refusal = "; ".join(change.said for change in wishes.rest())
     if not kept and not refusal:
         return None

@@ -16,6 +16,7 @@ from iscat_analysis.diagnosis.causes import (
     landing_rate_warning,
     line_warning,
     nonlinearity_warning,
+    residue_warning,
     scale_warning,
     sign_warning,
 )
@@ -96,6 +97,9 @@ def make_analysis(
         sign_warning(config, table),
         reference_warning(config, table),
         landing_rate_warning(table) if ready.background_mode == "sliding" else "",
+        residue_warning(table, found.summary["window_frames"])
+        if ready.background_mode == "sliding" and found.summary
+        else "",
     ):
         if doubt:
             run.warn(doubt)

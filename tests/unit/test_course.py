@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pandas as pd
 
-from iscat_analysis.diagnosis.causes import landing_rate_warning
+from iscat_analysis.diagnosis.causes import landing_rate_warning, residue_warning
 
 
 def _table(ok: int, changing: int, undescribed: int) -> pd.DataFrame:
@@ -22,3 +23,25 @@ def test_few_of_them_and_a_wrong_model_are_not() -> None:
     assert not landing_rate_warning(_table(20, 4, 4))
     assert not landing_rate_warning(_table(200, 10, 0))
     assert not landing_rate_warning(_table(0, 0, 0))
+
+
+def _rows(residues: np.ndarray, others: int) -> pd.DataFrame:
+    status = ["sidelobe"] * len(residues) + ["ok"] * others
+    return pd.DataFrame({"frame": [*residues, *range(others)], "status": status})
+
+
+def test_many_residues_are_one_sentence_with_their_frames() -> None:
+    """They were hundreds of rows, and nothing said that the light was the cause."""
+    at_once = np.random.default_rng(1).integers(480, 520, 40)
+    anywhere = np.random.default_rng(2).integers(0, 1000, 10)
+    said = residue_warning(_rows(np.concatenate([at_once, anywhere]), 30), 40)
+    assert said.startswith("50 rows are residues and no particles")
+    inside, frames = said.split("sidelobe), ")[1].split(" of them in frames ")
+    start, stop = (int(frame) for frame in frames.split(":", 2)[:2])
+    assert int(inside) >= 40
+    assert start <= 480 + 3
+    assert 517 <= stop <= start + 81
+    steadily = residue_warning(_rows(np.arange(0, 1000, 20), 30), 40)
+    assert "all through the movie" in steadily
+    assert not residue_warning(_rows(at_once[:8], 3), 40)  # few
+    assert not residue_warning(_rows(at_once, 100), 40)  # a few for each particle
