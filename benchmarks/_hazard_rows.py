@@ -159,7 +159,7 @@ def coma(strength: float, seed: int) -> Case:
 
 def uneven_amplitude(strength: float, seed: int) -> Case:
     """Let the amplitude of the reference fall over the field by so much each way."""
-    return usual(of_optics(other_reference(0.0, strength)), seed)
+    return learned(of_optics(other_reference(0.0, strength)), seed)
 
 
 def curved_phase(strength: float, seed: int) -> Case:

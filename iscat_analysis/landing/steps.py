@@ -211,12 +211,12 @@ class ChunkFitter:
             frames = np.maximum(effective[where], 1e-9)
             self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
         peaks = find_steps(chunk, matched, snr, effective, context.templates.threshold)
-        refuse_flood(
-            len(peaks), context.templates, self._excess_noise,
-            images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
-        )  # fmt: skip
         self._last = peaks, (snr, effective)
         fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
+        refuse_flood(  # the rings of a few bright particles are no noise
+            len(fresh), context.templates, self._excess_noise,
+            images=len(snr), frames=f" in frames {chunk.first}:{chunk.stop}",
+        )  # fmt: skip
         return [self._begin(peak) for peak in fresh]
 
     def _begin(self, peak: Peak) -> Step:
