@@ -85,6 +85,7 @@ def draw(
     """Draw counts: of `source`, where estimators are told another microscope; among others."""
     true = source or setting
     side_nm = true.pixels * true.context.pixel_nm
+    others = replace(true, context=replace(true.context, model=true.context.wide))
     bounds = true.bounds.crb_joint
     pixel = setting.context.pixel_nm
     most = [RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]]
@@ -106,7 +107,7 @@ def draw(
         if density_um2:
             for _ in range(random.poisson(density_um2 * (side_nm / 1000) ** 2)):
                 place = random.uniform(-0.5, true.pixels - 0.5, 2) * pixel
-                frame = frame + true.signal_e(np.array([*place, *truths[i, 2:]]))
+                frame = frame + others.signal_e(np.array([*place, *truths[i, 2:]]))
         counts = true.windows(np.broadcast_to(frame, (true.pixels, true.pixels)), random)
         before.append(counts.before_e)
         after.append(counts.after_e)
