@@ -415,18 +415,12 @@ class Particle(Section):
                 raise ValueError('kind = "custom" needs permittivity or index')
             if self.density_kg_m3 is None:
                 raise ValueError('kind = "custom" needs density_kg_m3')
-        shell = {"shell_nm": self.shell_nm, "shell_index": self.shell_index}
-        for name, value in shell.items():
-            if (value is None) == (self.model == "shell"):
-                raise ValueError(
-                    f'model = "shell" needs {name}' if value is None
-                    else f'{name} = {value:g} needs model = "shell", and model is "{self.model}"'
-                )  # fmt: skip
-        if self.model == "shell" and self.density_kg_m3 is None:
-            raise ValueError(
-                'model = "shell" needs density_kg_m3, the mean density of core and shell, because '
-                "the mass is that of both"
-            )
+        for name in ("shell_nm", "shell_index", "density_kg_m3"):
+            value = getattr(self, name)
+            if self.model == "shell" and value is None:
+                raise ValueError(f'model = "shell" needs {name}')
+            if self.model != "shell" and name != "density_kg_m3" and value is not None:
+                raise ValueError(f'{name} = {value:g} needs model = "shell"')
         if self.shell_nm is not None and self.shell_nm > self.nominal_diameter_nm / 2:
             raise ValueError(
                 f"shell_nm = {self.shell_nm:g} is more than the radius of a particle of "

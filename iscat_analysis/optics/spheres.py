@@ -141,9 +141,3 @@ def _coefficients(x: float, core: float, m: complex, shell: float) -> Coefficien
 
 coefficients = memoize(_KEPT, _coefficients)
 """Mie's coefficients a_n and b_n; the last ones are kept."""
-
-
-def largest_index_contrast(sphere: Sphere, n_sample: float) -> float:
-    """Largest |m − 1| of the parts of a sphere in a medium: zero where it is invisible."""
-    parts = [sphere.index, *([sphere.shell_index] if sphere.shell_nm else [])]
-    return max(abs(part / n_sample - 1) for part in parts)

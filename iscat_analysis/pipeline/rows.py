@@ -99,7 +99,8 @@ def reported_rows(
         table = with_diameters(table, config.particle.density)
     budget = budget_of(
         table, shared, achieved,
-        calibrated=config.calibration is not None or mode == "size", scaled=config.fit.sigma == "measured",
+        calibrated=config.calibration is not None or mode == "size",
+        scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 

@@ -30,7 +30,7 @@ def test_the_form_has_every_key_of_the_configuration_once() -> None:
     assert expected <= set(keys)
     assert set(FIRST) <= set(keys)
     choices = {field.key: field.choices for field in fields()}
-    assert choices["fit.mode"] == ("mass", "localize", "joint", "track")
+    assert choices["fit.mode"] == ("mass", "localize", "joint", "size", "track")
     assert choices["background.power_normalization"] == (True, False)
 
 

@@ -280,7 +280,7 @@ def test_debug_shows_the_traceback(library, capsys, error) -> None:
         (["fit"], "Missing argument 'STACK'"),
         (["fit", "m.tif", "--mdoe", "mass"], "--mode"),
         (["fit", "m.tif", "--overwite"], "--overwrite"),
-        (["fit", "m.tif", "--mode", "mas"], "'mass', 'localize', 'joint', 'track'"),
+        (["fit", "m.tif", "--mode", "mas"], "'mass', 'localize', 'joint', 'size', 'track'"),
         (["fit", "m.tif", "--mode", "mas"], "did you mean 'mass'?"),
         (["fit", "m.tif", "--workers", "0"], "--workers"),
         (["fit", "m.tif", "--workers", "two"], "--workers"),
