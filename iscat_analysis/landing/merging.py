@@ -23,6 +23,8 @@ VIEWS = 1000
 CLIPS = 250
 """Events of which a clip is kept, the first; the page holds fewer."""
 
+_DRIFT_PX = 512  # of the middle of the field, whose drift is measured
+
 SEAM_PX = 2.0
 """Estimates of one step by two chunks, or two tiles, are nearer than this."""
 
@@ -216,7 +218,10 @@ class MergedChunks:
             return [float(d) for d in way.shift_px[-1]]
         first = [done for k, done in enumerate(self._done) if self._opens(k)]
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
-        moved = [measure_drift(a.ends_e[0], b.ends_e[1]) for a, b in zip(first, last, strict=True)]
+        moved = [
+            measure_drift(_middle(a.ends_e[0]), _middle(b.ends_e[1]))
+            for a, b in zip(first, last, strict=True)
+        ]
         dy, dx = np.sum(moved, axis=0).tolist()
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 
@@ -229,6 +234,15 @@ class MergedChunks:
         """Defective and saturated pixels."""
         defective = self._masked & ~self._saturated
         return int(defective.sum()), int(self._saturated.sum())
+
+
+def _middle(image: FloatArray) -> FloatArray:
+    """Cut the middle out of a large image: its pattern moves as all of it does.
+
+    Shapes: `image` (y, x).
+    """
+    sides = (slice((n - min(n, _DRIFT_PX)) // 2, (n + min(n, _DRIFT_PX)) // 2) for n in image.shape)
+    return image[tuple(sides)]
 
 
 def is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
