@@ -23,6 +23,8 @@ VIEWS = 1000
 CLIPS = 250
 """Events of which a clip is kept, the first; the page holds fewer."""
 
+_DRIFT_PX = 512  # of the middle of the field, whose drift is measured
+
 SEAM_PX = 2.0
 """Estimates of one step by two chunks, or two tiles, are nearer than this."""
 
@@ -61,6 +63,7 @@ class MergedChunks:
         self._dated: dict[int, NDArray[np.int64]] = {}
         self._sampled: dict[int, int] = {}
         self._strongest = np.zeros((2, *shape))
+        self._masked, self._saturated = (np.zeros(shape, dtype=np.bool_) for _ in range(2))
         self.cause = ""
         self.empty: EmptySpread | None = None
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
@@ -85,18 +88,22 @@ class MergedChunks:
         """Append the next chunk."""
         stronger = done.strongest[0] > self._strongest[0]
         self._strongest = np.where(stronger, done.strongest, self._strongest)
+        self._masked |= done.masked
+        self._saturated |= done.saturated
         self.cause = self.cause or done.cause
         if done.empty is not None:
             self.empty = done.empty if self.empty is None else self.empty + done.empty
         # the images are merged; holding them for every chunk would grow with the movie
-        small = np.empty((2, 0, 0))
+        small, none = np.empty((2, 0, 0)), np.empty((0, 0), dtype=np.bool_)
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
         if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
             kept = tuple(replace(view, clip=None) for view in kept)
         ends = done.ends_e
         if self._done and not self._opens(len(self._done) - 1) and not self._closes(self._done[-1]):
             self._done[-1] = replace(self._done[-1], ends_e=small)
-        self._done.append(replace(done, strongest=small, views=kept, ends_e=ends))
+        self._done.append(
+            replace(done, strongest=small, masked=none, saturated=none, views=kept, ends_e=ends)
+        )
 
     @property
     def image(self) -> FloatArray:
@@ -211,22 +218,31 @@ class MergedChunks:
             return [float(d) for d in way.shift_px[-1]]
         first = [done for k, done in enumerate(self._done) if self._opens(k)]
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
-        moved = [measure_drift(a.ends_e[0], b.ends_e[1]) for a, b in zip(first, last, strict=True)]
+        moved = [
+            measure_drift(_middle(a.ends_e[0]), _middle(b.ends_e[1]))
+            for a, b in zip(first, last, strict=True)
+        ]
         dy, dx = np.sum(moved, axis=0).tolist()
         return [dy, dx] if math.isfinite(dy) and math.isfinite(dx) else None
 
     @property
     def masked_pixels(self) -> int:
         """Pixels that are not used in some chunk."""
-        return int(np.any([d.masked for d in self._done], axis=0).sum()) if self._done else 0
+        return int(self._masked.sum())
 
     def masks(self) -> tuple[int, int]:
         """Defective and saturated pixels."""
-        if not self._done:
-            return 0, 0
-        masked = np.any([d.masked for d in self._done], axis=0)
-        saturated = np.any([d.saturated for d in self._done], axis=0)
-        return int(np.sum(masked & ~saturated)), int(saturated.sum())
+        defective = self._masked & ~self._saturated
+        return int(defective.sum()), int(self._saturated.sum())
+
+
+def _middle(image: FloatArray) -> FloatArray:
+    """Cut the middle out of a large image: its pattern moves as all of it does.
+
+    Shapes: `image` (y, x).
+    """
+    sides = (slice((n - min(n, _DRIFT_PX)) // 2, (n + min(n, _DRIFT_PX)) // 2) for n in image.shape)
+    return image[tuple(sides)]
 
 
 def is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:

@@ -34,7 +34,10 @@ _HIDDEN = "partly hidden by bright or ill-described particles"
 
 @dataclass(frozen=True)
 class _Seen:
-    """What some frames next to each other show; nothing where they have no light."""
+    """What some frames next to each other show; nothing where they have no light.
+
+    The image is that of the middle of the field.
+    """
 
     light_e: float = math.nan
     noise: float = math.nan
@@ -75,7 +78,7 @@ def _span(compared: Compared) -> tuple[int, int]:
 
 
 def _look(movie: Stack, camera: Camera, start: int, stop: int) -> _Seen:
-    """Measure light and noise of some frames, and their mean image."""
+    """Measure light and noise of some frames, and the middle of their mean image."""
     counts = movie.read(start, stop)
     light, repeats = measure_frames(counts, camera)
     good = well_lit(light, DARK) & ~repeats
@@ -93,7 +96,7 @@ def _look(movie: Stack, camera: Camera, start: int, stop: int) -> _Seen:
     if used.any():
         steps = np.mean(np.diff(electrons, axis=0) ** 2, axis=0)
         noise = float(steps[used].sum() / (2 * expected[used].sum()))
-    return _Seen(float(power.mean()), noise, mean)
+    return _Seen(float(power.mean()), noise, _middle(mean).copy())
 
 
 def _drift(
@@ -107,7 +110,7 @@ def _drift(
     for number, (one, held) in enumerate(zip(seen, inside, strict=True)):
         if one.image is None or additive:
             continue
-        pattern = pattern_of(_middle(one.image))
+        pattern = pattern_of(one.image)
         if held != begun or reference is None:
             reference, begun, origin = pattern, held, latest
         shift = np.array(pattern.shift_from(reference))
