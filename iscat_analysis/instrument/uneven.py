@@ -170,8 +170,10 @@ class Change:
         """Say so."""
         if DRIFT in self.terms:
             return f"the focus moves by about {self.rise_nm:+.0f} nm over the movie"
-        if self.kind in (JUMP, RESTLESS) or BEND in self.terms:
+        if self.kind == RESTLESS:
             return f"{self.kind}, by about {self.rise_nm:.0f} nm"
+        if set(self.terms) & set(MOVES):  # to first order its course is not known
+            return f"the focus moves by about {self.rise_nm:.0f} nm within the movie"
         size = math.hypot(*self.terms.values())
         unit = "deg" if next(iter(self.terms), "").endswith("_deg") else "nm"
         return f"{self.kind} by about {size:.0f} {unit} towards the edge of the field"
@@ -303,7 +305,10 @@ class _Wishes:
         largest = zip(self.asked.names, changes.tolist(), strict=True)
         if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest):
             return None
-        return Change(kind, terms, significance, rise_nm(terms, self.view.frames))
+        clearness = significance - 2 * math.log(
+            trials
+        )  # the likeliest of many is so by chance, too
+        return Change(kind, terms, clearness, rise_nm(terms, self.view.frames))
 
 
 def _by_no_chance(significance: float, parameters: int, trials: int = 1) -> bool:
