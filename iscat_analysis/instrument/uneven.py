@@ -338,14 +338,16 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
+_VOTE = 6.0  # standard errors that each particle counts for at most
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
 def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
     """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
 
-    Around each particle every frame is compared with the change from one end to the other.  The
-    roots of what all of them gain from a step are added: one that leaves outweighs no others.
+    Around each particle every frame is compared with the change from one end to the other, and the
+    standard errors of a step are added.  Each has a vote of at most so many until the frames are
+    near: what lands beside a few of them outweighs no jump, which all of them see.
     """
     order = sorted(sights, key=lambda sight: sight.shown)
     last, first = (order[k] for k in between)
@@ -360,7 +362,7 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
         for sight in order
         if sight.step < low
     ]
-    found = round((last.shown + first.shown) / 2)
+    found, vote = round((last.shown + first.shown) / 2), _VOTE
     while places and high - low > 2 * _ENDS + 1:
         frames = np.unique(np.linspace(low + _ENDS, high - _ENDS - 1, _LOOKED_AT).astype(int))
         looked = [*range(low, low + _ENDS), *frames.tolist(), *range(high - _ENDS, high)]
@@ -373,12 +375,15 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
             change = seen[-_ENDS:].mean(axis=0) - seen[:_ENDS].mean(axis=0)
             sums = np.cumsum(seen[_ENDS:-_ENDS] @ change)
             steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
-            clear += np.sqrt(number * number[::-1]) * np.abs(steps) / np.linalg.norm(change)
+            noise = np.std(np.diff(seen, axis=0)) / math.sqrt(2) * np.linalg.norm(change)
+            clear += np.minimum(
+                np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise, vote
+            )
         found = int(frames[int(np.argmax(clear)) + 1])
         around = max(found - 2 * _ENDS, low), min(found + 2 * _ENDS, high)
         if around == (low, high):
             break
-        low, high = around
+        (low, high), vote = around, math.inf
     return found
 
 
