@@ -171,8 +171,10 @@ class Change:
         """Say so."""
         if DRIFT in self.terms:
             return f"the focus moves by about {self.rise_nm:+.0f} nm over the movie"
-        if self.kind in (JUMP, RESTLESS) or BEND in self.terms:
+        if self.kind == RESTLESS:
             return f"{self.kind}, by about {self.rise_nm:.0f} nm"
+        if set(self.terms) & set(MOVES):  # to first order its course is not known
+            return f"the focus moves by about {self.rise_nm:.0f} nm within the movie"
         size = math.hypot(*self.terms.values())
         unit = "deg" if next(iter(self.terms), "").endswith("_deg") else "nm"
         return f"{self.kind} by about {size:.0f} {unit} towards the edge of the field"
@@ -304,7 +306,10 @@ class _Wishes:
         largest = zip(self.asked.names, changes.tolist(), strict=True)
         if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest):
             return None
-        return Change(kind, terms, significance, rise_nm(terms, self.view.frames))
+        clearness = significance - 2 * math.log(
+            trials
+        )  # the likeliest of many is so by chance, too
+        return Change(kind, terms, clearness, rise_nm(terms, self.view.frames))
 
 
 def _by_no_chance(significance: float, parameters: int, trials: int = 1) -> bool:
@@ -332,14 +337,16 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
+_VOTE = 6.0  # standard errors that each particle counts for at most
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
 def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
     """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
 
-    Around each particle every frame is compared with the change from one end to the other.  The
-    roots of what all of them gain from a step are added: one that leaves outweighs no others.
+    Around each particle every frame is compared with the change from one end to the other, and the
+    standard errors of a step are added.  Each has a vote of at most so many until the frames are
+    near: what lands beside a few of them outweighs no jump, which all of them see.
     """
     order = sorted(sights, key=lambda sight: sight.shown)
     last, first = (order[k] for k in between)
@@ -354,7 +361,7 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
         for sight in order
         if sight.step < low
     ]
-    found = round((last.shown + first.shown) / 2)
+    found, vote = round((last.shown + first.shown) / 2), _VOTE
     while places and high - low > 2 * _ENDS + 1:
         frames = np.unique(np.linspace(low + _ENDS, high - _ENDS - 1, _LOOKED_AT).astype(int))
         looked = [*range(low, low + _ENDS), *frames.tolist(), *range(high - _ENDS, high)]
@@ -367,12 +374,15 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
             change = seen[-_ENDS:].mean(axis=0) - seen[:_ENDS].mean(axis=0)
             sums = np.cumsum(seen[_ENDS:-_ENDS] @ change)
             steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
-            clear += np.sqrt(number * number[::-1]) * np.abs(steps) / np.linalg.norm(change)
+            noise = np.std(np.diff(seen, axis=0)) / math.sqrt(2) * np.linalg.norm(change)
+            clear += np.minimum(
+                np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise, vote
+            )
         found = int(frames[int(np.argmax(clear)) + 1])
         around = max(found - 2 * _ENDS, low), min(found + 2 * _ENDS, high)
         if around == (low, high):
             break
-        low, high = around
+        (low, high), vote = around, math.inf
     return found
 
 
