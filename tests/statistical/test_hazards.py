@@ -1,4 +1,4 @@
-"""Movies in which something is wrong, from ``benchmarks/hazards.py``: right, or flagged with words."""
+"""Movies of ``benchmarks/hazards.py``, in which something is wrong: right, or flagged in words."""
 
 from __future__ import annotations
 
