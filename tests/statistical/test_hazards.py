@@ -14,7 +14,7 @@ from hazards import judge
 
 pytestmark = pytest.mark.large
 
-SEEDS = range(31, 61, 10)
+SEEDS = range(31, 81, 10)
 
 
 @pytest.mark.parametrize(
