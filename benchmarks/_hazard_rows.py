@@ -215,6 +215,11 @@ def breath(strength: float, seed: int) -> Case:
     return usual(alike(), seed, course=breathing(strength))
 
 
+def breath_of_heavy(strength: float, seed: int) -> Case:
+    """Do the same to particles that are all bright enough to show it."""
+    return usual(alike(), seed, course=breathing(strength), masses=(430.0,))
+
+
 def among(draw: Draw, kda: float, number: int, seed: int) -> Case:
     """Let bright ones land among proteins."""
     every = draw_landings(SHAPE, COUNT + number, seed=seed, masses=(1.0,), apart_px=APART_PX)
@@ -351,6 +356,9 @@ ROWS: Mapping[str, Row] = {
     "jitter": Row(jitter, (15.0, 10.0, 25.0), "nm rms", "wiggle|wider"),
     "light that rises": Row(slow, (40.0, 10.0, 20.0), "frames", "rises|goes on changing"),
     "breathing": Row(breath, (0.05, 0.03, 0.1), "", "fluctuate|goes on changing"),
+    "breathing of heavy ones": Row(
+        breath_of_heavy, (0.05, 0.03, 0.1), "", "fluctuate|goes on changing"
+    ),
     "cone of illumination": Row(cone, (0.1, 0.05, 0.15), "rad", _MODEL),
     "two halves": Row(halves, (100.0, 50.0, 200.0), "nm", "wider|extended|apart"),
     "aggregates among proteins": Row(aggregates, (5e3, 2e3, 1e4), "kDa"),

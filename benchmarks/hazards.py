@@ -10,10 +10,10 @@ scatter; the systematic error that they state; the bias over both together; the 
 the lines that name the cause.
 
 A row keeps its promise where the bias of its ``ok`` rows lies within `SIGMAS` of both errors
-together, no more than one of 500 is beyond `BEYOND`, and no more are of no particle than
-false alarms allow; or where no row is ``ok`` and the cause is named.  A control whose truth is
-changed afterwards must be found broken.  Exit status 1 where a row breaks its promise, or the
-control does not.
+together, no more than one of 500 is beyond `BEYOND`, and no more are of no particle than false
+alarms allow; or where no row is ``ok``, or the movie is refused, and the cause is named.  A control
+whose truth is changed afterwards must be found broken.  Exit status 1 where a row breaks its
+promise, or the control does not.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from _hazard_movies import GAIN, NOMINAL, PIXEL_NM, Case
 from _hazard_rows import ROWS, Row
 
 import iscat_analysis as ia
+from iscat_analysis.errors import DataError
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SIGMAS, BEYOND, ONE_OF = 2.0, 5.0, 500
@@ -49,6 +50,10 @@ SETUP: Mapping[str, Any] = {
     "detection.false_alarms_per_movie": FALSE_ALARMS,
     "compute.workers": 1,
 }
+NOTHING = pd.DataFrame(
+    {name: np.zeros(0) for name in ("value", "true", "sigma", "systematic")}
+    | {name: np.zeros(0, dtype=str) for name in ("status", "flags")}
+)
 
 
 def masses(case: Case, result: ia.Result) -> pd.DataFrame:
@@ -96,15 +101,15 @@ def analyse(row: Row, strength: float, seed: int) -> tuple[pd.DataFrame, dict[st
     start = time.perf_counter()
     settings = {**setup, **case.settings}
     name = None if isinstance(case.counts, Path) else "movie"
-    result = ia.fit_movie(case.counts, settings=settings, name=name)
+    facts = {"particles": len(case.truth.frame), "searched": None}
+    try:
+        result = ia.fit_movie(case.counts, settings=settings, name=name)
+    except DataError as error:  # a movie that is refused does not lie
+        return NOTHING, {**facts, "said": [str(error)], "seconds": time.perf_counter() - start}
     table = (diffusion if row.diffusion else masses)(case, result)
-    searched = result.summary.get("landing", {}).get("searched_share")
-    return table.assign(seed=seed), {
-        "particles": len(case.truth.frame),
-        "searched": searched,
-        "said": list(result.summary["warnings"]),
-        "seconds": time.perf_counter() - start,
-    }
+    facts["searched"] = result.summary.get("landing", {}).get("searched_share")
+    said = list(result.summary["warnings"])
+    return table, {**facts, "said": said, "seconds": time.perf_counter() - start}
 
 
 def judge(name: str, row: Row, strength: float, seeds: range) -> dict[str, Any]:
@@ -147,7 +152,7 @@ def judge(name: str, row: Row, strength: float, seeds: range) -> dict[str, Any]:
     out["named"] = named
     right = enough and abs(out["bias_over_both"]) <= SIGMAS and beyond <= count // ONE_OF
     few = invented <= alarms + CHANCE_FALSE * np.sqrt(alarms)
-    out["kept"] = bool((right and few) or (not len(good) and len(table) and named))
+    out["kept"] = bool((right and few) or (not len(good) and named))
     return out
 
 

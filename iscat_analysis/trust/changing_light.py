@@ -32,8 +32,10 @@ _LEAST_MASS_RATIO_BESIDE = 5.0
 _BESIDE = 0.61  # λ/NA within which that is
 # Ratio of masses up to which two steps close in time may be two halves of one landing.
 _MOST_MASS_RATIO = 3.0
-# Expected gain in log-likelihood of a rise over a step, from which on rises are always seen.
-_LEAST_GAIN_SEEN = 10.0
+# Expected gain in log-likelihood of a rise over a step, from which on rises are mostly seen, and
+# from which on a step without one does not rise. A rise that is missed makes the mass, and this
+# gain with it, too small.
+_LEAST_GAIN_SEEN, _LEAST_GAIN_CERTAIN = 10.0, 30.0
 _FEWEST, _SHARE = 3, 0.2  # rises, and their share of the steps in which they would be seen
 # Share of rising steps that go on rising, beyond which all may; by chance it is 0.002.
 _LEAST_SHARE_CONTINUING = 0.1
@@ -99,13 +101,14 @@ def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]
     mass, crb = (table[name].to_numpy(float) for name in ("mass_kda", "crb_mass_kda"))
     before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
     one2 = (mass / crb) ** 2 * (before + after) / (before * after)
-    seen = np.nan_to_num(one2) * frames / 24 > _LEAST_GAIN_SEEN
+    gain = np.nan_to_num(one2) * frames / 24
+    seen = gain > _LEAST_GAIN_SEEN
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()
     many = (goes_on & rising).sum() >= max(_FEWEST, _LEAST_SHARE_CONTINUING * rising.sum())
     alike = rising if many else nothing[0]
-    return (~rising & ~seen) | alike, frames
+    return (~rising & (gain < _LEAST_GAIN_CERTAIN)) | alike, frames
 
 
 def rise_message(frames: float, unseen: int, rising: int, rows: int) -> str:

@@ -295,5 +295,7 @@ def test_faint_steps_may_rise_as_the_bright_ones_do() -> None:
     unseen, frames = may_rise(table, told)
     assert frames == 40
     assert unseen.tolist() == [False] * 20 + [True] * 10
+    table.loc[20:, "mass_kda"] = 60.0  # of which some show it, and some do not
+    assert may_rise(table, told)[0].tolist() == [False] * 20 + [True] * 10
     few = Evidence(*np.zeros((10, 30)), np.where(np.arange(30) < 2, 40.0, 0.0))
     assert not may_rise(table, few)[0].any()
