@@ -12,7 +12,7 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from iscat_analysis.records import Analysis
-from iscat_analysis.report import drawing
+from iscat_analysis.report import page
 from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.style import Sketch
 
@@ -23,7 +23,6 @@ PAGES = tuple(
         "benchmark",
         "bounds",
         "calibration",
-        "drawing",
         "estimators",
         "optics",
         "page",
@@ -77,4 +76,4 @@ def sketch_figures(patch: pytest.MonkeyPatch) -> None:
     """Let every report be written without its figures."""
     for module in PAGES:
         patch.setattr(module, "publish", sketch)
-    patch.setattr(drawing, "event_figures", without_images)
+    patch.setattr(page, "event_figures", without_images)

@@ -6,7 +6,6 @@ second one draws.
 
 from __future__ import annotations
 
-from itertools import chain
 from pathlib import Path
 
 from markupsafe import Markup
@@ -40,15 +39,11 @@ def draw_part(
     analysis: Analysis, folder: Path, most: int, part: int, *, progress: Progress = silent
 ) -> dict[str, Markup]:
     """Draw a part of the figures into a folder."""
-    from iscat_analysis.report.event_figures import event_figures
-    from iscat_analysis.report.page import page_sketches
-    from iscat_analysis.report.style import drawn, publish
+    from iscat_analysis.report.page import publish_figures
 
     del progress
-    sketches = chain(page_sketches(analysis, event_table(analysis)), event_figures(analysis, most))
-    some = [
-        sketch
-        for number, sketch in enumerate(sketches)
-        if (number % _SHARE == 0) == (part == _HERE)
-    ]
-    return publish(drawn(some), folder)
+
+    def is_ours(number: int) -> bool:
+        return (number % _SHARE == 0) == (part == _HERE)
+
+    return publish_figures(analysis, folder, most, is_ours)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from markupsafe import Markup
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.context import report_context
 from iscat_analysis.report.distribution import distribution_section, species_figure
-from iscat_analysis.report.event_figures import corner_figures
+from iscat_analysis.report.event_figures import corner_figures, event_figures
 from iscat_analysis.report.figures import page_figures
 from iscat_analysis.report.headline import caution, is_uncalibrated
 from iscat_analysis.report.style import Sketch, drawn, publish
@@ -71,6 +72,15 @@ def render_report(analysis: Analysis, *, folder: Path | None = None) -> str:
     table = event_table(analysis)
     about = page_context(analysis, table, folder)
     return page_of(about, publish(drawn(page_sketches(analysis, table)), folder))
+
+
+def publish_figures(
+    analysis: Analysis, folder: Path, most: int, chosen: Callable[[int], bool]
+) -> dict[str, Markup]:
+    """Write those figures of a folder whose numbers are chosen; images of `most` events at most."""
+    sketches = chain(page_sketches(analysis, event_table(analysis)), event_figures(analysis, most))
+    some = [sketch for number, sketch in enumerate(sketches) if chosen(number)]
+    return publish(drawn(some), folder)
 
 
 def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:

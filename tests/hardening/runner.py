@@ -31,11 +31,11 @@ sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 from sketches import PAGES, sketch
 
 from iscat_analysis import pipeline  # what a run imports, before the clock runs
-from iscat_analysis.report import drawing
+from iscat_analysis.report import page
 from iscat_analysis.search.sliding import chunks
 from iscat_cli import main
 
-LOADED = (pipeline, drawing)
+LOADED = (pipeline, page)
 _SKETCH = partial(sketch, pause_s=0.01)  # a moment to be killed in, at each figure
 
 
