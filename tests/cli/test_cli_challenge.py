@@ -135,4 +135,3 @@ def test_estimators_are_compared_on_the_same_counts(
         rows = [who for row in table["best"] for who in row]
         assert len(rows) == len(found["photons"]) * len(found["height_nm"])
         assert rows.count("iscat") > len(rows) / 2, name
-    assert (out / "figures" / "estimators_map.png").stat().st_size > 10000
