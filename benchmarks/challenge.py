@@ -2,10 +2,14 @@
 
     python benchmarks/challenge.py                  # all presets, ten minutes
     python benchmarks/challenge.py easy hard
+    python benchmarks/challenge.py map              # ten minutes; who is best where
 
 Every estimator that is installed is run on the counts of every particle, given a start within a
 pixel.  Movies are analysed by `iscat-fit` as well, which has to find the particles, and under an
 unknown microscope to learn it; stacks by the Octave script beside this file, where there is one.
+
+``map`` is `iscat benchmark` of ``sample_configs/mass.toml`` with all of them, in its three modes
+(``benchmark_mass.csv``) and by height and collected photons (``benchmark_map.csv``).
 """
 
 from __future__ import annotations
@@ -15,10 +19,13 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
+from iscat_analysis.report.estimators import contest_parts
 from iscat_analysis.study.challenge_presets import ABOUT
 from iscat_analysis.study.estimators import known_estimators
 
@@ -54,11 +61,39 @@ def results_of(folder: Path) -> list[Path]:
     return found
 
 
-def table_of(scores: Path) -> pd.DataFrame:
+def map_of(found: Mapping[str, Any]) -> pd.DataFrame:
+    """Tabulate who keeps most of the information at each height and light."""
+    return pd.DataFrame([
+        {"parameter": name, "height_nm": height, "photons": photons, "best": table["best"][r][c],
+         "kept": table["kept"][r][c], "as_good": " ".join(table["equal"][r][c] or ())}
+        for name, table in found["parameters"].items()
+        for r, height in enumerate(found["height_nm"])
+        for c, photons in enumerate(found["photons"])
+    ])  # fmt: skip
+
+
+def benchmark_all(chosen: list[str], trials: int) -> None:
+    """Run a benchmark of one configuration with all estimators."""
+    out, config = RESULTS / "map", ROOT.parent / "sample_configs" / "mass.toml"
+    estimators = [part for name in chosen for part in ("--estimator", name)]
+    run("iscat", "benchmark", "--config", config, "--set", "bounds.pixels=33", "--trials", trials,
+        "--no-posterior", "--out", out, "--overwrite", *estimators)  # fmt: skip
+    write_benchmark(out / "benchmark.json")
+
+
+def write_benchmark(path: Path) -> None:
+    """Write the two tables of a benchmark."""
+    study = json.loads(path.read_text(encoding="utf-8"))
+    table = table_of(contest_parts(study))
+    table.to_csv(ROOT / "benchmark_mass.csv", index=False, float_format="%.4g")
+    found = map_of(study["estimator_map"])
+    found.to_csv(ROOT / "benchmark_map.csv", index=False, float_format="%.4g")
+
+
+def table_of(parts: Mapping[str, Any]) -> pd.DataFrame:
     """Tabulate what was scored, without the resamples' intervals of everything."""
-    document = json.loads(scores.read_text(encoding="utf-8"))
     rows = []
-    for part, entries in document["parts"].items():
+    for part, entries in parts.items():
         for who, entry in entries["estimators"].items():
             for name in ("x_nm", "y_nm", "z_nm", "mass_kda"):
                 scored = entry.get(name)
@@ -73,18 +108,23 @@ def table_of(scores: Path) -> pd.DataFrame:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Estimators on the ready challenges.")
     parser.add_argument("presets", nargs="*", default=list(ABOUT))
+    parser.add_argument("--trials", type=int, default=120, help="of map, in each mode")
     parser.add_argument("--estimator", action="append", help="default: all that are installed")
     options = parser.parse_args()
     RESULTS.mkdir(parents=True, exist_ok=True)
     installed = [one.name for one in known_estimators() if not one.missing]
     chosen = options.estimator or installed
     for preset in options.presets:
+        if preset == "map":
+            benchmark_all(chosen, options.trials)
+            continue
         folder, scores = RESULTS / preset, RESULTS / f"{preset}-scores"
         run("iscat", "challenge", "make", "--preset", preset, "--out", folder, "--overwrite")
         estimators = [part for name in chosen for part in ("--estimator", name)]
         run("iscat", "challenge", "score", folder, *results_of(folder), *estimators,
             "--out", scores, "--overwrite")  # fmt: skip
-        table = table_of(scores / "challenge.json")
+        document = json.loads((scores / "challenge.json").read_text(encoding="utf-8"))
+        table = table_of(document["parts"])
         table.to_csv(ROOT / f"challenge_{preset}.csv", index=False, float_format="%.4g")
         print(f"{preset}: {len(table)} rows; {scores / 'challenge.html'}")
 

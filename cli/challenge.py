@@ -194,6 +194,8 @@ def publish_scores(
             for name, found in entry.items():
                 if isinstance(found, Mapping) and found.get("below_bound"):
                     messages.notify(f"{part}, {who}, {name}: {found['verdict']}")
+            for why, times in entry.get("failures", {}).items():
+                messages.notify(f"{part}, {who}: {times} of {entry['trials']} failed: {why}")
 
 
 def scores_table(scores: Mapping[str, Any]) -> Table:
@@ -202,6 +204,9 @@ def scores_table(scores: Mapping[str, Any]) -> Table:
     shown = table("part", "estimator", "parameter", *headings)
     for part, entries in scores["parts"].items():
         for who, entry in entries["estimators"].items():
+            if entry["failed"] == entry["trials"]:
+                nothing = ["–"] * (len(headings) - 1)
+                shown.add_row(part, who, "–", *nothing, f"0 of {entry['trials']}")
             for name, found in entry.items():
                 if not isinstance(found, Mapping) or "efficiency_crb" not in found:
                     continue

@@ -25,6 +25,7 @@ CHALLENGE_NAMES = frozenset({"challenge.json", "challenge.html", "benchmark.bib"
 
 _COLOURS = ("#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6A3D9A", "#8A8F96", "#B15928")
 _MARKERS = "os^Dv<>PXph*"
+_MAP_COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#CC79A7", "#F0E442", "#D55E00", "#8A8F96")
 
 _AXES = {
     "photons": ("collected scattered photons", True),
@@ -374,14 +375,14 @@ def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
     tables = {p: found["parameters"][p] for p in LABELS if p in found["parameters"]}
     winners = {who for table in tables.values() for row in table["best"] for who in row if who}
     letters = {who: chr(ord("A") + k) for k, who in enumerate(w for w in names if w in winners)}
-    colours = {who: _COLOURS[names.index(who) % len(_COLOURS)] for who in letters}
+    colours = {who: _MAP_COLOURS[k % len(_MAP_COLOURS)] for k, who in enumerate(letters)}
     figure = new_figure(1.1 + 2.4 * len(tables), 3.6)
     every = figure.subplots(1, len(tables), squeeze=False)[0]
     for place, (axes, (name, table)) in enumerate(zip(every, tables.items(), strict=True)):
         for row, column in np.ndindex(len(found["height_nm"]), len(found["photons"])):
             best, kept, equal = (table[key][row][column] for key in ("best", "kept", "equal"))
             colour = colours.get(best, GREY)
-            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, alpha=0.45,
+            axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=colour, alpha=0.6,
                                      edgecolor="white", linewidth=1.5))  # fmt: skip
             text = f"{letters[best]} {number(kept, 2)}{'+' if equal else ''}" if best else "—"
             axes.text(column, row, text, ha="center", va="center", fontsize=7.5, color=INK)
@@ -397,7 +398,7 @@ def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
         if not place:
             axes.set_ylabel("height [nm]")
     patches = [
-        Patch(facecolor=colours[who], alpha=0.45, label=f"{letter} {who}")
+        Patch(facecolor=colours[who], alpha=0.6, label=f"{letter} {who}")
         for who, letter in letters.items()
     ]
     figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 5) or 1,

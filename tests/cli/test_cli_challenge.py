@@ -41,16 +41,20 @@ def test_a_blind_challenge_from_making_to_the_page(
     results, out = tmp_path / "r.csv", tmp_path / "scores"
     _results(made).to_csv(results, index=False)
     archive = ["--archive", str(tmp_path / "scores.zip")]
-    assert main(["challenge", "score", str(made), str(results), "--out", str(out), *archive]) == 0
+    scored = ["challenge", "score", str(made), str(results), "--estimator", "json:dumps"]
+    assert main([*scored, "--out", str(out), *archive]) == 0
     shown = capsys.readouterr()
     assert "efficiency" in shown.out
+    assert "0 of 26" in shown.out
+    assert "stack, json:dumps: 26 of 26 failed: TypeError" in shown.err
     assert "stack, r, mass_kda: below the bound" in shown.err
     written = json.loads((out / "challenge.json").read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator(schema("challenge")).validate(written)
     assert written["challenge"]["blind"]
     assert written["parts"]["stack"]["estimators"]["r"]["mass_kda"]["below_bound"]
-    assert written["ranking"] == [{"estimator": "r", "kept": written["ranking"][0]["kept"],
-                                   "below_bound": True}]  # fmt: skip
+    assert [(one["estimator"], one["below_bound"]) for one in written["ranking"]] == [
+        ("json:dumps", False), ("r", True)
+    ]  # fmt: skip
     page = (out / "challenge.html").read_text(encoding="utf-8")
     assert "not ranked" in page
     assert (tmp_path / "scores.zip").stat().st_size > 1000
@@ -123,4 +127,11 @@ def test_estimators_are_compared_on_the_same_counts(
     assert sum(failed["failures"].values()) == 40
     assert written["ranking"][0]["estimator"] == "iscat"
     assert set(written["estimator_curves"]) >= {"photons", "mass", "height", "focus", "density"}
-    assert "Where each is best" in (out / "benchmark.html").read_text(encoding="utf-8")
+    page = (out / "benchmark.html").read_text(encoding="utf-8")
+    assert "Where each is best" in page
+    assert "Who is best where" in page
+    found = written["estimator_map"]
+    for name, table in found["parameters"].items():
+        rows = [who for row in table["best"] for who in row]
+        assert len(rows) == len(found["photons"]) * len(found["height_nm"])
+        assert rows.count("iscat") > len(rows) / 2, name
