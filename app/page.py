@@ -55,15 +55,21 @@ def page_of(folder: Path, queue: Queue) -> Any:
         Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen),
         Calibrate(chosen), Bounds(chosen), Export(chosen, results),
     ]  # fmt: skip
+    # Filled when first opened, for speed, and kept: what the browser says of a list that the server
+    # has taken away is lost without a word, as it would be of `dynamic` tabs.
+    places = [pn.Column(sizing_mode="stretch_width") for _ in parts]
     tabs = pn.Tabs(
-        *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width",
-        stylesheets=[_TABS],
+        *[(part.title, place) for part, place in zip(parts, places, strict=True)],
+        sizing_mode="stretch_width", stylesheets=[_TABS],
     )  # fmt: skip
 
     def show(*_: Any) -> None:
         heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"
         colours.object = _colours(chosen)
-        parts[tabs.active].refresh()
+        part, place = parts[tabs.active], places[tabs.active]
+        part.refresh()
+        if not len(place):
+            place.append(part.body)
 
     def remember(*_: Any) -> None:
         if pn.state.location is not None:
