@@ -148,11 +148,13 @@ def find_species(
             table, sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
             above_kda=above_kda,
         )  # fmt: skip
-    wanted = len(choice.masses_kda) if isinstance(choice, Begun) else k or 0
+    wanted, fewer = k or 0, "a smaller `k`"
+    if isinstance(choice, Begun):
+        wanted, fewer = len(choice.masses_kda), "fewer in `start_kda`"
     if table.mass_kda.size < _EVENTS_EACH * wanted:
         raise DataError(
             f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {wanted} "
-            f"species, which need {_EVENTS_EACH} each; give fewer"
+            f"species, which need {_EVENTS_EACH} each; give {fewer}"
         )
     if isinstance(choice, (Begun, Given)):
         argument = "`masses_kda`" if isinstance(choice, Given) else "`start_kda`"

@@ -261,8 +261,8 @@ def test_peaks_may_be_named() -> None:
     """Peaks at 1, 2 and 4 times a mass: those of 132 and 264 kDa lie as those of 66 and 132 do."""
     rng = np.random.default_rng(11)
     contrast = np.concatenate([
-        events(rng, (66.0,), count=400, offset=0.0),
-        events(rng, (132.0, 264.0), count=100, offset=0.0),
+        events(rng, (66.0,), count=240, offset=0.0),
+        events(rng, (132.0, 264.0), count=60, offset=0.0),
     ])  # fmt: skip
     assert calibrate_mass(contrast, (132, 264)).gradient_per_kda == pytest.approx(
         GRADIENT / 2, rel=0.05
