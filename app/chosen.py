@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
+from urllib.parse import urlencode
 
 import panel as pn
 import param
@@ -26,7 +27,9 @@ class Chosen(param.Parameterized):
     movie = param.ClassSelector(class_=Path, default=None, doc="File or folder of a movie.")
     result = param.ClassSelector(class_=Path, default=None, doc="Output folder of a movie.")
     span = param.Tuple(default=None, length=2, doc="Frames to analyse, half-open.")
+    excluded = param.Tuple(default=None, length=2, doc="Frames to leave out, half-open.")
     frame = param.Integer(default=None, allow_None=True, doc="Frame of the event that is shown.")
+    event = param.Integer(default=None, allow_None=True, doc="Its number, for a ring of its own.")
     changed = param.Integer(default=0, doc="Counts what changes on the disk.")
 
     def choose(self, movie: Path | None, result: Path | None = None) -> None:
@@ -34,7 +37,7 @@ class Chosen(param.Parameterized):
         if result is None and movie is not None:
             result = path_beside(movie, ".iscat")
         found = result if result is not None and (result / "summary.json").is_file() else None
-        self.param.update(movie=movie, result=found, frame=None)
+        self.param.update(movie=movie, result=found, frame=None, event=None)
 
     def look_again(self) -> None:
         """See whether there is a result by now."""
@@ -111,6 +114,17 @@ class Notice:
                 raise
 
 
+def in_line(*parts: Any) -> pn.FlexBox:
+    """Put widgets beside each other, on one base line; where the page is narrow, below."""
+    return pn.FlexBox(*parts, align_items="end", sizing_mode="stretch_width")
+
+
+def link_to(page: Path, text: str) -> str:
+    """Link to a page that the commands wrote."""
+    address = html.escape("page?" + urlencode({"path": str(page)}))
+    return f'<a href="{address}" target="_blank" style="color: inherit">{html.escape(text)}</a>'
+
+
 def table_of(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str:
     """Write a table as HTML; its cells are text."""
 
@@ -118,4 +132,5 @@ def table_of(rows: Sequence[tuple[str, ...]], head: tuple[str, ...] = ()) -> str
         return "<tr>" + "".join(f"<{tag}>{html.escape(c)}</{tag}>" for c in cells) + "</tr>"
 
     top = f"<thead>{line(head, 'th')}</thead>" if head else ""
-    return f"<table>{top}<tbody>{''.join(line(row, 'td') for row in rows)}</tbody></table>"
+    body = "".join(line(row, "td") for row in rows)
+    return f'<div style="overflow-x: auto"><table>{top}<tbody>{body}</tbody></table></div>'

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +14,21 @@ from bokeh.plotting import figure
 import iscat_analysis as ia
 from iscat_analysis.answers.gates import MassHistogram, counted_rows, mass_histogram
 from iscat_analysis.report.gates import PALETTES
-from iscat_app.chosen import Chosen, Notice, table_of
+from iscat_app.binding import BindingPart
+from iscat_app.chosen import Chosen, Notice, in_line, link_to, table_of
 from iscat_app.rejections import Rejections
+from iscat_app.runs import Job, Queue
 
 _HEAD = ("sample", "p: same", "p: same masses", "p: same fractions", "species [kDa]", "shift [kDa]",
          "95 %", "fraction", "difference", "95 %")  # fmt: skip
+
+
+_DAY = (
+    "<small>All movies of the folder, or those of its samples.csv, with the day's calibrations "
+    "and in one page; what is finished is left alone.</small>"
+)
+DAY = "day.batch"
+"""Folder of a day's results, beside its movies."""
 
 
 class Compare:
@@ -25,8 +36,8 @@ class Compare:
 
     title = "Compare"
 
-    def __init__(self, chosen: Chosen) -> None:
-        self._chosen = chosen
+    def __init__(self, chosen: Chosen, queue: Queue) -> None:
+        self._chosen, self._queue = chosen, queue
         self._notice = Notice()
         self.samples: list[tuple[str, MassHistogram]] = []
         self._paths = pn.widgets.MultiSelect(label="Results (Ctrl for several)",
@@ -36,15 +47,27 @@ class Compare:
         )
         self._stacked = pn.widgets.Checkbox(label="one above the other")
         test = pn.widgets.Button(label="Test whether they differ", color="primary", width=200)
-        self._plot = pn.pane.Bokeh(figure(width=760, height=420))
+        self._plot = pn.pane.Bokeh(None)
+        day = pn.widgets.Button(label="Analyse the folder as a day", width=200)
+        self._pages = pn.pane.HTML("")
+        self._binding = BindingPart(self._notice, self._tables)
         self._table = pn.pane.HTML("", sizing_mode="stretch_width")
         for widget in (self._paths, self._bin, self._stacked):
             widget.param.watch(lambda _: self._draw(), "value")
         test.on_click(self._test)
+        day.on_click(self._start_day)
         self.body = pn.Column(
             self._notice.pane,
-            pn.FlexBox(pn.Column(self._paths, pn.Row(self._bin, self._stacked), test), self._plot),
+            pn.FlexBox(
+                pn.Column(self._paths, in_line(self._bin, self._stacked), test, width=460),
+                self._plot,
+            ),
             self._table,
+            "### Binding",
+            self._binding.body,
+            "### The day",
+            pn.pane.HTML(_DAY),
+            in_line(day, self._pages),
         )
 
     def refresh(self) -> None:
@@ -56,7 +79,21 @@ class Compare:
         found = sorted(p for p in place.parent.glob("*.iscat") if (p / "fits.parquet").is_file())
         options = {p.name: str(p) for p in found}
         if options != self._paths.options:
-            self._paths.options = options
+            kept = [path for path in self._paths.value if path in options.values()]
+            self._paths.param.update(options=options, value=kept)
+        pages = sorted(place.parent.glob("*/batch.html"))
+        self._pages.object = " · ".join(
+            link_to(page, f"Page of {page.parent.name}") for page in pages
+        )
+
+    def _start_day(self, _: Any) -> None:
+        place = self._chosen.movie
+        if place is None:
+            self._notice.say("Choose a movie under Open; its folder is the day.", "error")
+            return
+        folder = place.parent
+        self._queue.add(Job(folder, self._chosen.config, folder / DAY, "day"))
+        self._notice.say("The day is in the queue: Run shows how far it is.")
 
     def _tables(self) -> list[tuple[str, Any]]:
         """Read the events that count: ok, and not rejected."""
@@ -73,13 +110,15 @@ class Compare:
     def _draw(self) -> None:
         self._notice.say("")
         with self._notice.told():
+            self._binding.show([Path(text).stem for text in self._paths.value])
             self.samples = [
                 (name, mass_histogram(table["mass_kda"].to_numpy(float), bin_kda=self._bin.value))
                 for name, table in self._tables()
             ]
-            plot = figure(width=760, height=420, x_axis_label="|mass| [kDa]",
+            plot = figure(width=640, height=420, x_axis_label="|mass| [kDa]",
                           y_axis_label=f"share of events per {self._bin.value:g} kDa",
                           tools="xwheel_zoom,pan,reset,save")  # fmt: skip
+            plot.toolbar.logo = None
             plot.add_layout(Legend(click_policy="hide"), "right")
             colours = PALETTES["colour-blind safe"]
             most = max(
@@ -114,15 +153,25 @@ class Compare:
 def _rows(names: list[str], found: list[ia.Comparison]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for name, each in zip(names, found, strict=True):
-        tests = [f"{t.p_value:.3g}" for t in (each.same, each.same_masses, each.same_fractions)]
+        tests = [_said(t.p_value, ".3g") for t in
+                 (each.same, each.same_masses, each.same_fractions)]  # fmt: skip
         for place, s in enumerate(each.species.to_dict("records")):
             head = (name, *tests) if place == 0 else ("", "", "", "")
             rows.append(
                 (
-                    *head, f"{s['mass_kda']:.1f}", f"{s['shift_kda']:.2f}",
-                    f"{s['shift_low']:.2f} to {s['shift_high']:.2f}", f"{s['fraction']:.1%}",
-                    f"{s['difference']:.1%}",
-                    f"{s['difference_low']:.1%} to {s['difference_high']:.1%}",
+                    *head, _said(s["mass_kda"], ".1f"), _said(s["shift_kda"], ".2f"),
+                    _between(s["shift_low"], s["shift_high"], ".2f"), _said(s["fraction"], ".1%"),
+                    _said(s["difference"], ".1%"),
+                    _between(s["difference_low"], s["difference_high"], ".1%"),
                 )
             )  # fmt: skip
     return rows
+
+
+def _said(value: float, form: str) -> str:
+    """Write a number; a dash where too few events tell it."""
+    return "–" if math.isnan(value) else format(value, form)
+
+
+def _between(low: float, high: float, form: str) -> str:
+    return "–" if math.isnan(low + high) else f"{low:{form}} to {high:{form}}"

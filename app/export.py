@@ -13,7 +13,7 @@ import iscat_analysis as ia
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.report.gates import PALETTES, Format, figure_bytes, histogram_figure
-from iscat_app.chosen import Chosen, Notice
+from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.results import Results
 
 
@@ -51,7 +51,7 @@ class Export:
         self._buttons = buttons
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(self._width, self._height, self._font, self._palette, self._density),
+            in_line(self._width, self._height, self._font, self._palette, self._density),
             pn.FlexBox(self._preview, pn.Column(*buttons)),
             "### The same without the window",
             self._command,
@@ -123,7 +123,9 @@ class Export:
         if movie is not None:
             again = [str(folder / "config.toml"), "--out", f"{folder.stem}-again.iscat"]
             lines.append(shlex.join(["iscat-fit", str(movie), "--config", *again]))
-        lines.append(shlex.join(["iscat", "species", str(folder)]))
+        start = self._results.start
+        begun = [] if start is None else ["--start", ",".join(f"{mass:g}" for mass in start)]
+        lines.append(shlex.join(["iscat", "species", str(folder), *begun]))
         rejected = self._results.rejected
         if rejected and self._results.rejections is not None:
             lines.append(f"# {len(rejected)} events were rejected by hand: "

@@ -12,7 +12,7 @@ import panel as pn
 import iscat_analysis as ia
 from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.reading import read_json
-from iscat_app.chosen import Chosen, Notice, table_of
+from iscat_app.chosen import Chosen, Notice, in_line, table_of
 
 Kind = Literal["folder", "movie", "result"]
 
@@ -113,12 +113,12 @@ class Files:
         self._filter.param.watch(lambda _: self.refresh(), "value")
         self._list.param.watch(self._pick, "value")
         self._drop.param.watch(self._dropped, "value")
-        self.body = pn.Row(
+        self.body = pn.FlexBox(
             pn.Column(
-                self._where, pn.Row(self._filter, again), self._list, self._drop,
-                sizing_mode="stretch_width", min_width=420,
+                self._where, in_line(self._filter, again), self._list, self._drop,
+                width=640,
             ),
-            pn.Column(self._notice.pane, self._facts, sizing_mode="stretch_width"),
+            pn.Column(self._notice.pane, self._facts, width=560),
             sizing_mode="stretch_width",
         )  # fmt: skip
 

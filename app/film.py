@@ -14,6 +14,7 @@ from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.pipeline.ratio_film import RatioFilm
+from iscat_analysis.report.pictures import SHOWN_FRAMES
 from iscat_app.chosen import Chosen, Notice
 
 RATES = (5, 10, 25, 50, 100, 250, 1000)
@@ -24,9 +25,6 @@ AHEAD = 2
 
 SLIDER_S = 0.25
 """After which the slider of frames follows the film, as it plays."""
-
-SHOWN = 12
-"""Frames around its own in which an event of a landing movie is ringed."""
 
 FIRST_WINDOW = 25
 """Frames of the window before anyone has chosen."""
@@ -51,6 +49,7 @@ class Film:
         self._um = 1.0
         self._limits = (0.0, 1.0)
         self._sent = 0  # pictures
+        self._begun = 0  # of these, before it was played
         self._at = 0  # the frame that is shown
         self._next = 0.0  # where the film is, as it plays
         self._ticked = self._slid = 0.0
@@ -72,7 +71,7 @@ class Film:
             tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom",
             output_backend="canvas", toolbar_location="right",
         )  # fmt: skip
-        self._figure.grid.visible = False
+        self._figure.grid.visible, self._figure.toolbar.logo = False, None
         # Coloured here, which is a tenth of the work that it is in the browser.
         self._figure.image_rgba(image="image", x=0, y=0, dw="dw", dh="dh", source=self._picture)
         self._figure.scatter(
@@ -130,6 +129,7 @@ class Film:
         self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
         self.span = pn.widgets.StaticText(label="Frames marked in the light", value="all")
         self.use_span = pn.widgets.Button(label="Analyse only these frames", disabled=True)
+        self.leave_out = pn.widgets.Button(label="Leave these frames out", disabled=True)
         self.facts = pn.pane.HTML("", width=320)
         self.play.param.watch(self._play, "value")
         self.frame.param.watch(self._frame_moved, "value")
@@ -140,6 +140,7 @@ class Film:
         self.events.param.watch(lambda _: self._ring(), "value")
         self._trace.selected.on_change("indices", self._marked)
         self.use_span.on_click(self._keep_span)
+        self.leave_out.on_click(self._exclude)
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
@@ -150,7 +151,8 @@ class Film:
                 ),
                 pn.Column(
                     self.kind, self.rate, self.window, self.contrast, self.events, self.search,
-                    self.facts, self.span, self.use_span, pn.pane.Bokeh(self._drawn), width=340,
+                    self.facts, self.span, self.use_span, self.leave_out,
+                    pn.pane.Bokeh(self._drawn), width=340,
                 ),
             ),
         )  # fmt: skip
@@ -235,6 +237,7 @@ class Film:
             self.play.value = False
         elif event.new:
             self._next, self._ticked = float(self.frame.value), time.monotonic()
+            self._begun = self._sent
             self._soon()
         elif self._film is not None:
             self._shown_by_player(self.frame.value)
@@ -242,7 +245,8 @@ class Film:
     def _soon(self) -> None:
         """Show the next frame when it is time for it."""
         document = pn.state.curdoc
-        if document is not None and not self._due and self._sent - self._drawn.value < AHEAD:
+        ahead = self._sent - max(self._drawn.value, self._begun)
+        if document is not None and not self._due and ahead < AHEAD:
             self._due = True
             left = 1.0 / self.rate.value - (time.monotonic() - self._ticked)
             document.add_timeout_callback(self._step, max(1, round(1000 * left)))
@@ -346,12 +350,15 @@ class Film:
         at = self._at
         if self.events.value and len(self._events):
             near = self._events[
-                (self._events["frame"] - at).abs().le(SHOWN) & self._events["x_px"].notna()
+                (self._events["frame"] - at).abs().le(SHOWN_FRAMES) & self._events["x_px"].notna()
             ]
             for row in near.to_dict("records"):
                 ok = row["status"] == "ok"
                 colour = _DOUBTFUL if not ok else _LANDS if row["mass_kda"] > 0 else _LEAVES
-                rings.append((row["x_px"], row["y_px"], colour, f"{row['mass_kda']:.0f}"))
+                text = f"{row['mass_kda']:.0f}"
+                if row["event"] == self._chosen.event:
+                    colour, text = _HERE, f"event {row['event']}: {text} kDa"
+                rings.append((row["x_px"], row["y_px"], colour, text))
         if self.search.value and self._found_at == at:
             for row in self._found.to_dict("records"):
                 rings.append((row["x_px"], row["y_px"], _HERE, f"{row['snr']:.1f} σ"))
@@ -420,14 +427,23 @@ class Film:
     def _marked(self, attr: str, old: Any, new: list[int]) -> None:
         del attr, old
         frames = np.asarray(self._trace.data["frame"])[new] if new else np.array([])
-        self.use_span.disabled = not len(frames)
+        self.use_span.disabled = self.leave_out.disabled = not len(frames)
         self.span.value = f"{frames.min()} to {frames.max()}" if len(frames) else "all"
 
-    def _keep_span(self, _: Any) -> None:
+    def _span(self) -> tuple[int, int]:
         first, last = (int(text) for text in self.span.value.split(" to "))
-        self._chosen.span = (first, last + 1)
+        return first, last + 1
+
+    def _exclude(self, _: Any) -> None:
+        first, stop = self._chosen.excluded = self._span()
         self._notice.say(
-            f"fit.frames = [{first}, {last + 1}] goes into the form: save it under Set up."
+            f"[{first}, {stop}] goes into fit.excluded_frames of the form: save it under Set up."
+        )
+
+    def _keep_span(self, _: Any) -> None:
+        first, stop = self._chosen.span = self._span()
+        self._notice.say(
+            f"fit.frames = [{first}, {stop}] goes into the form: save it under Set up."
         )
 
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import html
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import panel as pn
 
 import iscat_analysis as ia
-from iscat_analysis.config import config_to_toml, parse_config, toml_value
-from iscat_analysis.files import whole_file
 from iscat_analysis.pipeline.setup import Setup, write_setup
+from iscat_app.calibrations import Taken
 from iscat_app.chosen import Chosen, Notice
+from iscat_app.setup_file import plain, read_texts, toml_text, write_texts
 
 FIRST = (
     "camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind", "fit.mode",
@@ -88,56 +88,6 @@ def _choices(said: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(found)
 
 
-def read_texts(path: Path | None) -> dict[str, str]:
-    """Read a configuration file as texts by key."""
-    if path is None:
-        return {}
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, OSError) as error:
-        raise ia.ConfigError(f"{path}: cannot be read ({error})") from None
-    return {
-        f"{section}.{name}": toml_text(value)
-        for section, table in values.items()
-        if isinstance(table, dict)
-        for name, value in table.items()
-    }
-
-
-def toml_text(value: Any) -> str:
-    """Write what tomllib has read."""
-    return toml_value(tuple(value) if isinstance(value, list) else value)
-
-
-def write_texts(path: Path, texts: Mapping[str, str]) -> ia.Config:
-    """Check texts by key, and write them as a configuration file."""
-    tables: dict[str, list[str]] = {}
-    for key, text in texts.items():
-        section, _, name = key.partition(".")
-        tables.setdefault(section, []).append(f"{name} = {_as_toml(text)}")
-    written = "# Written by `iscat app`; `iscat config` prints every key there is.\n"
-    for section, lines in tables.items():
-        written += f"\n[{section}]\n" + "\n".join(lines) + "\n"
-    checked = parse_config(tomllib.loads(written), where=str(path))
-    with whole_file(path) as partial:
-        partial.write_text(written, encoding="utf-8")
-    return checked
-
-
-def _plain(text: str) -> str:
-    """Take the quotes off a text."""
-    return str(tomllib.loads(f"value = {text}")["value"]) if text.startswith('"') else text
-
-
-def _as_toml(text: str) -> str:
-    """Put quotes around what is a text and has none."""
-    try:
-        tomllib.loads(f"value = {text}")
-    except tomllib.TOMLDecodeError:
-        return toml_value(text.strip())
-    return text.strip()
-
-
 class Form:
     """The form, for the movie that is chosen."""
 
@@ -151,6 +101,7 @@ class Form:
         self._first = pn.Column()
         self._rest = pn.Accordion(sizing_mode="stretch_width")
         self._written = pn.pane.Str("", sizing_mode="stretch_width")
+        self._taken = Taken(chosen, self._notice)
         propose = pn.widgets.Button(label="Propose from the movie", width=190)
         save = pn.widgets.Button(label="Save iscat.toml", color="primary", width=150)
         propose.on_click(self._propose)
@@ -158,7 +109,10 @@ class Form:
         self.body = pn.Column(
             self._notice.pane,
             pn.FlexBox(
-                pn.Column("### What matters most", self._first, pn.Row(save, propose), width=420),
+                pn.Column(
+                    "### What matters most", self._first, pn.Row(save, propose), self._taken.body,
+                    width=480,
+                ),
                 pn.Column("### Everything else", self._rest, width=520),
                 pn.Column("### The file", self._written, width=420),
             ),
@@ -168,6 +122,7 @@ class Form:
         """Show the configuration of the movie that is chosen."""
         if not self._widgets:
             self._make_widgets()
+        self._taken.refresh()
         now = self._chosen.movie, self._chosen.changed
         if now != self._shown:
             self._shown = now
@@ -175,11 +130,16 @@ class Form:
                 texts = read_texts(self._chosen.config)
                 for key, widget in self._widgets.items():
                     unset = _UNSET if isinstance(widget, pn.widgets.Select) else ""
-                    widget.value = _plain(texts.get(key, unset))
+                    widget.value = plain(texts.get(key, unset))
             self._show_file()
         if self._chosen.span is not None:
             first, last = self._chosen.span
             self._widgets["fit.frames"].value = f"[{first}, {last}]"
+        if self._chosen.excluded is not None:
+            widget = self._widgets["fit.excluded_frames"]
+            had = tomllib.loads(f"value = {widget.value or '[]'}")["value"]
+            if list(self._chosen.excluded) not in had:
+                widget.value = toml_text([*had, list(self._chosen.excluded)])
 
     def _make_widgets(self) -> None:
         sections: dict[str, list[Any]] = {}
@@ -191,7 +151,16 @@ class Form:
                 sections.setdefault(field.key.partition(".")[0], []).append(shown)
         for key in FIRST:
             self._first.append(self._widgets[key])
-        self._rest.extend([(name, pn.Column(*parts)) for name, parts in sections.items()])
+        # The browser needs seconds for all of these, so a section is sent when it is unfolded.
+        places = [pn.Column() for _ in sections]
+        self._rest.extend(list(zip(sections, places, strict=True)))
+
+        def fill(event: Any) -> None:
+            for number in event.new:
+                if not len(places[number]):
+                    places[number].extend([*sections.values()][number])
+
+        self._rest.param.watch(fill, "active")
 
     def _texts(self) -> dict[str, str]:
         texts = {}
@@ -213,7 +182,7 @@ class Form:
             return
         with self._notice.told():
             config = write_texts(path, self._texts() | self._others())
-            self._chosen.span = None
+            self._chosen.span = self._chosen.excluded = None
             self._chosen.changed += 1
             self._notice.say(f"saved as {path}: mode {config.fit.mode}")
             self._show_file()
@@ -259,8 +228,6 @@ def _default(value: Any) -> str:
 
 
 def _help(field: Field) -> str:
-    import html
-
     return f"<small>{html.escape(field.help)}</small>"
 
 
@@ -269,16 +236,3 @@ def _number(text: str) -> float | str:
         return float(text)
     except ValueError:
         return text
-
-
-def add_table(path: Path, section: str, toml: str) -> None:
-    """Put a section, as a calibration writes it, into a configuration file in place of its own."""
-    texts = read_texts(path if path.is_file() else None)
-    kept = {key: text for key, text in texts.items() if not key.startswith(f"{section}.")}
-    new = tomllib.loads(toml)[section]
-    write_texts(path, kept | {f"{section}.{name}": toml_text(v) for name, v in new.items()})
-
-
-def whole_toml(path: Path | None) -> str:
-    """Write the complete configuration that a file stands for."""
-    return config_to_toml(ia.load_config(path))

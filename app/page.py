@@ -31,7 +31,19 @@ td:last-child { overflow-wrap: anywhere; }
 """
 """Beside what Panel brings."""
 
-_TABS = ".bk-tab.bk-active { color: inherit; font-weight: 700; }"  # readable on a dark ground
+_TABS = """
+.bk-tab.bk-active { color: inherit; font-weight: 700; }  /* readable on a dark ground */
+[style*="visibility: hidden"] { display: none; }  /* or every tab is as high as the highest */
+:host > .bk-header, .bk-headers { flex-wrap: wrap; }
+"""
+
+_KEYS = """<script>
+document.addEventListener("keydown", (event) => {
+  const at = event.composedPath()[0];
+  if (event.key === "Enter" && at.matches?.(".bk-tab")) at.click();
+});
+</script>"""
+"""Bokeh's tabs can be reached with the keyboard, but answer to clicks alone."""
 
 pn.extension(notifications=False, raw_css=[STYLE], sizing_mode=None, throttled=False)
 
@@ -52,18 +64,24 @@ def page_of(folder: Path, queue: Queue) -> Any:
     dark = _given("theme") == "dark"
     results, runs = Results(chosen), RunTab(chosen, queue)
     parts: list[Part] = [
-        Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen),
-        Calibrate(chosen), Bounds(chosen), Export(chosen, results),
+        Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen, queue),
+        Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results),
     ]  # fmt: skip
+    # Filled when first opened, for speed, and kept: what the browser says of a list that the server
+    # has taken away is lost without a word, as it would be of `dynamic` tabs.
+    places = [pn.Column(sizing_mode="stretch_width") for _ in parts]
     tabs = pn.Tabs(
-        *[(part.title, part.body) for part in parts], dynamic=True, sizing_mode="stretch_width",
-        stylesheets=[_TABS],
+        *[(part.title, place) for part, place in zip(parts, places, strict=True)],
+        sizing_mode="stretch_width", stylesheets=[_TABS],
     )  # fmt: skip
 
     def show(*_: Any) -> None:
         heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"
         colours.object = _colours(chosen)
-        parts[tabs.active].refresh()
+        part, place = parts[tabs.active], places[tabs.active]
+        if not len(place):
+            place.append(part.body)
+        part.refresh()
 
     def remember(*_: Any) -> None:
         if pn.state.location is not None:
@@ -77,7 +95,7 @@ def page_of(folder: Path, queue: Queue) -> Any:
     chosen.param.watch(show, ["movie", "result", "changed"])
     chosen.param.watch(remember, ["movie"])
     template = _Template(
-        title="iSCAT analysis", main=[heading, tabs], header=[colours],
+        title="iSCAT analysis", main=[heading, tabs], header=[colours, pn.pane.HTML(_KEYS)],
         header_background="#1B1D21", theme="dark" if dark else "default", busy_indicator=None,
     )  # fmt: skip
     show()

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import panel as pn
 from bokeh.events import SelectionGeometry
-from bokeh.models import BoxAnnotation, BoxSelectTool, ColumnDataSource, TapTool
+from bokeh.models import BoxAnnotation, BoxSelectTool, ColumnDataSource, PointDrawTool, TapTool
 from bokeh.plotting import figure
 
 import iscat_analysis as ia
@@ -21,9 +21,8 @@ from iscat_analysis.answers.gates import (
     mass_histogram,
     usual_bin,
 )
-from iscat_analysis.records import Status
 from iscat_analysis.species.describe import Branch
-from iscat_app.chosen import Chosen, Notice, table_of
+from iscat_app.chosen import Chosen, Notice, in_line, link_to, table_of
 from iscat_app.rejections import Rejections
 
 DRAWS = 50
@@ -37,8 +36,8 @@ _BRANCHES: dict[str, Branch] = {
     "leaving": "leaving",
 }
 _HINT = (
-    "<small>Drag over the histogram for a gate; click a bar, or dots below, to select events."
-    "</small>"
+    "<small>Drag over the histogram for a gate; click a bar, or dots below, to select events. The "
+    "point tool moves, adds (click) and removes (Backspace) the diamonds of species.</small>"
 )
 _GATE_HEAD = (
     "gate [kDa]",
@@ -69,6 +68,7 @@ class Results:
         self.histogram: MassHistogram | None = None
         self.gates: list[Gate] = []
         self.species: ia.Distribution | None = None
+        self.start: list[float] | None = None  # from where the species were fitted
         self._seen = pd.DataFrame()
         self._make_figures()
         self._make_widgets()
@@ -79,6 +79,7 @@ class Results:
         self._bars = ColumnDataSource({"left": [], "right": [], "top": []})
         self._curve = ColumnDataSource({"x": [], "y": []})
         self._species_curve = ColumnDataSource({"x": [], "y": []})
+        self._handles = ColumnDataSource({"x": [], "y": []})
         self._events = ColumnDataSource(
             {name: [] for name in ("x", "y", "frame", "mass", "event", "colour")}
         )
@@ -94,6 +95,17 @@ class Results:
         self._hist.line(
             "x", "y", source=self._species_curve, color=_RED, line_width=2, legend_label="species"
         )
+        handles = self._hist.scatter(
+            "x", "y", source=self._handles, size=14, marker="diamond", color=_RED,
+            line_color="white", nonselection_alpha=1,
+        )  # fmt: skip
+        self._hist.add_tools(
+            PointDrawTool(renderers=[handles], description="move, add or remove species")
+        )
+        self._hist.toolbar.logo = None
+        legend = self._hist.legend[0]
+        legend.update(orientation="horizontal", border_line_color=None, padding=2)
+        self._hist.add_layout(legend, "above")
         gate_tool = BoxSelectTool(dimensions="width", renderers=[], description="drag a gate")
         self._hist.add_tools(gate_tool, TapTool(renderers=[bars]))
         self._hist.toolbar.active_drag = gate_tool
@@ -109,6 +121,7 @@ class Results:
             width=310, height=300, tools="pan,wheel_zoom,box_select,tap,reset",
             x_axis_label="frame", y_axis_label="mass [kDa]",
         )  # fmt: skip
+        self._map.toolbar.logo = self._course.toolbar.logo = None
         for plot, x, y in ((self._map, "x", "y"), (self._course, "frame", "mass")):
             plot.scatter(
                 x, y, source=self._events, size=6, color="colour", selection_line_color="black",
@@ -123,13 +136,16 @@ class Results:
         self.kernel = pn.widgets.FloatInput(
             label="Kernel [kDa]", value=10.0, start=0.01, step=1.0, width=110
         )
-        self.branch = pn.widgets.Select(label="Events", options=[*_BRANCHES], width=160)
+        self.branch = pn.widgets.Select(label="Events", options=[*_BRANCHES], width=190)
         self.flagged = pn.widgets.Checkbox(label="flagged too")
         self.find = pn.widgets.Button(label="Find the species", width=140)
-        self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=110)
-        self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=110)
-        add = pn.widgets.Button(label="Add the gate", width=110)
-        drop = pn.widgets.Button(label="Remove all gates", width=130)
+        self.refit = pn.widgets.Button(label="Fit again from the diamonds", width=210)
+        self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=100)
+        self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=100)
+        add = pn.widgets.Button(label="Add the gate", width=100)
+        drop = pn.widgets.Button(label="Remove all gates", width=125)
+        pick = pn.widgets.Button(label="Select its events", width=120)
+        self._report = pn.pane.HTML("")
         self._gate_table = pn.pane.HTML("", sizing_mode="stretch_width")
         self._species_table = pn.pane.HTML("", sizing_mode="stretch_width")
         self.which = pn.widgets.Select(label="Selected events", options=[], size=7, width=230)
@@ -142,20 +158,25 @@ class Results:
         back = pn.widgets.Button(label="Take the event back", width=160)
         for widget in (self.bin, self.kernel, self.branch, self.flagged):
             widget.param.watch(lambda _: self._draw(), "value")
-        self.find.on_click(self._find_species)
+        self.find.on_click(lambda _: self._find_species(None))
+        self.refit.on_click(lambda _: self._find_species(self._means()))
         add.on_click(lambda _: self._add_gate(self.low.value, self.high.value))
+        pick.on_click(lambda _: self._select(self.low.value, self.high.value))
         drop.on_click(lambda _: self._set_gates([]))
         reject.on_click(self._reject)
         back.on_click(self._take_back)
         self.which.param.watch(self._show_event, "value")
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(self.bin, self.kernel, self.branch, self.flagged, self.find),
+            in_line(
+                self.bin, self.kernel, self.branch, self.flagged, self.find, self.refit,
+                self._report,
+            ),
             pn.FlexBox(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML(_HINT),
-                    pn.Row(self.low, self.high, add, drop, styles={"align-items": "end"}),
+                    in_line(self.low, self.high, add, pick, drop),
                     self._gate_table, self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
                     width=_LEFT_PX,
@@ -174,12 +195,16 @@ class Results:
         self._shown = now
         if self.result is not None:
             self.result.close()
-        self.result, self.table, self.species = None, pd.DataFrame(), None
+        self.result, self.table = None, pd.DataFrame()
+        self.species, self.start = None, None
         self._set_gates([])
         if self._chosen.result is None:
             self._notice.say("There is no result yet: analyse the movie under Run.")
+            self._report.object = ""
             return
         self._notice.say("")
+        report = self._chosen.result / "report.html"
+        self._report.object = link_to(report, "The whole report") if report.is_file() else ""
         with self._notice.told():
             self.result = ia.open_result(self._chosen.result, movie=self._chosen.movie)
             self.table = self.result.table
@@ -210,7 +235,7 @@ class Results:
                 rejected=self.rejected,
             )  # fmt: skip
             if not self.table[counts].equals(self._seen):
-                self._seen, self.species = self.table[counts], None
+                self._seen, self.species, self.start = self.table[counts], None, None
             seen = self.histogram = mass_histogram(
                 self.masses(), bin_kda=self.bin.value, bandwidth_kda=self.kernel.value
             )
@@ -266,17 +291,27 @@ class Results:
 
     # ---- species ----------------------------------------------------------------------------
 
-    def _find_species(self, _: Any) -> None:
-        seen, branch = self._seen, _BRANCHES[self.branch.value]
-        if len(seen):
-            self._notice.work(
-                "Finding species", lambda: ia.find_species(seen, branch=branch, draws=DRAWS),
-                lambda found: self._take_species(found, seen),
-            )  # fmt: skip
+    def _means(self) -> list[float]:
+        """Give the masses at which somebody left the diamonds."""
+        return sorted({round(float(x), 2) for x in self._handles.data["x"] if x > 0})
 
-    def _take_species(self, found: ia.Distribution, seen: pd.DataFrame) -> None:
+    def _find_species(self, start: list[float] | None) -> None:
+        """Fit species, as many as there are, or from where somebody says."""
+        seen, branch = self._seen, _BRANCHES[self.branch.value]
+        if start is not None and not start:
+            self._notice.say("Find the species first, or set diamonds with the point tool.")
+        elif len(seen):
+            self._notice.work(
+                "Finding species",
+                lambda: ia.find_species(seen, start_kda=start, branch=branch, draws=DRAWS),
+                lambda found: self._take_species(found, seen, start),
+            )
+
+    def _take_species(
+        self, found: ia.Distribution, seen: pd.DataFrame, start: list[float] | None
+    ) -> None:
         if seen is self._seen:  # and not of events that count no more
-            self.species = found
+            self.species, self.start = found, start
             self._draw_species()
 
     def species_curve(self) -> tuple[Any, Any] | None:
@@ -289,10 +324,12 @@ class Results:
     def _draw_species(self) -> None:
         found = self.species_curve()
         if found is None or self.species is None:
-            self._species_curve.data = {"x": [], "y": []}
+            self._species_curve.data = self._handles.data = {"x": [], "y": []}
             self._species_table.object = ""
             return
         self._species_curve.data = {"x": found[0], "y": found[1]}
+        means = self.species.species["mass_kda"].to_numpy(float)
+        self._handles.data = {"x": means, "y": np.interp(means, *found)}
         rows = [
             (
                 f"{s['mass_kda']:.1f}", f"{s['mass_low']:.1f} to {s['mass_high']:.1f}",
@@ -316,6 +353,11 @@ class Results:
             inside |= (mass >= edges[bar]) & (mass < edges[bar + 1])
         self._events.selected.indices = np.flatnonzero(inside).tolist()
 
+    def _select(self, low: float, high: float) -> None:
+        """Select the events between two masses, as a click on their bars would."""
+        mass = self.masses()
+        self._events.selected.indices = np.flatnonzero((mass >= low) & (mass < high)).tolist()
+
     def _events_selected(self, attr: str, old: Any, new: list[int]) -> None:
         del attr, old
         options = {
@@ -331,8 +373,9 @@ class Results:
             self._facts.object, self._picture.object = "", None
             return
         row = int(np.flatnonzero(self.table["event"] == number)[0])
-        self._facts.object = facts_of(self.table.iloc[row])
-        self._chosen.frame = int(self.table["frame"].iloc[row])  # where the film goes
+        self._facts.object = table_of(result.facts(row))
+        # where the film goes, and what it rings
+        self._chosen.param.update(frame=int(self.table["frame"].iloc[row]), event=int(number))
         self._notice.work(
             "Drawing the event", lambda: _png(result, row), lambda png: self._take(png, number)
         )
@@ -367,21 +410,6 @@ class Results:
         self.listed.options = {
             f"{r['event']}: {r['mass_kda']:.1f} kDa": int(r["event"]) for r in rows
         }
-
-
-def facts_of(row: pd.Series) -> str:
-    """Write the numbers of an event."""
-    facts = [("event", f"{row['event']}, frame {row['frame']}")]
-    for name, label, unit in (("mass_kda", "mass", "kDa"), ("x_nm", "x", "nm"), ("y_nm", "y", "nm"),
-                              ("z_nm", "z", "nm")):  # fmt: skip
-        sigma, bound = row[f"sigma_{name}"], row[f"crb_{name}"]
-        error = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
-        beside = f" (CRB {bound:.1f})" if np.isfinite(bound) else ""
-        facts.append((label, f"{row[name]:.1f}{error} {unit}{beside}"))
-    status = Status(row["status"])
-    facts += [("contrast", f"{100 * row['contrast']:.3f} %, SNR {row['snr']:.1f}"),
-              ("status", f"{status.value}: {status.advice}")]  # fmt: skip
-    return table_of(facts)
 
 
 def _png(result: ia.StoredResult, row: int) -> bytes:

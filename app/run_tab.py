@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import html
+from pathlib import Path
 from typing import Any
 
 import panel as pn
 
 from iscat_analysis.movie.addresses import path_beside
-from iscat_app.chosen import Chosen, Notice
+from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.files import listed
-from iscat_app.runs import Queue, Run
+from iscat_app.runs import Job, Queue, Run
 
 LOOK_MS = 500
 """Between two looks at the queue."""
@@ -44,9 +45,9 @@ class RunTab:
         self._log = pn.pane.Str("", sizing_mode="stretch_width")
         self.body = pn.Column(
             self._notice.pane,
-            pn.Row(start, every),
-            pn.Row(self._overwrite, self._scheduler),
-            pn.Row(self._which, stop, again),
+            in_line(start, every),
+            in_line(self._scheduler, self._overwrite),
+            in_line(self._which, stop, again),
             self._bar,
             self._state,
             self._log,
@@ -68,7 +69,7 @@ class RunTab:
         if self._version == self._queue.version and not running:
             return
         self._version = self._queue.version
-        options = {f"{r.number}: {r.movie.name}, {r.state}": r.number for r in self._queue.runs}
+        options = {f"{r.number}: {r.job.title}, {r.state}": r.number for r in self._queue.runs}
         if options != self._which.options:
             is_new = len(options) != len(self._which.options)
             value = self._queue.runs[-1].number if is_new else self._which.value
@@ -77,7 +78,7 @@ class RunTab:
         for run in self._queue.runs:
             if run.ended and run.number not in self._ended:
                 self._ended.add(run.number)
-                if run.movie == self._chosen.movie:
+                if run.job.kind != "fit" or run.job.movie == self._chosen.movie:
                     self._chosen.look_again()
 
     def _chosen_run(self) -> Run | None:
@@ -92,12 +93,12 @@ class RunTab:
         share = 100 * run.done / run.total if run.total else 0
         self._bar.value = 100 if run.state == "done" else int(share)
         left = run.seconds_left
-        parts = [f"<b>{html.escape(run.movie.name)}</b>: {run.state}"]
+        parts = [f"<b>{html.escape(run.job.title)}</b>: {run.state}"]
         if run.state in ("running", "stopping"):
             parts.append(f"{run.stage or 'starting'} {run.done} of {run.total}")
             parts += [] if left is None else [f"about {_time(left)} left in this stage"]
         self._state.object = f"<p role='status'>{', '.join(parts)}</p>"
-        self._log.object = "\n".join([f"$ {run.command}", *run.log])
+        self._log.object = "\n".join([f"$ {run.job.command}", *run.log])
 
     def _start(self, _: Any) -> None:
         movie = self._chosen.movie
@@ -105,12 +106,15 @@ class RunTab:
             self._notice.say("Choose a movie under Open.", "error")
             return
         self._notice.say("")
-        run = self._queue.add(
+        run = self._queue.add(self._job(movie))
+        self.refresh()
+        self._which.value = run.number
+
+    def _job(self, movie: Path) -> Job:
+        return Job(
             movie, self._chosen.config, path_beside(movie, ".iscat"),
             overwrite=self._overwrite.value, scheduler=self._scheduler.value.strip() or "threads",
         )  # fmt: skip
-        self.refresh()
-        self._which.value = run.number
 
     def _start_all(self, _: Any) -> None:
         """Put all movies of the folder into the queue, but those that have a result."""
@@ -118,16 +122,12 @@ class RunTab:
         if movie is None:
             self._notice.say("Choose a movie of the folder under Open.", "error")
             return
-        config = self._chosen.config
         put = 0
         for entry in listed(movie.parent):
             if entry.kind == "movie":
                 out = path_beside(entry.path, ".iscat")
                 if self._overwrite.value or not (out / "summary.json").is_file():
-                    self._queue.add(
-                        entry.path, config, out, overwrite=self._overwrite.value,
-                        scheduler=self._scheduler.value.strip() or "threads",
-                    )  # fmt: skip
+                    self._queue.add(self._job(entry.path))
                     put += 1
         self._notice.say(f"{put} movies are in the queue; those with a result were left alone")
         self.refresh()

@@ -1,4 +1,4 @@
-"""The queue of movies to be analysed, each in a process of its own, one after the other.
+"""The queue of what is to be done with movies, each in a process of its own, one after the other.
 
 It belongs to the server and not to a page, so that pages may be closed and opened as it works.
 """
@@ -10,7 +10,7 @@ import shlex
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -18,7 +18,10 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from multiprocessing.resource_tracker import ensure_running
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from iscat_analysis.records import Progress
 
 State = Literal["waiting", "running", "stopping", "done", "stopped", "failed"]
 
@@ -29,17 +32,49 @@ CLOSING_S = 1.0
 """That a run has to end by itself when the server ends; finished parts are on the disk by then."""
 
 
-@dataclass
-class Run:
-    """One movie that is, was or will be analysed."""
+Kind = Literal["fit", "camera", "optics", "day"]
+"""What is done with a movie, or with a folder of them: the command of that name."""
 
-    number: int
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be done, and where its result goes."""
+
     movie: Path
     config: Path | None
     out: Path
+    kind: Kind = "fit"
     overwrite: bool = False
-    settings: Sequence[str] = ()
+    dark: Path | None = None
     scheduler: str = "threads"
+
+    @property
+    def title(self) -> str:
+        """Name what is done."""
+        what = {"fit": "", "camera": "camera of ", "optics": "optics of ", "day": "all of "}
+        return f"{what[self.kind]}{self.movie.name}"
+
+    @property
+    def command(self) -> str:
+        """The command line that does the same."""
+        command = {
+            "fit": ["iscat-fit"], "camera": ["iscat", "calibrate", "camera"],
+            "optics": ["iscat", "calibrate", "optics"], "day": ["iscat", "batch"],
+        }  # fmt: skip
+        words = [*command[self.kind], str(self.movie)]
+        words += ["--dark", str(self.dark)] if self.dark else []
+        words += ["--config", str(self.config)] if self.config and self.kind != "camera" else []
+        words += ["--scheduler", self.scheduler] if self.scheduler != "threads" else []
+        words += ["--out", str(self.out)]
+        return shlex.join([*words, *(["--overwrite"] if self.overwrite else [])])
+
+
+@dataclass
+class Run:
+    """A job that is, was or will be done."""
+
+    number: int
+    job: Job
     state: State = "waiting"
     is_asked_to_stop: bool = False
     stage: str = ""
@@ -47,16 +82,6 @@ class Run:
     total: int = 0
     stage_began: float = 0.0
     log: list[str] = field(default_factory=list)
-
-    @property
-    def command(self) -> str:
-        """The command line that does the same."""
-        words = ["iscat-fit", str(self.movie)]
-        words += ["--config", str(self.config)] if self.config else []
-        words += [word for each in self.settings for word in ("--set", each)]
-        words += ["--scheduler", self.scheduler] if self.scheduler != "threads" else []
-        words += ["--out", str(self.out)]
-        return shlex.join([*words, *(["--overwrite"] if self.overwrite else [])])
 
     @property
     def ended(self) -> bool:
@@ -87,22 +112,13 @@ class Queue:
         self._wake = threading.Condition(self._lock)
         threading.Thread(target=self._work, daemon=True, name="queue").start()
 
-    def add(
-        self,
-        movie: Path,
-        config: Path | None,
-        out: Path,
-        *,
-        overwrite: bool = False,
-        settings: Sequence[str] = (),
-        scheduler: str = "threads",
-    ) -> Run:
-        """Put a movie at the end; one that waits or runs already is not put twice."""
+    def add(self, job: Job) -> Run:
+        """Put a job at the end; one that waits or runs already is not put twice."""
         with self._wake:
             for run in self.runs:
-                if run.out == out and not run.ended:
+                if run.job.out == job.out and not run.ended:
                     return run
-            run = Run(len(self.runs) + 1, movie, config, out, overwrite, tuple(settings), scheduler)
+            run = Run(len(self.runs) + 1, job)
             self.runs.append(run)
             self.version += 1
             self._wake.notify_all()
@@ -120,10 +136,7 @@ class Queue:
 
     def again(self, run: Run) -> Run:
         """Go on with a run that was stopped, or repeat one that failed."""
-        return self.add(
-            run.movie, run.config, run.out, overwrite=run.overwrite, settings=run.settings,
-            scheduler=run.scheduler,
-        )  # fmt: skip
+        return self.add(run.job)
 
     def close(self) -> None:
         """Stop what runs and begin nothing more."""
@@ -149,7 +162,7 @@ class Queue:
                 self.version += 1
                 context = get_context("spawn")
                 here, there = context.Pipe(duplex=False)
-                self._process = context.Process(target=_analyse, args=(run_of(run), there))
+                self._process = context.Process(target=_work_on, args=(run.job, there))
                 with _interrupts_held():
                     self._process.start()
                 there.close()
@@ -197,19 +210,8 @@ def _interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def run_of(run: Run) -> tuple[Path, Path | None, Path, bool, tuple[str, ...], str, str]:
-    """Give what a process needs to know of a run."""
-    return (
-        run.movie, run.config, run.out, run.overwrite, tuple(run.settings), run.scheduler,
-        run.command,
-    )  # fmt: skip
-
-
-def _analyse(
-    job: tuple[Path, Path | None, Path, bool, tuple[str, ...], str, str], to: Connection
-) -> None:
-    """Do one run, in a process of its own, and tell how far it is."""
-    movie, config, out, overwrite, settings, scheduler, command = job
+def _work_on(job: Job, to: Connection) -> None:
+    """Do one job, in a process of its own, and tell how far it is."""
     said = 0.0
     lock = threading.Lock()
 
@@ -225,28 +227,74 @@ def _analyse(
             to.send(("note", text))
 
     try:
-        from iscat_analysis.config import load_config
         from iscat_analysis.errors import IscatError
-        from iscat_analysis.executors import open_executor
-        from iscat_analysis.pipeline import fit_stack
 
         # An interrupt that came during these imports is raised here.
         signal.signal(signal.SIGINT, signal.default_int_handler)
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_SETMASK, ())
         try:
-            resolved = load_config(config, settings)
-            with open_executor(
-                scheduler, None, shared=movie, workers=resolved.compute.workers
-            ) as executor:
-                analysis = fit_stack(
-                    movie, resolved, out=out, overwrite=overwrite, progress=progress,
-                    notify=notify, command=command, executor=executor,
-                )  # fmt: skip
-            to.send(("done", f"{len(analysis.table)} rows; results in {out}"))
+            to.send(("done", _WORK[job.kind](job, progress, notify)))
         except IscatError as error:
             to.send(("failed", str(error)))
         except (OSError, MemoryError) as error:
             to.send(("failed", f"{type(error).__name__}: {error}"))
     except KeyboardInterrupt as stop:
         to.send(("stopped", str(stop) or "stopped; what was finished is kept"))
+
+
+def _fit(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+    from iscat_analysis.config import load_config
+    from iscat_analysis.executors import open_executor
+    from iscat_analysis.pipeline import fit_stack
+
+    config = load_config(job.config)
+    with open_executor(
+        job.scheduler, None, shared=job.movie, workers=config.compute.workers
+    ) as executor:
+        analysis = fit_stack(
+            job.movie, config, out=job.out, overwrite=job.overwrite, progress=progress,
+            notify=notify, command=job.command, executor=executor,
+        )  # fmt: skip
+    return f"{len(analysis.table)} rows; results in {job.out}"
+
+
+def _camera(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+    from iscat_analysis.answers.calibrations import camera_calibration
+
+    camera_calibration(
+        [job.movie], job.out, dark=job.dark, overwrite=job.overwrite, progress=progress,
+        notify=notify,
+    )  # fmt: skip
+    return f"the camera is in {job.out}"
+
+
+def _optics(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+    from iscat_analysis.answers.calibrations import optics_calibration
+    from iscat_analysis.config import load_config
+    from iscat_analysis.errors import DataError
+
+    found = optics_calibration(
+        job.movie, load_config(job.config), job.out, overwrite=job.overwrite, progress=progress,
+        notify=notify,
+    )  # fmt: skip
+    if not found.accepted:
+        raise DataError(f"the optics are refused: {'; '.join(found.measured.refusals)}")
+    return f"the optics are in {job.out}"
+
+
+def _day(job: Job, progress: Progress, notify: Callable[[str], None]) -> str:
+    from iscat_analysis.day import batch
+    from iscat_analysis.day.table import TABLES
+
+    table = next((job.movie / name for name in TABLES if (job.movie / name).is_file()), job.movie)
+    found = batch(
+        table, out=job.out, config=job.config, scheduler=job.scheduler, progress=progress,
+        notify=notify, command=job.command,
+    )  # fmt: skip
+    for name, why in found.failed:
+        notify(f"{name}: {why}")
+    return f"{len(found.movies)} movies; the page is {found.page}"
+
+
+_WORK = {"fit": _fit, "camera": _camera, "optics": _optics, "day": _day}

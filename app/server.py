@@ -19,6 +19,7 @@ from tornado.web import RequestHandler
 from tornado.websocket import WebSocketClosedError
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.report.view import PAGES
 from iscat_app.page import page_of
 from iscat_app.runs import Queue
 
@@ -56,6 +57,7 @@ def serve(
     number = _free_port(port)
     logging.basicConfig(level=logging.WARNING, handlers=[_Log(warn, debug=debug)], force=True)
     token = secrets.token_urlsafe(24)
+    auth = _Token(token, number)
     queue = Queue()
     root = folder.resolve()
     for name in _UNHEARD:
@@ -65,11 +67,12 @@ def serve(
         address=HOST,
         port=number,
         websocket_origin=[f"{HOST}:{number}", f"localhost:{number}"],
-        auth_provider=_Token(token, number),
+        auth_provider=auth,
         title="iSCAT analysis",
         show=False,
         start=False,
         verbose=False,
+        extra_patterns=[("/page", _Page, {"auth": auth})],
     )
     address = f"http://{HOST}:{number}/?token={token}"
 
@@ -157,6 +160,26 @@ class _Locked(RequestHandler):
         """Answer whoever has no token."""
         self.set_status(403)
         self.finish(_LOCKED)
+
+
+class _Page(RequestHandler):
+    """Shows a page that the commands wrote, whose scripts cannot touch the window."""
+
+    def initialize(self, auth: _Token) -> None:
+        self._auth = auth
+
+    def get(self) -> None:
+        """Answer with the page, if it is one of those."""
+        path = Path(self.get_argument("path", ""))
+        if self._auth.get_user(self) is None:
+            self.set_status(403)
+            self.finish(_LOCKED)
+        elif path.name not in PAGES or not path.is_file():
+            self.set_status(404)
+            self.finish("<!doctype html><title>iSCAT analysis</title><p>There is no such page.")
+        else:
+            self.set_header("Content-Security-Policy", "sandbox allow-scripts allow-downloads")
+            self.finish(path.read_bytes())
 
 
 def _free_port(wanted: int | None) -> int:

@@ -127,6 +127,16 @@ def mass(
             ),
         ),
     ],
+    peaks: Annotated[
+        str | None,
+        typer.Option(
+            metavar="C,C,...",
+            help=(
+                "About the |contrast| of each standard's peak, in the order of --standards; "
+                "default as the masses fit best."
+            ),
+        ),
+    ] = None,
     landing: Annotated[
         LandingSign | None,
         typer.Option(
@@ -153,6 +163,7 @@ def mass(
     """
     with failures(messages):
         masses, errors = _standards(standards)
+        places = None if peaks is None else _contrasts(peaks)
 
         from iscat_analysis.answers.calibrations import mass_calibration
         from iscat_analysis.movie.addresses import path_beside
@@ -163,6 +174,7 @@ def mass(
             masses,
             folder,
             standards_se_kda=errors,
+            peaks_at=places,
             landing=landing.value if landing is not None else None,
             overwrite=overwrite,
             notify=messages.notify,
@@ -305,6 +317,15 @@ def _measure(
             f"{movie}: the template is refused: {'; '.join(found.refusals)}; record more particles "
             "that stand alone"
         )
+
+
+def _contrasts(text: str) -> list[float]:
+    from iscat_analysis.errors import ConfigError
+
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise ConfigError(f"--peaks {text}: write contrasts as in --peaks 0.002,0.0045") from None
 
 
 def _standards(text: str) -> tuple[list[float], list[float]]:

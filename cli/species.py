@@ -79,6 +79,14 @@ def species(
             "--masses", metavar="M1,M2", help="Masses of the species, which are fixed [kDa]."
         ),
     ] = None,
+    start: Annotated[
+        str | None,
+        typer.Option(
+            "--start",
+            metavar="M1,M2",
+            help="Masses from which the fit of as many species begins [kDa]; they are free.",
+        ),
+    ] = None,
     ladder: Annotated[
         str | None,
         typer.Option(
@@ -178,11 +186,12 @@ def species(
     with failures(messages):
         middle, spread = pair("--limit", limit)
         given = None if masses is None else numbers("--masses", masses)
+        begun = None if start is None else numbers("--start", start)
         rungs = () if steps is None else whole("--steps", steps)
         monomer = _monomer(ladder)
         if len(events) > 1:
             _only_one(
-                offset=offset, hold=hold, side=side, widths=widths,
+                offset=offset, hold=hold, side=side, widths=widths, start=start is not None,
                 rates=frame_rate is not None or frames is not None,
             )  # fmt: skip
             _compare(
@@ -204,6 +213,7 @@ def species(
             events_of,
             k=k,
             masses_kda=given,
+            start_kda=begun,
             ladder=monomer,
             steps=rungs,
             offset=offset,
@@ -233,7 +243,9 @@ def species(
             messages.notify(f"wrote {out}; look at {out / 'figures' / 'species.png'}")
 
 
-def _only_one(*, offset: bool, hold: bool, side: Side, widths: Width | None, rates: bool) -> None:
+def _only_one(
+    *, offset: bool, hold: bool, side: Side, widths: Width | None, start: bool, rates: bool
+) -> None:
     """Refuse what has no meaning where tables are compared."""
     from iscat_analysis.errors import ConfigError
 
@@ -242,6 +254,7 @@ def _only_one(*, offset: bool, hold: bool, side: Side, widths: Width | None, rat
         ("--hold", hold),
         ("--branch", side is not Side.MAGNITUDE),
         ("--widths", widths is not None),
+        ("--start", start),
         ("--frame-rate", rates),
     ):
         if given:

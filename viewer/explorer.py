@@ -26,9 +26,10 @@ from qtpy.QtWidgets import (
 from superqt import QLabeledDoubleSlider, QLabeledSlider
 
 import iscat_analysis as ia
+from iscat_analysis.pipeline.ratio_film import film_limits
 from iscat_napari.events import EventPanel
 from iscat_napari.frames import LazyFrames, LazyMovie
-from iscat_napari.readers import RESULT, ROW, limits_of
+from iscat_napari.readers import RESULT, ROW
 
 if TYPE_CHECKING:
     import napari
@@ -283,7 +284,7 @@ class Explorer(QWidget):
             return
         with self._errors_shown(), _busy():
             frames = RatioFrames(preview, movie.data.shape, self.window_frames.value())
-            low, high = limits_of(frames)
+            low, high = film_limits(frames.__getitem__, (0, len(frames)))
             limit = max(abs(low), abs(high))
             layer = self._viewer.add_image(
                 frames, name=RATIO, colormap="gray", contrast_limits=(-limit, limit),

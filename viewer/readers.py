@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from iscat_analysis import DataError, Status, StoredResult, open_result, open_stack, tracked_rows
-from iscat_napari.frames import LazyFrames, LazyMovie
+from iscat_analysis.pipeline.ratio_film import film_limits
+from iscat_analysis.report.pictures import SHOWN_FRAMES
+from iscat_napari.frames import LazyMovie
 
 LayerData = tuple[Any, dict[str, Any], str]
 """Data, options and kind of a layer, as napari takes them."""
@@ -19,14 +20,10 @@ LayerData = tuple[Any, dict[str, Any], str]
 RESULT, ROW = "iscat_result", "row"
 """Key of a layer's metadata that holds the `StoredResult`, and the feature with its table's row."""
 
-SHOWN = 12.0
-"""Frames around its own in which an event of a landing movie is drawn."""
-
 _SIZE_PX = 12.0
 
 _COLOURS = {Status.OK.value: "lime"}
 _DOUBTFUL = "orange"
-_SAMPLED = 5  # frames from which the contrast limits of a movie are taken
 
 
 def movie_reader(path: str | Sequence[str]) -> Callable[[Any], list[LayerData]] | None:
@@ -51,17 +48,9 @@ def _is_result(path: Path) -> bool:
 
 def movie_layer(movie: LazyMovie) -> LayerData:
     """Make the layer of a movie."""
-    options = {"name": movie.stack.name, "contrast_limits": limits_of(movie), "colormap": "gray"}
+    limits = film_limits(movie.__getitem__, (0, len(movie)))
+    options = {"name": movie.stack.name, "contrast_limits": limits, "colormap": "gray"}
     return movie, options, "image"
-
-
-def limits_of(frames: LazyFrames) -> tuple[float, float]:
-    """Give the limits between which most of the pixels of a few frames lie."""
-    numbers = np.unique(np.linspace(0, len(frames) - 1, _SAMPLED).astype(int))
-    seen = np.concatenate([np.ravel(frames[int(t)]) for t in numbers]).astype(float)
-    seen = seen[np.isfinite(seen)]
-    low, high = np.quantile(seen, [0.001, 0.999]) if seen.size else (0.0, 1.0)
-    return float(low), float(high if high > low else low + 1.0)
 
 
 def result_layers(result: StoredResult) -> list[LayerData]:
@@ -77,8 +66,8 @@ def result_layers(result: StoredResult) -> list[LayerData]:
     points = placed[["frame", "y_px", "x_px"]].to_numpy(float)
     scale = [1.0, 1.0, 1.0]
     if "landing" in result.summary:  # a slice is one step of the data thick
-        scale[0] = SHOWN
-        points[:, 0] /= SHOWN
+        scale[0] = float(SHOWN_FRAMES)
+        points[:, 0] /= SHOWN_FRAMES
     elif result.tracks is None:  # they are there in all frames after the background
         points, scale = points[:, 1:], scale[1:]
     options = {

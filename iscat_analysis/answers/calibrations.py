@@ -13,9 +13,12 @@ import pandas as pd
 import tifffile
 
 from iscat_analysis.calibration.mass import (
+    LEAST_EVENTS,
+    ContrastPeak,
     Landing,
     MassCalibration,
     calibrate_mass,
+    find_contrast_peaks,
     standards_of,
 )
 from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
@@ -29,7 +32,7 @@ from iscat_analysis.movie.event_tables import read_events
 from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.optics.measured import sha256_of
 from iscat_analysis.reading import first_line, is_file, open_regular
-from iscat_analysis.records import Progress, Status, silent
+from iscat_analysis.records import FloatArray, Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
 from iscat_analysis.report.optics import optics_page
@@ -176,6 +179,7 @@ def mass_calibration(
     out: Path,
     *,
     standards_se_kda: Sequence[float] | None = None,
+    peaks_at: Sequence[float] | None = None,
     landing: Landing | None = None,
     standards: Config | None = None,
     overwrite: bool = False,
@@ -196,6 +200,7 @@ def mass_calibration(
         contrast,
         standards_kda,
         standards_se_kda=standards_se_kda,
+        peaks_at=peaks_at,
         sigmas=sigma,
         landing=landing,
         name=str(events),
@@ -226,6 +231,26 @@ def mass_calibration(
         page = mass_page(events.name, jsonable(contents), toml)
         (folder / "calibration.html").write_text(page, encoding="utf-8")
     return found
+
+
+def contrast_peaks(events: Path) -> tuple[FloatArray, list[ContrastPeak]]:
+    """Give the |contrast| of the landings in a table, and the peaks that it has.
+
+    Shapes: result (n,).
+    """
+    table = read_contrasts(events)
+    contrast = table["contrast"].to_numpy(float)
+    lands = contrast > 0
+    if _landing(contrast, table["mass_kda"].to_numpy(float)) == "dark":
+        lands = contrast < 0
+    size = np.abs(contrast[lands])
+    sigma = np.zeros(size.shape)
+    if "sigma_contrast" in table:
+        sigma = table["sigma_contrast"].to_numpy(float)[lands]
+    known = np.isfinite(size) & np.isfinite(sigma)
+    if np.count_nonzero(known) < LEAST_EVENTS:
+        return size[known], []
+    return size[known], find_contrast_peaks(size[known], sigma[known])
 
 
 def analysed_with(events: Path) -> Config | None:

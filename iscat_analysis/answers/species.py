@@ -21,6 +21,7 @@ from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS, Distribution, describe
 from iscat_analysis.species.choices import (
     MOST_RUNGS,
+    Begun,
     Choice,
     Given,
     Ladder,
@@ -45,6 +46,7 @@ def find_species(
     *,
     k: int | None = None,
     masses_kda: Sequence[float] | None = None,
+    start_kda: Sequence[float] | None = None,
     ladder: float | Literal["auto"] | None = None,
     steps: Sequence[int] = (),
     offset: bool = False,
@@ -74,6 +76,9 @@ def find_species(
         So many species; by default as many as the Bayesian information criterion likes.
     masses_kda : sequence of float, optional
         Species of these masses, held [kDa].
+    start_kda : sequence of float, optional
+        Species of free masses, as many as there are numbers; the fit begins at these and takes the
+        nearest maximum of the likelihood [kDa].
     ladder : float or "auto", optional
         Oligomers of a monomer of about this mass [kDa], which is fitted, or of one to be found.
     steps : sequence of int
@@ -127,7 +132,7 @@ def find_species(
     """
     choice = choice_of(
         k, masses_kda, ladder, steps=steps, offset=offset, hold=hold, widths=widths,
-        background=background,
+        background=background, start_kda=start_kda,
     )  # fmt: skip
     draws = int(number_in("`draws`", draws, least=0, most=_MOST_DRAWS, whole=True))
     seed = int(number_in("`seed`", seed, least=0, whole=True))
@@ -143,13 +148,17 @@ def find_species(
             table, sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
             above_kda=above_kda,
         )  # fmt: skip
-    if k is not None and table.mass_kda.size < _EVENTS_EACH * k:
+    wanted, fewer = k or 0, "a smaller `k`"
+    if isinstance(choice, Begun):
+        wanted, fewer = len(choice.masses_kda), "fewer in `start_kda`"
+    if table.mass_kda.size < _EVENTS_EACH * wanted:
         raise DataError(
-            f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {k} species, "
-            f"which need {_EVENTS_EACH} each; give a smaller `k`"
+            f"{table.name}: holds {count(table.mass_kda.size, 'event')}, too few for {wanted} "
+            f"species, which need {_EVENTS_EACH} each; give {fewer}"
         )
-    if isinstance(choice, Given):
-        refuse_far([table], choice.masses_kda, "`masses_kda`")
+    if isinstance(choice, (Begun, Given)):
+        argument = "`masses_kda`" if isinstance(choice, Given) else "`start_kda`"
+        refuse_far([table], choice.masses_kda, argument)
     elif isinstance(choice, Ladder) and choice.monomer_kda is not None:
         rungs = choice.steps or (1, MOST_RUNGS)
         monomer = choice.monomer_kda
@@ -195,11 +204,17 @@ def choice_of(
     hold: bool,
     widths: Widths,
     background: bool,
+    start_kda: Sequence[float] | None = None,
 ) -> Choice:
     """Say which species to look for, and refuse what is impossible."""
     named = [
         name
-        for name, value in (("k", k), ("masses_kda", masses_kda), ("ladder", ladder))
+        for name, value in (
+            ("k", k),
+            ("masses_kda", masses_kda),
+            ("start_kda", start_kda),
+            ("ladder", ladder),
+        )
         if value is not None
     ]
     if len(named) > 1:
@@ -209,7 +224,7 @@ def choice_of(
     for name, value in (("offset", offset), ("hold", hold), ("background", background)):
         truth_in(f"`{name}`", value)
     choice_in("`widths`", widths, ("common", "free"))
-    for name, several in (("masses_kda", masses_kda), ("steps", steps)):
+    for name, several in (("masses_kda", masses_kda), ("start_kda", start_kda), ("steps", steps)):
         if several is not None and not isinstance(several, (list, tuple, np.ndarray)):
             raise ConfigError(f"`{name}` = {shown(several)}: give a list, as in [66, 132]")
     if ladder is None and (len(steps) or offset or hold):
@@ -217,13 +232,10 @@ def choice_of(
         raise ConfigError(f"`{which}` is of a ladder; give `ladder` as well")
     if k is not None:
         return Number(int(number_in("`k`", k, least=1, most=_MOST_SPECIES, whole=True)))
+    if start_kda is not None:
+        return Begun(_masses("`start_kda`", start_kda))
     if masses_kda is not None:
-        masses = [mass_in("`masses_kda`", m) for m in masses_kda]
-        if not masses:
-            raise ConfigError("`masses_kda`: is empty; give masses in kDa, as in 66,132")
-        if len(set(masses)) < len(masses):
-            raise ConfigError("`masses_kda`: names a mass twice; name each once")
-        return Given(tuple(masses), widths, background)
+        return Given(_masses("`masses_kda`", masses_kda), widths, background)
     if ladder is None:
         return Searched()
     rungs = [int(number_in("`steps`", n, least=1, most=1e6, whole=True)) for n in steps]
@@ -236,6 +248,16 @@ def choice_of(
         return Ladder(None, (), offset, widths=widths, background=background)
     monomer = mass_in("`ladder`", ladder, "mass of a monomer in kDa")
     return Ladder(monomer, tuple(rungs), offset, hold, widths, background)
+
+
+def _masses(name: str, given: Sequence[float]) -> tuple[float, ...]:
+    """Check masses of species, each of which is named once."""
+    masses = tuple(mass_in(name, mass) for mass in given)
+    if not masses:
+        raise ConfigError(f"{name}: is empty; give masses in kDa, as in 66,132")
+    if len(set(masses)) < len(masses):
+        raise ConfigError(f"{name}: names a mass twice; name each once")
+    return masses
 
 
 def _write(

@@ -122,6 +122,9 @@ class Fit(Section):
     frames: FrameRange | None = Field(
         None, description="[start, stop); absent: all after the background"
     )
+    excluded_frames: tuple[FrameRange, ...] = Field(
+        (), description="[[start, stop), ...] left out of a landing movie, as if it broke there"
+    )
     roi_nm: Annotated[Positive, length(50.0, LARGEST_NM)] = Field(
         2700.0, description="side of the square that is fitted"
     )

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding import SHORTEST_MOVIE
@@ -107,8 +108,36 @@ class Stretches:
         }
 
 
-def find_stretches(movie: Stack, span: tuple[int, int]) -> Stretches:
-    """Find where a movie breaks."""
+def find_stretches(
+    movie: Stack, span: tuple[int, int], excluded: Sequence[tuple[int, int]] = ()
+) -> Stretches:
+    """Find where a movie breaks; frames that are excluded are a break too."""
+    given: list[Break] = []
+    for start, stop in sorted(excluded):
+        start, stop = max(start, span[0]), min(stop, span[1])
+        if given and start <= given[-1].stop:
+            given[-1] = Break(given[-1].start, max(stop, given[-1].stop), _EXCLUDED)
+        elif start < stop:
+            given.append(Break(start, stop, _EXCLUDED))
+    if not given:
+        return _breaks_within(movie, span)
+    between = _between(span, given)
+    if between is None:
+        raise ConfigError(
+            f"{movie.name}: fit.excluded_frames leaves no {SHORTEST_MOVIE} frames together, which "
+            "an analysis needs"
+        )
+    parts = [_breaks_within(movie, part) for part in between.kept]
+    breaks = sorted((*given, *(one for part in parts for one in part.breaks)), key=_start_of)
+    return Stretches(tuple(kept for part in parts for kept in part.kept), tuple(breaks))
+
+
+def _start_of(one: Break) -> int:
+    return one.start
+
+
+def _breaks_within(movie: Stack, span: tuple[int, int]) -> Stretches:
+    """Find the breaks that the frames themselves show."""
     whole = Stretches((span,))
     starts = np.arange(span[0], span[1] - _READ + 1, _GROUP)
     if starts.size < _FEWEST:
@@ -141,6 +170,7 @@ def find_stretches(movie: Stack, span: tuple[int, int]) -> Stretches:
     return _between(span, found) or whole
 
 
+_EXCLUDED = "excluded by fit.excluded_frames"
 _LAMP = "more light than before, as of a lamp or a door that is open,"
 _CUT = "another pattern of light, as where two recordings or fields were joined,"
 _JOLT = "the pattern of the light changes from one frame to the next, as by a jolt or new liquid,"

@@ -69,7 +69,12 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
         )
     stretches = Stretches((span,))
     if mode == "sliding" and config.optics.scheme != "darkfield":
-        stretches = find_stretches(movie, span)
+        stretches = find_stretches(movie, span, config.fit.excluded_frames)
+    elif config.fit.excluded_frames:
+        raise ConfigError(
+            "fit.excluded_frames: frames are left out of landing movies only, which have an "
+            'interferometric scheme and background.method = "sliding"; cut others with fit.frames'
+        )
     asked = config.fit.frames
     if stretches.breaks:  # all that is learned of the movie is learned within one of its parts
         run.warn(stretches.message(movie.name))

@@ -7,9 +7,12 @@ a movie of any length is played with the memory of two images.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in
@@ -18,6 +21,17 @@ from iscat_analysis.records import FloatArray
 
 _SAMPLED = 5  # frames from which limits of the contrast are taken
 _INSIDE = (0.001, 0.999)  # quantiles of the pixels that such limits leave inside
+
+
+def film_limits(
+    image: Callable[[int], NDArray[Any]], frames: tuple[int, int]
+) -> tuple[float, float]:
+    """Give the limits between which most of the pixels of a few frames of a film lie."""
+    looked = np.unique(np.linspace(frames[0], frames[1] - 1, _SAMPLED).astype(int))
+    seen = np.concatenate([np.ravel(image(int(t))) for t in looked]).astype(np.float64)
+    seen = seen[np.isfinite(seen)]
+    low, high = np.quantile(seen, _INSIDE) if seen.size else (0.0, 1.0)
+    return float(low), float(high if high > low else low + 1.0)
 
 
 class RatioFilm:
@@ -117,15 +131,11 @@ class RatioFilm:
 
         Those of the contrast are as far above 0 as below.
         """
-        first, stop = self.frames if ratio else (0, self.movie.shape[0])
-        looked = np.unique(np.linspace(first, stop - 1, _SAMPLED).astype(int))
-        seen = [(self.contrast if ratio else self.raw)(int(t)) for t in looked]
-        values = np.concatenate([image[np.isfinite(image)] for image in seen])
-        low, high = np.quantile(values, _INSIDE) if values.size else (0.0, 1.0)
-        if ratio:
-            high = max(abs(low), abs(high)) or 1.0
-            low = -high
-        return float(low), float(high if high > low else low + 1.0)
+        if not ratio:
+            return film_limits(self.raw, (0, self.movie.shape[0]))
+        low, high = film_limits(self.contrast, self.frames)
+        most = max(abs(low), abs(high)) or 1.0
+        return -most, most
 
     def _frame(self, number: int) -> FloatArray:
         counts: FloatArray = self.movie.read(number, number + 1)[0].astype(np.float64)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -27,7 +28,7 @@ from iscat_analysis.diagnosis.repeated_frames import without_repeats
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.fitting.events import Fitted, PlaceAndMass
+from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
@@ -35,7 +36,9 @@ from iscat_analysis.fitting.regions import Region, photons_scale, region_around,
 from iscat_analysis.fitting.results import view_of
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.landing.neighbours import Neighbours, Step
+from iscat_analysis.landing.steps import StepEvent
 from iscat_analysis.landing.tasks import TaskBuilder
+from iscat_analysis.landing.traces import patch_of, trace_of
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
 from iscat_analysis.search.sliding import StepFrame, stride_of
@@ -119,9 +122,8 @@ def _landings(
         known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
         steps = [_step(neighbours, table.iloc[i]) for i in numbers]
-        task = TaskBuilder(context, chunk, window, neighbours, pattern).build(
-            0, steps, neighbours.of(steps)[0]
-        )
+        tasks = TaskBuilder(context, chunk, window, neighbours, pattern)
+        task = tasks.build(0, steps, neighbours.of(steps)[0])
         if task is None:
             raise DataError(f"{movie.name}: there are no frames around frame {frame} to draw")
         start, (y_px, x_px) = steps[0].start, task.offset_px
@@ -130,7 +132,15 @@ def _landings(
         )
         fit = fit_particle(task.likelihood, start, context.mode, config.fit.z_range_nm, level=True)
         number = int(table["event"].iloc[row])
-        return view_of(number, Fitted(task.region, fit, task.likelihood))
+        fitted = StepEvent(
+            Event(
+                task.region, fit, task.likelihood, task.windows, (), task.at.frame, task.n_before,
+                task.n_after, steps[0].sign, task.at.half_width, task.at.rise,
+            ),
+            replace(steps[0], at=task.at), tuple(steps[1:]), np.zeros(0),
+        )  # fmt: skip
+        trace = trace_of(fitted, patch_of(fitted, chunk, window), chunk, neighbours, tasks)
+        return view_of(number, Fitted(task.region, fit, task.likelihood), trace=trace)
 
     return draw
 

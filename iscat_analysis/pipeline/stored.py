@@ -18,7 +18,7 @@ from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.pipeline.redraw import Redraw, redraw
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import EventView
-from iscat_analysis.report.pictures import draw_view
+from iscat_analysis.report.pictures import draw_view, event_facts
 
 
 def open_result(folder: str | Path, *, movie: str | Path | None = None) -> StoredResult:
@@ -192,7 +192,7 @@ class StoredResult:
         Returns
         -------
         matplotlib.figure.Figure
-            Three panels.
+            Three panels, and of a landing movie the contrast against frame below.
 
         Raises
         ------
@@ -201,6 +201,21 @@ class StoredResult:
         """
         pixel_nm = float(self.config.camera.pixel_size_nm or 0.0)
         return draw_view(self.images(row), self.config.optics.scheme, pixel_nm)
+
+    def facts(self, row: int) -> list[tuple[str, str]]:
+        """Say in words what was found of a row of the table.
+
+        Parameters
+        ----------
+        row : int
+            As for `images`.
+
+        Returns
+        -------
+        list of (str, str)
+            What is told, and its value with error, bound and unit.
+        """
+        return event_facts(self.table.iloc[row])
 
     def close(self) -> None:
         """Release the movie, where it was opened; it is opened again when it is needed."""

@@ -5,9 +5,11 @@ from __future__ import annotations
 import functools
 import io
 from collections.abc import Callable
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from iscat_analysis.errors import ConfigError, DataError
@@ -16,6 +18,12 @@ from iscat_analysis.report import event_figures, figures, track_figures
 from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.style import STYLE
 from iscat_analysis.report.tables import event_table
+
+SHOWN_FRAMES = 12
+"""Frames around its own in which an event of a landing movie is marked in a film."""
+
+_QUANTITIES = (("mass_kda", "mass", "kDa"), ("x_nm", "x", "nm"), ("y_nm", "y", "nm"),
+               ("z_nm", "z", "nm"))  # fmt: skip
 
 
 def draw(analysis: Analysis, kind: str) -> Figure:
@@ -82,6 +90,28 @@ def posterior_of(analysis: Analysis, event: int) -> PosteriorResult:
             f"({posterior.message}), so it is not a posterior; raise posterior.steps"
         )
     return posterior
+
+
+def event_facts(row: pd.Series[Any]) -> list[tuple[str, str]]:
+    """Say in words what was found of an event: its numbers, with errors and bounds."""
+    name, number = "event", row["event"]
+    if "track" in row and pd.notna(row["track"]):
+        name, number = "track", int(row["track"])
+    when = "leaves at frame" if row["mass_kda"] < 0 else "frame"
+    facts = [(name, f"{number}, {when} {row['frame']}")]
+    for key, label, unit in _QUANTITIES:
+        if not np.isfinite(row[key]):
+            continue
+        sigma, bound = row[f"sigma_{key}"], row[f"crb_{key}"]
+        error = f" ± {sigma:.1f}" if np.isfinite(sigma) else ""
+        beside = f" (CRB {bound:.1f})" if np.isfinite(bound) else ""
+        facts.append((label, f"{row[key]:.1f}{error} {unit}{beside}"))
+    status = Status(row["status"])
+    return [
+        *facts,
+        ("contrast", f"{100 * row['contrast']:.3f} %, SNR {row['snr']:.1f}"),
+        ("status", f"{status.value}: {status.advice}"),
+    ]
 
 
 def _movie(analysis: Analysis) -> str:

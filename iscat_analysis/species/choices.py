@@ -28,9 +28,9 @@ from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, height
+from iscat_analysis.species.mixture import Mixture, ascend, height
 from iscat_analysis.species.search import fit_species
-from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, fit_jointly
+from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, fit_jointly, polish
 
 Widths = Literal["common", "free"]
 
@@ -98,6 +98,19 @@ class Number:
         """Fit this number of species."""
         fits = fit_species(events, self.k, least=self.k)
         return Chosen(tuple(fits), fits[-1].by_mass())
+
+
+@dataclass(frozen=True)
+class Begun:
+    """Species with free masses, near those that are given."""
+
+    masses_kda: tuple[float, ...]
+
+    def choose(self, events: Events) -> Chosen:
+        """Climb from the given masses to the nearest maximum of the likelihood."""
+        masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
+        best = polish(events, ascend(events, _near(events, masses)))
+        return Chosen((best,), best.by_mass())
 
 
 @dataclass(frozen=True)
@@ -221,7 +234,7 @@ class Ladder:
         return float(chdtrc(k - means, gain))
 
 
-Choice = Searched | Number | Given | Ladder
+Choice = Searched | Number | Begun | Given | Ladder
 
 
 def rungs(
@@ -262,13 +275,21 @@ def rungs(
 
 
 def _start(events: Events, mean: FloatArray, structure: Structure, background: bool) -> Mixture:
-    """Start from the fractions of events near each mass, and the typical error as width."""
+    """Start from the species near each mass, and a faint background."""
+    near = _near(events, mean)
+    if not background:
+        return near
+    weight = np.append(near.weight, 0.05)
+    mean = np.append(mean, structure.origin[1, -1])
+    return Mixture(weight / weight.sum(), mean, np.append(near.variance, structure.origin[2, -1]))
+
+
+def _near(events: Events, mean: FloatArray) -> Mixture:
+    """Take the fractions of events near each mass, and the typical error as width.
+
+    Shapes: `mean` (k,).
+    """
     edges = (mean[:-1] + mean[1:]) / 2
-    near = np.searchsorted(edges, events.x)
-    size = np.bincount(near, minlength=mean.size) + 1.0
+    size = np.bincount(np.searchsorted(edges, events.x), minlength=mean.size) + 1.0
     variance = np.full(mean.size, float(np.median(events.sigma)) ** 2)
-    if background:
-        size = np.append(size, 0.05 * size.sum())
-        mean = np.append(mean, structure.origin[1, -1])
-        variance = np.append(variance, structure.origin[2, -1])
     return Mixture(size / size.sum(), mean, variance)

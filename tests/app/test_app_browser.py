@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -16,8 +17,10 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import pandas as pd
 import pytest
+from app_results import dimers_result, standards_result
 from browsers import BROWSER, DRIVER, open_browser
 from small_movies import LANDING
 
@@ -31,8 +34,15 @@ pytestmark = pytest.mark.skipif(
 selenium = pytest.importorskip("selenium", reason="needs the Python package selenium")
 pytest.importorskip("panel", reason="needs the Python package panel")
 
+actions = pytest.importorskip("selenium.webdriver.common.actions.action_builder")
+chains = pytest.importorskip("selenium.webdriver.common.action_chains")
+Keys = pytest.importorskip("selenium.webdriver.common.keys").Keys
+
 PATIENCE_S = 120.0
 """How long is waited for what should be seen; a loaded machine is slow."""
+
+SERIES_NM = (3.0, 10.0, 30.0)
+"""Concentrations of a protein whose dimers have K_D = 10 nM."""
 
 EVERYWHERE = """
 const everywhere = (root, found = []) => {
@@ -107,6 +117,45 @@ class Page:
             ),
         )
 
+    def type(self, label: str, text: str) -> None:
+        """Write into the field below a label, and leave it."""
+        field = self.until(
+            f"{label} is there",
+            lambda: self.script(
+                """
+                const word = everywhere(document).find(
+                  (n) => n.matches("label") && shown(n) && n.textContent.trim() === arguments[0]);
+                return word?.getRootNode().querySelector("input");
+                """,
+                label,
+            ),
+        )
+        field.clear()
+        field.send_keys(text, Keys.TAB)
+
+    def click_figure(self, x_label: str, x: float) -> None:
+        """Click a figure at a place of its horizontal axis, in the middle of its height."""
+        across, down = self.until(
+            f"{x_label} has a frame",
+            lambda: self.bokeh(
+                """
+                const plot = models.find(
+                  (m) => m.type === "Figure" && m.below?.[0]?.axis_label === arguments[0]);
+                const view = plot && Bokeh.index.find_one(plot);
+                if (!view?.el || !shown(view.el)) return null;
+                view.el.scrollIntoView({ block: "center" });
+                const box = view.el.getBoundingClientRect(), frame = view.frame.bbox;
+                return [box.x + view.frame.x_scale.compute(arguments[1]),
+                        box.y + (frame.top + frame.bottom) / 2];
+                """,
+                x_label,
+                x,
+            ),
+        )
+        mouse = actions.ActionBuilder(self.driver)
+        mouse.pointer_action.move_to_location(round(across), round(down)).click()
+        mouse.perform()
+
     def bokeh(self, code: str, *given: Any) -> Any:
         """Ask the models of the figures."""
         return self.script(
@@ -128,11 +177,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (path / "iscat.toml").write_text(small, encoding="utf-8")
     ia.simulate_movie(path / "iscat.toml", path / "landing.tif", seed=1)
     (path / "damaged.tif").write_bytes((path / "landing.tif").read_bytes()[:50_000])
+    random, series = np.random.default_rng(5), path / "series"
+    series.mkdir()
+    for concentration in SERIES_NM:
+        dimers_result(series / f"{concentration:g} nM.iscat", random, concentration)
+    standards_result(series / "standards.iscat", random)
     return path
 
 
 @pytest.fixture(scope="module")
-def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def server(
+    folder: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[subprocess.Popen[str]]:
     """Start the command; Ctrl-C ends it, and it says nothing went wrong."""
     log = tmp_path_factory.mktemp("server") / "log"
     code = "import sys, iscat_cli; sys.argv = ['iscat', 'app', *sys.argv[1:]]; "
@@ -144,13 +200,20 @@ def address(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
             env=os.environ | {"BROWSER": "true"},  # which opens nothing
         )  # fmt: skip
         assert server.stdout is not None
-        with server.stdout as said_first:
-            yield said_first.readline().strip()
+        with server.stdout:
+            yield server
             server.send_signal(signal.SIGINT)
             assert server.wait(PATIENCE_S) == 0
     said = log.read_text()
     assert "unexpected" not in said, said
     assert "Traceback" not in said, said
+
+
+@pytest.fixture(scope="module")
+def address(server: subprocess.Popen[str]) -> str:
+    """Read the address that the command prints."""
+    assert server.stdout is not None
+    return server.stdout.readline().strip()
 
 
 @pytest.fixture(scope="module")
@@ -188,7 +251,8 @@ WEBSOCKET = {
 
 
 @pytest.mark.parametrize(
-    ("place", "headers"), [("", {}), ("?token=guessed", {}), ("ws", WEBSOCKET)]
+    ("place", "headers"),
+    [("", {}), ("?token=guessed", {}), ("ws", WEBSOCKET), ("page?path=report.html", {})],
 )
 def test_nobody_is_let_in_without_the_token(
     address: str, place: str, headers: dict[str, str]
@@ -198,6 +262,21 @@ def test_nobody_is_let_in_without_the_token(
         urllib.request.urlopen(wanted)
     with refused.value as answer:
         assert answer.code == 403
+
+
+def test_pages_of_the_commands_are_shown_in_a_sandbox_and_nothing_else_is(
+    address: str, folder: Path
+) -> None:
+    (folder / "report.html").write_text("<!doctype html><p>of an analysis", encoding="utf-8")
+    here, _, token = address.partition("?")
+    wanted = f"{here}page?{token}&path={quote(str(folder / 'report.html'))}"
+    with urllib.request.urlopen(wanted) as answer:
+        assert answer.read().endswith(b"of an analysis")
+        assert answer.headers["Content-Security-Policy"].startswith("sandbox")
+    with pytest.raises(urllib.error.HTTPError) as refused:
+        urllib.request.urlopen(wanted.replace("report.html", "iscat.toml"))
+    with refused.value as answer:
+        assert answer.code == 404
 
 
 def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> None:
@@ -234,6 +313,13 @@ def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> Non
         ".selected.indices = [...Array(500).keys()]"
     )
     page.says("SNR")
+    page.until(
+        "the pictures are drawn",
+        lambda: page.script(
+            "return everywhere(document).some("
+            "(n) => n.matches('img') && shown(n) && n.naturalWidth > 99)"
+        ),
+    )
     page.choose(" kDa, ok")
     events = len(pd.read_parquet(folder / "landing.iscat" / "fits.parquet"))
     assert events > 0
@@ -267,9 +353,208 @@ def test_a_damaged_movie_is_refused_in_words_and_the_page_goes_on(page: Page) ->
     page.says("is damaged")
     page.open("Look")
     page.says("is damaged")
-    page.open("Open")
-    page.choose("landing.tif")
+    for movie, words in (("landing.tif", "240 of 64 × 64 pixels"), ("damaged.tif", "is damaged")):
+        page.open("Open")
+        page.choose(movie)  # at once, while the server may still be busy with the other tab
+        page.says(movie, words)
+        page.open("Look")
+        page.says("Black and white at")
+
+
+def test_samples_are_compared_and_bind(page: Page) -> None:
+    page.choose("series/")
+    page.choose("3 nM.iscat")
+    page.says("events", "600")
+    page.open("Compare")
+    page.until(
+        "all results are chosen",
+        lambda: page.script(
+            """
+            const list = everywhere(document).find(
+              (n) => n.matches("select[multiple]") && shown(n));
+            if (list?.options.length !== 4) return false;
+            for (const option of list.options) option.selected = option.text.includes("nM");
+            list.dispatchEvent(new Event("change", { bubbles: true }));
+            return true;
+            """
+        ),
+    )
+    for concentration in SERIES_NM:
+        page.type(f"{concentration:g} nM: monomers in all [nM]", f"{concentration:g}")
+    page.type("Approximate masses [kDa]", "66")
+    page.click("Fit K_D")
+    page.says("K_D =", "by K_D")
+    found = re.search(r"K_D = (\S+) nM \(95 %: (\S+) to (\S+) nM\)", page.text())
+    assert found is not None
+    _, low, high = map(float, found.groups())
+    assert 0.5 * low < 10 < 2 * high  # one draw of an interval
+    assert high < 5 * low
+    page.click("Test whether they differ")
+    page.says("p: same masses", "10 nM", "30 nM")
+
+
+def test_a_clicked_peak_is_a_standard(page: Page, folder: Path) -> None:
+    page.choose("series/")
+    page.choose("standards.iscat")
+    page.says("events", "360")
+    page.open("Calibrate")
+    page.type("Masses of the standards [kDa]", "132, 264")
+    page.until(
+        "peaks are marked",
+        lambda: page.bokeh("return models.some((m) => m.data?.text && m.data.x?.length === 3)"),
+    )
+    for number, percent in enumerate((0.41, 0.82), start=1):
+        page.click_figure("|contrast| [%]", percent)
+        page.until(
+            f"{number} peaks have masses",
+            lambda number=number: page.bokeh(
+                "return models.some((m) => m.type === 'ColumnDataSource' && Array.from("
+                "m.get_column('text') ?? []).filter((t) => String(t).endsWith('kDa')).length"
+                " === arguments[0])",
+                number,
+            ),
+        )
+    page.click("Fit the line")
+    page.says("by the line [kDa]", "saved in")
+    line = (folder / "series" / "standards.calibration" / "calibration.toml").read_text()
+    slope = float(line.split("gradient_per_kda = ")[1].split()[0])
+    assert slope == pytest.approx(-3.1e-5, rel=0.03)
+    page.choose("line of the masses: standards")
+
+
+@pytest.mark.large
+def test_species_are_fitted_again_from_where_somebody_drags_them(page: Page) -> None:
+    page.choose("series/")
+    page.choose("standards.iscat")
+    page.says("events", "360")
+    page.open("Results")
+    page.click("Find the species")
+    page.says("species [kDa]")
+    handles = "models.find((m) => m.type === 'PointDrawTool').renderers[0].data_source"
+    means = page.until("there are diamonds", lambda: page.bokeh(f"return [...{handles}.data.x]"))
+    assert sorted(means) == pytest.approx([66, 132, 264], rel=0.03)
+    page.bokeh(f"{handles}.data = {{ x: [70, 250], y: [1, 1] }}")  # one moved, one removed
+    page.click("Fit again from the diamonds")
+    page.until("two are left", lambda: page.bokeh(f"return {handles}.data.x[0] !== 70"))
+    assert page.bokeh(f"return {handles}.data.x.length") == 2
+    page.open("Export")
+    page.says("iscat species", "--start 70,250")
+
+
+@pytest.mark.large
+def test_the_keyboard_alone_opens_and_runs(page: Page) -> None:
+    def press(*keys: str) -> None:
+        chains.ActionChains(page.driver).send_keys(*keys).perform()
+
+    def tab_to(what: str) -> None:
+        for _ in range(80):
+            press(Keys.TAB)
+            now = page.script(
+                "let n = document.activeElement; while (n?.shadowRoot?.activeElement) "
+                "n = n.shadowRoot.activeElement; return n?.matches('select') ? 'list' "
+                ": n?.textContent?.trim() ?? ''"
+            )
+            if now == what:
+                return
+        raise AssertionError(f"Tab does not reach {what}")
+
+    tab_to("list")
+    press("○")  # the list jumps to what begins so, or to its first line
+    for _ in range(8):
+        if "240 of 64 × 64 pixels" in page.text():
+            break
+        press(Keys.ARROW_DOWN)
+        time.sleep(1)
     page.says("240 of 64 × 64 pixels")
+    page.driver.execute_script("document.activeElement.blur()")
+    tab_to("Run")
+    press(Keys.ENTER)
+    page.says("Analyse this movie")
+    tab_to("Analyse this movie")
+    press(Keys.ENTER)
+    page.says("$ iscat-fit")
+
+
+TABS = ("Open", "Look", "Set up", "Run", "Results", "Compare", "Calibrate", "Bounds", "Export")
+
+
+@pytest.mark.large
+@pytest.mark.parametrize("theme", ["default", "dark"])
+def test_nothing_is_cut_off_at_twice_the_size(
+    page: Page, address: str, folder: Path, theme: str
+) -> None:
+    size = {"width": 700, "height": 500, "deviceScaleFactor": 2, "mobile": False}
+    page.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        movie = quote(str(folder / "landing.tif"))
+        page.driver.get(f"{address}&movie={movie}&theme={theme}")
+        page.says("landing.tif")
+        for tab in TABS:
+            page.open(tab)
+            page.until(f"{tab} is there", lambda: page.text().count("\n") > 14)
+            beyond = page.script(
+                """
+                const inner = (n) => { for (; n; n = n.parentElement ?? n.getRootNode().host)
+                  if (getComputedStyle(n).overflowX === "auto" && n.tagName === "DIV") return true;
+                  return false; };
+                return everywhere(document).filter((n) => shown(n) && !inner(n.parentElement)
+                  && n.getBoundingClientRect().right > window.innerWidth + 1)
+                  .map((n) => `${n.tagName} ${n.className} ${n.textContent.slice(0, 40)}`);
+                """
+            )
+            assert beyond == [], tab
+            pale = page.script(
+                """
+                const number = (colour) => colour.match(/[\\d.]+/g).map(Number);
+                const light = ([r, g, b]) => [r, g, b].map((c) => c / 255)
+                  .map((c) => (c <= 0.04 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
+                  .reduce((sum, c, k) => sum + c * [0.2126, 0.7152, 0.0722][k], 0);
+                const ground = (n) => { for (; n; n = n.parentElement ?? n.getRootNode().host) {
+                  const c = number(getComputedStyle(n).backgroundColor);
+                  if (c.length < 4 || c[3] > 0.5) return c; } return [255, 255, 255]; };
+                return everywhere(document).filter((n) => shown(n) && !n.matches(":disabled, svg *")
+                  && [...n.childNodes].some((c) => c.nodeType === 3 && c.textContent.trim()))
+                  .filter((n) => !n.matches("option, style, script"))
+                  .filter((n) => { const [a, b] = [number(getComputedStyle(n).color), ground(n)]
+                    .map(light); return (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05) < 3; })
+                  .map((n) => `${n.tagName} ${n.textContent.slice(0, 40)}`);
+                """
+            )
+            assert pale == [], tab
+    finally:
+        page.driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+@pytest.mark.large
+def test_a_movie_of_ten_gigabytes_needs_little_memory(
+    page: Page, folder: Path, address: str, server: subprocess.Popen[str]
+) -> None:
+    zarr = pytest.importorskip("zarr", reason="needs the Python package zarr")
+    path = folder / "large"
+    path.mkdir()
+    frames = 10_000_000_000 // (512 * 512 * 2)
+    movie = zarr.create_array(
+        path / "large.zarr", shape=(frames, 512, 512), chunks=(1, 512, 512), dtype="uint16"
+    )
+    movie[:64] = np.random.default_rng(2).poisson(1000, (64, 512, 512))
+    chunks = path / "large.zarr" / "c"
+    for frame in range(64, frames):  # the same again and again, which takes no room on the disk
+        (chunks / f"{frame}" / "0").mkdir(parents=True)
+        (chunks / f"{frame}" / "0" / "0").hardlink_to(chunks / f"{frame % 64}" / "0" / "0")
+    page.driver.get(f"{address}&movie={quote(str(path / 'large.zarr'))}")
+    page.says(f"{frames} of 512 × 512 pixels")
+    for tab in TABS:
+        page.open(tab)
+        page.until(f"{tab} is there", lambda: page.text().count("\n") > 14)
+    page.open("Look")
+    before = page.drawn()
+    page.click("▶ Play")
+    page.until("the film plays", lambda: page.drawn() > before + 25)
+    page.click("⏸ Pause")
+    status = Path(f"/proc/{server.pid}/status").read_text()
+    peak_kb = int(status.split("VmHWM:")[1].split()[0])
+    print(f"peak memory of the server: {peak_kb / 1e6:.2f} GB")
+    assert peak_kb < 1.5e6
 
 
 @pytest.mark.large

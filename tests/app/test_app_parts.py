@@ -4,18 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
+import tifffile
+from app_results import standards_result
 
 import iscat_analysis as ia
 
 pytest.importorskip("panel", reason="needs the Python package panel")
 
+from iscat_app.calibrate import Calibrate
+from iscat_app.calibrations import beside, take
 from iscat_app.chosen import Chosen, table_of
 from iscat_app.files import listed
-from iscat_app.form import FIRST, Form, add_table, fields, read_texts, write_texts
+from iscat_app.form import FIRST, Form, fields
 from iscat_app.rejections import Rejections
-from iscat_app.runs import Queue
+from iscat_app.runs import Job, Queue
+from iscat_app.setup_file import add_table, read_texts, write_texts
 
 
 def test_the_form_has_every_key_of_the_configuration_once() -> None:
@@ -75,6 +81,64 @@ def test_a_calibration_replaces_only_its_section(tmp_path: Path) -> None:
     assert (config.optics.na, config.calibration.gradient_per_kda) == (1.3, -3e-5)
 
 
+def test_calibrations_beside_a_movie_go_into_its_configuration(tmp_path: Path) -> None:
+    for name, text in (
+        ("a.camera/camera.toml", '[camera]\ngain_e_per_adu = 2.5  # 95 %\noffset_adu = "o.tif"\n'),
+        ("b.optics/optics.toml", "[optics]\nna = 1.31\n"),
+        ("c.calibration/calibration.toml", "[calibration]\ngradient_per_kda = -3e-5\n"),
+        ("d.optics/optics.html", "refused: there is no optics.toml"),
+    ):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    tifffile.imwrite(tmp_path / "a.camera" / "o.tif", np.full((4, 4), 100, np.float32))
+    found = beside(tmp_path)
+    assert [*found] == ["camera: a", "optics: b", "line of the masses: c"]
+    setup = tmp_path / "iscat.toml"
+    write_texts(setup, {"camera.pixel_size_nm": "84", "camera.gain_e_per_adu": "1.0"})
+    for path in found.values():
+        take(Path(path), setup)
+    config = ia.load_config(setup)
+    assert (config.camera.pixel_size_nm, config.camera.gain_e_per_adu) == (84.0, 2.5)
+    assert config.camera.offset_adu == str(tmp_path / "a.camera" / "o.tif")
+    assert config.optics.na == 1.31
+    assert config.calibration is not None
+    assert config.calibration.gradient_per_kda == -3e-5
+
+
+def test_frames_that_are_left_out_add_up_in_the_form(tmp_path: Path) -> None:
+    (tmp_path / "iscat.toml").write_text("[fit]\nexcluded_frames = [[5, 9]]\n", encoding="utf-8")
+    chosen = Chosen()
+    chosen.choose(tmp_path / "movie.tif")
+    form = Form(chosen)
+    form.refresh()
+    chosen.excluded = (20, 40)
+    form.refresh()
+    form._save(None)
+    assert ia.load_config(tmp_path / "iscat.toml").fit.excluded_frames == ((5, 9), (20, 40))
+
+
+@pytest.fixture
+def standards(tmp_path: Path) -> Path:
+    """Make a result whose peaks lie at 66, 132 and 264 kDa."""
+    return standards_result(tmp_path / "standards.iscat", np.random.default_rng(3))
+
+
+def test_a_click_gives_a_peak_its_mass_and_takes_it_back(standards: Path) -> None:
+    chosen = Chosen(result=standards)
+    calibrate = Calibrate(chosen, Queue())
+    calibrate.refresh()
+    assert len(calibrate.peaks) == 3
+    calibrate._standards.value = "264, 132"
+    calibrate._clicked(0.42)  # %, near 3.1e-5 · 132
+    calibrate._clicked(0.80)
+    calibrate._clicked(0.20)  # there is no third mass
+    assert calibrate.assigned == {1: 132.0, 2: 264.0}
+    calibrate._clicked(0.41)
+    assert calibrate.assigned == {2: 264.0}
+    calibrate._standards.value = "66"
+    assert calibrate.assigned == {}
+
+
 @pytest.fixture
 def table() -> pd.DataFrame:
     return pd.DataFrame(
@@ -109,10 +173,13 @@ def test_a_new_analysis_does_not_inherit_rejections_of_other_events(
 def test_a_run_that_cannot_be_fails_in_words_and_is_not_put_twice(tmp_path: Path) -> None:
     queue = Queue()
     queue.close()  # nothing begins
-    run = queue.add(tmp_path / "a.tif", None, tmp_path / "a.iscat", settings=["optics.na=1.3"])
-    assert queue.add(tmp_path / "a.tif", None, tmp_path / "a.iscat") is run
-    assert run.command.startswith("iscat-fit ")
-    assert "--set optics.na=1.3" in run.command
+    run = queue.add(Job(tmp_path / "a.tif", tmp_path / "iscat.toml", tmp_path / "a.iscat"))
+    assert queue.add(Job(tmp_path / "a.tif", None, tmp_path / "a.iscat")) is run
+    assert run.job.command.startswith("iscat-fit ")
+    assert f"--config {tmp_path / 'iscat.toml'}" in run.job.command
+    camera = Job(tmp_path / "a.tif", None, tmp_path / "a.camera", "camera", dark=tmp_path / "d.tif")
+    assert camera.command.startswith("iscat calibrate camera ")
+    assert f"--dark {tmp_path / 'd.tif'}" in camera.command
     queue.stop(run)
     assert run.state == "stopped"
     assert queue.again(run) is not run

@@ -62,6 +62,8 @@ def test_json_follows_the_schema(events: Path, tmp_path: Path, capsys) -> None:
         ("--sigma 0", 2, "--sigma 0: give one mass in kDa above 0"),
         ("--above 9000", 1, "no event lies above --above 9000"),
         ("--k 200", 1, "give a smaller --k"),
+        ("--start 66,1x", 2, "--start 66,1x: write masses in kDa"),
+        ("--start 66 --k 2", 2, "--k and --start"),
         ("--branch leaving", 1, "holds 0 leaving events"),
     ],
 )
@@ -119,7 +121,9 @@ def test_samples_are_compared_with_the_first(events: Path, tmp_path: Path, capsy
     assert printed["comparisons"][0]["same_fractions"]["p_value"] < 1e-3
 
 
-@pytest.mark.parametrize("option", ["--offset", "--hold", "--branch=landing", "--widths=free"])
+@pytest.mark.parametrize(
+    "option", ["--offset", "--hold", "--branch=landing", "--widths=free", "--start=66"]
+)
 def test_what_is_for_one_table_is_refused_for_two(option: str, events: Path, capsys) -> None:
     assert main(["species", str(events), str(events), "--ladder", "66", option]) == 2
     assert f"{option.partition('=')[0]} is for a single table" in capsys.readouterr().err

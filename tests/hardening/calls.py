@@ -196,8 +196,9 @@ def _made() -> dict[str, Call]:
             "mass_kda": np.array([1e5]), "diameter_nm": 100.0, "sigma_mass_kda": 10.0,
             "sigma_diameter_nm": 1.0, "index": 1.46, "density_kg_m3": 1350.0, "n_medium": 1.33}),
         "find_species": (ia.find_species, known | {
-            "events": events, "k": 2, "masses_kda": None, "ladder": None, "steps": (),
-            "branch": "magnitude", "draws": 0, "seed": 1, "kinetics": None, "out": None}),
+            "events": events, "k": 2, "masses_kda": None, "start_kda": None,
+            "ladder": None, "steps": (), "branch": "magnitude", "draws": 0, "seed": 1,
+            "kinetics": None, "out": None}),
         "find_ladder": (ia.find_species, known | {
             "events": events, "ladder": 66.0, "steps": [1, 2], "offset": False, "hold": False,
             "widths": "common", "background": False, "draws": 0}),

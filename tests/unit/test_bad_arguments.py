@@ -42,8 +42,8 @@ _WRONG: list[object] = [
     np.array(["a", "b"]), [1, [2, 3]], np.datetime64("2020"),
 ]  # fmt: skip
 _OPTIONS = {
-    "find_species": ("events", "k", "draws", "seed", "sigma_kda", "above_kda", "limit_kda",
-                     "offset", "hold", "background", "widths", "branch"),
+    "find_species": ("events", "k", "start_kda", "draws", "seed", "sigma_kda", "above_kda",
+                     "limit_kda", "offset", "hold", "background", "widths", "branch"),
     "compare_samples": ("first", "k", "sigma_kda", "above_kda", "background"),
     "fit_kinetics": ("events", "frame_rate_hz", "frames", "radius_px"),
     "fit_diffusion": ("frames", "positions_nm", "sigma_nm", "frame_rate_hz", "exposure_ms",

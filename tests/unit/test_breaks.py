@@ -127,6 +127,26 @@ def test_a_break_is_named_left_out_and_the_rest_is_right(
     assert {axes.get_xlim() for axes in figure.axes} == {(0.0, FRAMES)}  # one axis
 
 
+def test_frames_are_left_out_where_somebody_says() -> None:
+    fit = {"roi_nm": 1300.0, "excluded_frames": [[110, 130], [80, 115]]}
+    result = ia.fit_movie(_counted(_light(1)), config=_config(fit=fit))
+    (one,) = result.summary["left_out"]["breaks"]
+    assert (one["start"], one["stop"]) == (80, 130)
+    assert "excluded" in one["cause"]
+    assert result.summary["left_out"]["analysed"] == [[0, 80], [130, FRAMES]]
+    assert np.abs(result.table["frame"].to_numpy() - np.array([50, 230, 290])).max() <= 2
+    assert list(result.table["status"]) == ["ok"] * 3
+
+
+def test_frames_are_left_out_of_landing_movies_only() -> None:
+    movie = _counted(_light(1)[:60])
+    with pytest.raises(ConfigError, match="excluded_frames leaves no"):
+        ia.fit_movie(movie, config=_config(fit={"excluded_frames": [[4, 56]]}))
+    fixed = {"method": "fixed", "frames": [0, 30], "window_frames": None}
+    with pytest.raises(ConfigError, match="of landing movies only"):
+        ia.fit_movie(movie, config=_config(background=fixed, fit={"excluded_frames": [[40, 50]]}))
+
+
 @pytest.mark.parametrize(
     "kind", ["quiet", "drift", "landings", "heavy", "bright", "flicker", "dark"]
 )

@@ -121,6 +121,20 @@ def test_as_many_species_as_asked_for(oligomers: pd.DataFrame) -> None:
     assert more.best.weight.size == 5
 
 
+def test_species_begin_where_somebody_says(oligomers: pd.DataFrame) -> None:
+    free = ia.find_species(oligomers, k=3, draws=0)
+    found = ia.find_species(oligomers, start_kda=(240.0, 60.0, 140.0), draws=0)
+    assert found.selection["log_likelihood"].iloc[-1] == pytest.approx(
+        free.selection["log_likelihood"].iloc[-1], abs=0.05
+    )
+    assert found.species["mass_kda"].to_numpy() == pytest.approx(
+        free.species["mass_kda"].to_numpy(), rel=0.01
+    )
+    alone = ia.find_species(oligomers, start_kda=[66.0], draws=0)  # the number is the user's
+    assert len(alone.species) == 1
+    assert alone.species["mass_kda"].iloc[0] != pytest.approx(66.0, rel=0.1)
+
+
 def test_a_cut_tells_as_much_as_the_detector_does() -> None:
     table = draw_table(np.random.default_rng(5), {66.0: 6000, 132.0: 2000}, efficiency=EFFICIENCY)
     plain = table.drop(columns="snr")
@@ -192,6 +206,8 @@ def test_refeyns_table_is_read(data_dir: Path) -> None:
         ({"k": 0}, "`k` = 0: give one whole number of at least 1"),
         ({"masses_kda": (66.0, -1.0)}, "above 0"),
         ({"masses_kda": (66.0, 66.0)}, "twice"),
+        ({"start_kda": (66.0, 66.0)}, "`start_kda`: names a mass twice"),
+        ({"start_kda": (66.0,), "k": 2}, "`k` and `start_kda`"),
         ({"ladder": -3.0}, "mass of a monomer"),
         ({"ladder": 66.0, "steps": (0, 1)}, "`steps` = 0: give one whole number"),
         ({"ladder": "auto", "hold": True}, "whose mass is given"),

@@ -257,6 +257,27 @@ def test_standards_that_do_not_match_are_one_clear_line() -> None:
         calibrate_mass(contrast, (400, 480))
 
 
+def test_peaks_may_be_named() -> None:
+    """Peaks at 1, 2 and 4 times a mass: those of 132 and 264 kDa lie as those of 66 and 132 do."""
+    rng = np.random.default_rng(11)
+    contrast = np.concatenate([
+        events(rng, (66.0,), count=240, offset=0.0),
+        events(rng, (132.0, 264.0), count=60, offset=0.0),
+    ])  # fmt: skip
+    assert calibrate_mass(contrast, (132, 264)).gradient_per_kda == pytest.approx(
+        GRADIENT / 2, rel=0.05
+    )  # the control: the more numerous are taken
+    for masses in ((132, 264), (264, 132)):
+        found = calibrate_mass(contrast, masses, peaks_at=[-GRADIENT * m for m in masses])
+        assert found.gradient_per_kda == pytest.approx(GRADIENT, rel=0.03)
+    with pytest.raises(DataError, match="264 kDa has no peak of its own near"):
+        calibrate_mass(contrast, (132, 264), peaks_at=(-GRADIENT * 132, -GRADIENT * 180))
+    with pytest.raises(DataError, match="do not match the peaks"):
+        calibrate_mass(contrast, (66, 264), peaks_at=(-GRADIENT * 264, -GRADIENT * 66))
+    with pytest.raises(ConfigError, match="one peak for each standard"):
+        calibrate_mass(contrast, (132, 264), peaks_at=(0.004,))
+
+
 def test_a_wrong_sign_is_one_clear_line() -> None:
     contrast = events(np.random.default_rng(6))
     with pytest.raises(DataError, match=r"only 60 of 510 events are bright.*wrong sign"):

@@ -73,6 +73,13 @@ def test_the_images_are_those_that_the_fit_saw(written, kind: str, rows: int) ->
                     getattr(seen, name), getattr(expected, name), atol=IMAGE_ATOL
                 )
             np.testing.assert_allclose(seen.residual, expected.residual, atol=0.1)
+            assert (seen.trace is None) == (expected.trace is None)
+            if seen.trace is not None and expected.trace is not None:
+                assert (seen.trace.first, seen.trace.frame) == (
+                    expected.trace.first, expected.trace.frame,
+                )  # fmt: skip
+                difference = seen.trace.contrast - expected.trace.contrast
+                assert np.nanmax(np.abs(difference)) < 0.2 * seen.trace.sigma
         # the comparison notices another event
         one, other = result.images(0).model, result.images(1).model
         assert one.shape != other.shape or np.abs(one - other).max() > 10 * IMAGE_ATOL

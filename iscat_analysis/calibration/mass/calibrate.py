@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from iscat_analysis.calibration.mass.line import york_line
-from iscat_analysis.calibration.mass.matching import check_match, match
+from iscat_analysis.calibration.mass.matching import check_match, match, pick
 from iscat_analysis.calibration.mass.peaks import ContrastPeak, find_contrast_peaks
 from iscat_analysis.calibration.mass.result import Landing, MassCalibration
 from iscat_analysis.errors import ConfigError, DataError, SignError
@@ -36,15 +36,19 @@ def calibrate_mass(
     standards_kda: Sequence[float],
     *,
     standards_se_kda: Sequence[float] | None = None,
+    peaks_at: Sequence[float] | None = None,
     sigmas: ArrayLike | None = None,
     landing: Landing = "dark",
     name: str = "the events",
 ) -> MassCalibration:
     """Calibrate contrast against the masses of standards.
 
+    Which peak is whose is found, unless `peaks_at` says about which |contrast| each standard has.
+
     Shapes: `contrasts` (n,), `sigmas` (n,).
     """
     masses, masses_se = _standards(standards_kda, standards_se_kda)
+    named = None if peaks_at is None else _places(peaks_at, standards_kda)
     signed = np.asarray(contrasts, dtype=np.float64)
     errors = np.zeros(signed.shape) if sigmas is None else np.asarray(sigmas, dtype=np.float64)
     finite = np.isfinite(signed) & np.isfinite(errors) & (signed != 0)
@@ -72,7 +76,9 @@ def calibrate_mass(
     for detail in _KERNEL_WIDTHS:
         peaks = find_contrast_peaks(size, size_errors, detail=detail)
         try:
-            chosen = match(peaks, masses, name)
+            chosen = (
+                match(peaks, masses, name) if named is None else pick(peaks, named, masses, name)
+            )
             line = york_line(
                 masses,
                 masses_se,
@@ -129,6 +135,14 @@ def _standards(
         )
     order = np.argsort(values)
     return values[order], se[order]
+
+
+def _places(contrasts: Sequence[float], masses: Sequence[float]) -> FloatArray:
+    """Check where peaks are said to be, and put them into the order of the masses."""
+    places = np.abs(np.asarray(contrasts, dtype=np.float64))
+    if places.shape != np.shape(masses) or not np.isfinite(places).all() or not places.all():
+        raise ConfigError("`peaks_at`: needs the |contrast| of one peak for each standard")
+    return np.asarray(places[np.argsort(np.asarray(masses, dtype=np.float64))])
 
 
 def _refuse_unlikely(slope: float, largest: float, masses: FloatArray, name: str) -> None:

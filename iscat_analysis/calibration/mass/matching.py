@@ -22,6 +22,7 @@ OFFSET_SHARE = 0.35
 """Largest contrast at zero mass, over the contrast of the lightest peak."""
 
 _FITTING_DISTANCE = 0.05  # largest relative distance of a standard that a message says to fit
+_NAMED_DISTANCE = 0.2  # largest relative distance of a peak from where somebody says it is
 _MOST_STANDARDS = 8  # with more, no subsets are tried for a message
 
 
@@ -36,6 +37,26 @@ def match(peaks: Sequence[ContrastPeak], masses: FloatArray, name: str) -> list[
             f"{_advice(peaks, masses)}"
         )
     return _nearest(peaks, masses)[0]
+
+
+def pick(
+    peaks: Sequence[ContrastPeak], contrasts: FloatArray, masses: FloatArray, name: str
+) -> list[ContrastPeak]:
+    """Choose the peaks that somebody has named, by about where they are.
+
+    Shapes: `contrasts, masses` (n,).
+    """
+    chosen: list[ContrastPeak] = []
+    for contrast, mass in zip(contrasts, masses, strict=True):
+        nearest = min(peaks, key=lambda peak: abs(peak.contrast - contrast), default=None)
+        off = math.inf if nearest is None else abs(nearest.contrast / contrast - 1)
+        if nearest is None or off > _NAMED_DISTANCE or nearest in chosen:
+            raise DataError(
+                f"{name}: the standard of {mass:g} kDa has no peak of its own near |contrast| = "
+                f"{contrast:.3g} ({_found(peaks)}); name other peaks"
+            )
+        chosen.append(nearest)
+    return chosen
 
 
 def check_match(
