@@ -242,7 +242,8 @@ class _Point:
         those of all pictures of an owner together, is a common factor: there are too few for more.
         """
         each, whole = self.pixel_scatter()
-        pixels, known = each.sum(axis=0), np.array(owners)
+        pixels: FloatArray = each.sum(axis=0)
+        known = np.array(owners)
         if not (known >= 0).all():
             return pixels
         groupings = (np.arange(len(known)), known)

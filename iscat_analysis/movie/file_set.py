@@ -53,8 +53,9 @@ class FileSet:
         if not len(where) or not (np.diff(where, axis=0) == [0, 1]).all():
             return None
         member, image = self._members[int(where[0, 0])], int(where[0, 1])
-        placed = isinstance(member, PlacedSource)
-        return member.in_place(image, image + stop - start) if placed else None
+        if not isinstance(member, PlacedSource):
+            return None
+        return member.in_place(image, image + stop - start)
 
     def close(self) -> None:
         """Release the files."""
