@@ -1,6 +1,7 @@
 """Movies that break what an analysis takes for granted: the error bar is right, or a flag is set.
 
-    python benchmarks/hazards.py [--quick] [--movies 5] [--seed N] [--rows NAME…] [--json FILE]
+    python benchmarks/hazards.py [--quick] [--movies 5] [--seed N] [--rows NAME…] [--first]
+                                 [--json FILE]
 
 Every row of the table (``_hazard_rows.py``) is one kind of harm at some strengths.  Over all movies
 of a row and strength it is told: how many particles have a row, and an ``ok`` one; the mean of
