@@ -279,10 +279,11 @@ def main() -> int:
     )
     print(f"two workers: {efficiency:.2f} of the processor time of one is not lost")
     print("efficiency by that model: " + ", ".join(f"{n}: {e:.2f}" for n, e in predicted.items()))
+    close = [name for name, speed in bounds.items() if rate > speed / 2]
     print(
         f"limits: memory is copied at {bounds['memory_copy_mb_per_s']:.0f} MB/s, the disk gives "
-        f"{bounds['disk_mb_per_s']:.0f} MB/s; the fastest job, {rate:.0f} MB per processor-second, "
-        f"is {bounds['memory_copy_mb_per_s'] / rate:.0f} times below the first: instructions limit"
+        f"{bounds['disk_mb_per_s']:.0f} MB/s; the fastest job takes {rate:.0f} MB per "
+        f"processor-second, so that what limits is: {', '.join(close) or 'instructions'}"
     )
     memory = max(c.peak_memory_mb for c in every)
     numbers = {
