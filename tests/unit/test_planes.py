@@ -117,6 +117,7 @@ def test_particles_at_many_heights_are_not_taken_for_a_membrane(mover: dict[str,
     assert _said_of(config, movie, ["poor_fit"] * 120) == ""
 
 
+@pytest.mark.large
 @pytest.mark.usefixtures("sketched")
 def test_a_movie_of_a_membrane_says_so() -> None:
     """Its heights were free: of all fits nearly none was described, and the optics were blamed."""
@@ -139,7 +140,8 @@ print(len(ia.fit_movie(movie.counts, config=config).table))
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is filled by its C library")
-@pytest.mark.parametrize("filled", [pytest.param("0", marks=pytest.mark.large), "255"])
+@pytest.mark.large
+@pytest.mark.parametrize("filled", ["0", "255"])
 def test_pixels_far_from_a_particle_outside_the_field_are_not_drawn_from_beyond_its_tables(
     filled: str,
 ) -> None:

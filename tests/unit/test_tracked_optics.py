@@ -88,6 +88,7 @@ def test_what_no_part_of_the_microscope_explains_is_not_called_wrong_optics() ->
     assert "optics.calibrate" not in said
 
 
+@pytest.mark.large
 def test_an_aberration_is_learned_from_tracks() -> None:
     aberrated = replace(Instrument(emission="reciprocal"), aberrations_nm={11: 20.0})
     movie = _movie(aberrated)
@@ -110,7 +111,7 @@ def ringed() -> Wanderers:
     return _movie(replace(Instrument(emission="reciprocal"), aberrations_nm={11: -20.0}))
 
 
-@pytest.mark.large  # the harder one of two
+@pytest.mark.large
 def test_rings_that_are_left_over_do_not_hide_an_aberration(ringed: Wanderers) -> None:
     """Taken for particles, they would be more than can be linked."""
     rings = {"calibration.optics": {"na": 1.42, "aberrations_nm": {"z11": -20.0}}}
