@@ -241,13 +241,14 @@ class _Point:
         Its shape is what the pixels say.  What the scores of pictures with owners scatter more, or
         those of all pictures of an owner together, is a common factor: there are too few for more.
         """
-        each, whole = self.pixel_scatter()
-        pixels: FloatArray = each.sum(axis=0)
+        by_picture, whole = self.pixel_scatter()
+        pixels: FloatArray = by_picture.sum(axis=0)
         known = np.array(owners)
         if not (known >= 0).all():
             return pixels
         groupings = (np.arange(len(known)), known)
-        return pixels * max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
+        excess = max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
+        return np.asarray(pixels * excess)
 
     def pixel_scatter(self) -> tuple[FloatArray, FloatArray]:
         """Covariance of every picture's reduced score from its residuals, and the score.
@@ -258,12 +259,13 @@ class _Point:
         gains = np.einsum("eij,ejk->eik", self.fisher[:, :k, k:], self.each(0.0)[2])
         reduce = np.concatenate([np.broadcast_to(np.eye(k), (len(gains), k, k)), -gains], axis=2)
         scatter = np.einsum("eia,eab,ejb->eij", reduce, self.squares, reduce, optimize=True)
-        return np.asarray(scatter), np.asarray(np.einsum("eia,ea->ei", reduce, self.score))
+        score: FloatArray = np.einsum("eia,ea->ei", reduce, self.score)
+        return np.asarray(scatter), score
 
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
         information, score, inverse = self.each(damping)
-        return np.asarray(information.sum(axis=0)), np.asarray(score.sum(axis=0)), inverse
+        return information.sum(axis=0), score.sum(axis=0), inverse
 
     def each(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Give the same of every picture.

@@ -350,8 +350,8 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
     """
     order = sorted(sights, key=lambda sight: sight.shown)
     last, first = (order[k] for k in between)
-    low = max(round(2 * last.step - last.shown) - _ENDS, view.frames[0])
-    high = min(round(2 * first.shown - first.step) + _ENDS, view.frames[1])
+    low = max(round(last.frames[0]) - _ENDS, view.frames[0])
+    high = min(round(2 * first.frames[1] - first.step) + _ENDS, view.frames[1])
     reach = round(_CORE_NM / view.pixel_nm)
     places = [
         tuple(
