@@ -46,7 +46,7 @@ def microscope(config: Config, changes: dict[str, Any]) -> ForwardModel:
     return build_microscope(config, 2600.0, {**settings_of(config), **changes})
 
 
-def make_sights(
+def make_particle_images(
     changes: dict[str, Any],
     count: int,
     *,
@@ -60,7 +60,7 @@ def make_sights(
 
     Returns
     -------
-    sights, truth : list of Sight
+    images, truth : list of Image
         With a rough start, and with the true place and mass.
     build : callable
         Makes microscopes from settings.
@@ -68,7 +68,7 @@ def make_sights(
     config = configuration() if config is None else config
     model = microscope(config, changes)
     random = np.random.default_rng(seed)
-    sights, truth = [], []
+    images, truth = [], []
     for _ in range(count):
         x, y = random.uniform(-PIXEL_NM / 2, PIXEL_NM / 2, 2)
         mass = random.choice(masses_kda) * (-1 if random.random() < leaving else 1)
@@ -77,10 +77,10 @@ def make_sights(
         after = random.poisson(photons * (1 + signal)).astype(float)
         data = conditional(model, GRID, before, after, 1.0).data
         snr = float(np.sqrt(np.sum(signal**2) * photons / 2))
-        sight = ParticleImage(
+        image = ParticleImage(
             GRID, CONDITIONAL, data, float(x), float(y), 5.0, mass_kda=mass, snr=snr
         )
-        truth.append(sight)
+        truth.append(image)
         dx, dy = START_NM * random.standard_normal(2)
-        sights.append(replace(sight, x_nm=float(x + dx), y_nm=float(y + dy), mass_kda=0.0))
-    return sights, truth, lambda settings: build_microscope(config, 2600.0, settings)
+        images.append(replace(image, x_nm=float(x + dx), y_nm=float(y + dy), mass_kda=0.0))
+    return images, truth, lambda settings: build_microscope(config, 2600.0, settings)

@@ -20,6 +20,7 @@ from kernel_cache import share_kernels  # noqa: E402
 
 share_kernels(ROOT)
 os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("PYTHONFAULTHANDLER", "1")  # a crash of a command says where
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers and commands
 
 # A shell starts what runs in its background with Ctrl-C ignored, and so would be every command that

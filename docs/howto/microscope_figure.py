@@ -44,11 +44,11 @@ def before_and_after() -> tuple[Pictures, Pictures]:
         ia.simulate_movie(CONFIG, movie, settings=TRUE)
         found = ia.calibrate_optics(movie, config=CONFIG)
     config = ia.configure(CONFIG)
-    sights = found.measured.estimate.sights
-    build = microscopes(config, max(map(reach_nm, sights)))
+    images = found.measured.estimate.images
+    build = microscopes(config, max(map(reach_nm, images)))
     configured = settings_of(config)
-    fitted = maximise(with_masses(sights, build, configured), build, configured, ())
-    return make_pictures(fitted.sights, build, configured), found.pictures
+    fitted = maximise(with_masses(images, build, configured), build, configured, ())
+    return make_pictures(fitted.images, build, configured), found.pictures
 
 
 def draw(rows: Sequence[tuple[str, Pictures]]) -> Figure:

@@ -29,8 +29,8 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.parameters import (
     FAINTEST,
     FREE,
-    LEAST_SIGHTS,
-    MOST_SIGHTS,
+    LEAST_IMAGES,
+    MOST_IMAGES,
     Hidden,
     exists,
     find_hidden,
@@ -122,9 +122,9 @@ class OpticsForecast:
                 f"optics uses those above {FAINTEST:g}: take heavier particles, more frames, or "
                 "more light"
             )
-        if not LEAST_SIGHTS <= self.events <= MOST_SIGHTS:
+        if not LEAST_IMAGES <= self.events <= MOST_IMAGES:
             found.append(
-                f"iscat calibrate optics uses between {LEAST_SIGHTS} and {MOST_SIGHTS} pictures, "
+                f"iscat calibrate optics uses between {LEAST_IMAGES} and {MOST_IMAGES} pictures, "
                 f"not {self.events}"
             )
         return tuple(found)
@@ -313,7 +313,7 @@ def _needed(picture: _Picture, names: Sequence[str]) -> dict[str, float]:
     one = covariance * _MANY
     scale = np.array([prior_range(name) for name in kept])
     widest = float(np.linalg.eigvalsh(one / np.outer(scale, scale))[-1]) if kept else math.nan
-    identified = max(LEAST_SIGHTS, widest)
+    identified = max(LEAST_IMAGES, widest)
     moves = picture.moves("mass")[:, [names.index(name) for name in kept]]
     mass_row = FREE_PARAMETERS["mass"].index("mass_kda")
     variances = {

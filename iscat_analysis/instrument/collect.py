@@ -27,7 +27,7 @@ from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.parameters import FAINTEST, MOST_SIGHTS, heights_free, settings_of
+from iscat_analysis.optics.parameters import FAINTEST, MOST_IMAGES, heights_free, settings_of
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
     ALONE_NM,
@@ -103,11 +103,11 @@ def landing_particle_images(
     found: list[BrightStep] = []
     rest: list[BrightStep] = []
     parts = [part for chunk in plan_parts(reader, config, window, stride) for part in chunk]
-    most = enough = MOST_SIGHTS if rings else TESTED
+    most = enough = MOST_IMAGES if rings else TESTED
     if whole:
         chosen = np.linspace(0, len(parts) - 1, min(len(parts), _PARTS)).round().astype(int)
         parts = [parts[k] for k in chosen]
-        most = math.ceil(MOST_SIGHTS / len(parts))
+        most = math.ceil(MOST_IMAGES / len(parts))
     bright: list[BrightStep] = []
     sums: FieldSums | None = None
     for part in parts:
@@ -143,7 +143,7 @@ def landing_particle_images(
     unique = _standards(_without_repeats(bright))
     others = _without_repeats(rest)
     model = build_microscope(config, 1000.0, settings_of(config))
-    sights = [
+    images = [
         [
             replace(
                 _particle_image_of(step, config, model),
@@ -151,9 +151,9 @@ def landing_particle_images(
             )
             for step in steps
         ]
-        for steps in (unique[:MOST_SIGHTS], others)
+        for steps in (unique[:MOST_IMAGES], others)
     ]
-    return sights[0], sights[1]
+    return images[0], images[1]
 
 
 def _in_field(steps: Sequence[BrightStep], tile: Tile) -> list[BrightStep]:
@@ -221,7 +221,7 @@ def bright_places(
     used = ~windows.masked & (windows.before_e > 0) & (windows.after_e > 0)
     energy = energy_of(windows.after_e - ratio * windows.before_e, variance, used, _spot_px(config))
     pixel, cut_out = _pixel_nm(config), _cutter(windows, config)
-    sights, others = (
+    images, others = (
         [
             cut_out(row, column, side)
             for row, column in find_bright_places(
@@ -230,10 +230,10 @@ def bright_places(
         ]
         for apart_nm, side in ((alone_nm, _roi_px(config)), (0.0, round(OTHERS_NM / pixel)))
     )
-    sights, others = (
-        [_among(sight, others, SAME_NM) for sight in some] for some in (sights, others)
+    images, others = (
+        [_among(image, others, SAME_NM) for image in some] for some in (images, others)
     )
-    return _bright(sights), others
+    return _bright(images), others
 
 
 def known_places(
@@ -262,12 +262,12 @@ def known_places(
     apart = np.hypot(*(places_nm[:, None] - places_nm).transpose(2, 0, 1))
     np.fill_diagonal(apart, np.inf)
     nearest = apart.min(axis=1, initial=np.inf)[inside]
-    seen = [_among(sight, others, 0.0) for sight in cut(thetas[inside], _roi_px(config))]
+    seen = [_among(image, others, 0.0) for image in cut(thetas[inside], _roi_px(config))]
     for alone_nm in _KNOWN_APART_NM:
-        sights = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
-        if len(sights) >= least:
+        images = _bright(s for s, d in zip(seen, nearest, strict=True) if d >= alone_nm)
+        if len(images) >= least:
             break
-    return sights, [_among(other, others, 0.0) for other in others]
+    return images, [_among(other, others, 0.0) for other in others]
 
 
 def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], ParticleImage]:
@@ -294,11 +294,11 @@ def _cutter(windows: Windows, config: Config) -> Callable[[int, int, int], Parti
     return cut_out
 
 
-def _among(sight: ParticleImage, others: Sequence[ParticleImage], least_nm: float) -> ParticleImage:
-    """Tell a sight which of the others are near, but not so near that they are the same."""
-    apart = [math.hypot(sight.x_nm - o.x_nm, sight.y_nm - o.y_nm) for o in others]
+def _among(image: ParticleImage, others: Sequence[ParticleImage], least_nm: float) -> ParticleImage:
+    """Tell an image which of the others are near, but not so near that they are the same."""
+    apart = [math.hypot(image.x_nm - o.x_nm, image.y_nm - o.y_nm) for o in others]
     near = [(k, 1.0) for k, d in enumerate(apart) if least_nm < d < RINGS_NM]
-    return replace(sight, neighbours=tuple(near))
+    return replace(image, neighbours=tuple(near))
 
 
 def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[ParticleImage]:
@@ -332,10 +332,10 @@ def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[P
     )
     model = build_microscope(config, 1000.0, settings_of(config))
     saturated = np.any(camera.saturated(counts), axis=0)
-    sights: list[ParticleImage] = []
-    per_place = max(1, MOST_SIGHTS // max(len(places), 1))
+    images: list[ParticleImage] = []
+    per_place = max(1, MOST_IMAGES // max(len(places), 1))
     taken = np.unique(np.linspace(0, len(frames) - 1, min(per_place, len(frames))).round())
-    for row, column in places[:MOST_SIGHTS]:
+    for row, column in places[:MOST_IMAGES]:
         region = _region(row, column, _roi_px(config))
         grid = PixelGrid.region(*region, _pixel_nm(config))
         cut = slice(*region[0]), slice(*region[1])
@@ -355,17 +355,17 @@ def scan_particle_images(movie: Stack, config: Config, camera: Camera) -> list[P
                     model, grid, frame, level, level, extra_variance_e2=read[cut], masked=masked
                 )
             seen.append(replace(_centred(likelihood, config), focus_steps=float(index)))
-        weights = [sight.snr**2 for sight in seen]
+        weights = [image.snr**2 for image in seen]
         x_nm, y_nm = (
-            float(np.average([getattr(sight, key) for sight in seen], weights=weights))
+            float(np.average([getattr(image, key) for image in seen], weights=weights))
             for key in ("x_nm", "y_nm")
         )
-        sights += [replace(sight, x_nm=x_nm, y_nm=y_nm) for sight in seen]
-    return _bright(sights)
+        images += [replace(image, x_nm=x_nm, y_nm=y_nm) for image in seen]
+    return _bright(images)
 
 
 def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
-    """Make a sight of a picture, from the centre of its energy."""
+    """Make an image of a picture, from the centre of its energy."""
     grid = likelihood.grid
     information = likelihood.signal_information()
     contrast = np.nan_to_num(likelihood.measured_signal())
@@ -380,13 +380,13 @@ def _centred(likelihood: Likelihood, config: Config) -> ParticleImage:
     )  # fmt: skip
 
 
-def _bright(sights: Iterable[ParticleImage]) -> list[ParticleImage]:
+def _bright(images: Iterable[ParticleImage]) -> list[ParticleImage]:
     """Keep the pictures that are bright enough, the brightest first."""
-    return sorted((s for s in sights if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_SIGHTS]
+    return sorted((s for s in images if s.snr > FAINTEST), key=lambda s: -s.snr)[:MOST_IMAGES]
 
 
 def _particle_image_of(step: BrightStep, config: Config, model: ForwardModel) -> ParticleImage:
-    """Make a sight of a step."""
+    """Make an image of a step."""
     grid = PixelGrid.region(step.rows, step.columns, _pixel_nm(config))
     likelihood = conditional(
         model, grid, step.before_e, step.after_e, step.power_ratio * step.motion,

@@ -44,7 +44,7 @@ from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.sources import seen_in_field
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
-from iscat_analysis.optics.parameters import FREE, LEAST_SIGHTS, heights_free, settings_of
+from iscat_analysis.optics.parameters import FREE, LEAST_IMAGES, heights_free, settings_of
 from iscat_analysis.threads import threads
 
 NEXT_TO_NONE = 0.3
@@ -175,7 +175,7 @@ def _found(
         if learned is None or _phase(learned) != _phase(config):
             raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
         return found
-    if len(seen.images) >= LEAST_SIGHTS:
+    if len(seen.images) >= LEAST_IMAGES:
         if heights_free(config):
             near = replace(seen, near=found.measured.settings)
             every = fit_optics(near, tuple(FREE), origin, pool.map)

@@ -21,7 +21,7 @@ from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_STEP,
     FREE,
-    LEAST_SIGHTS,
+    LEAST_IMAGES,
     Settings,
     free_names,
     optics_limits,
@@ -60,7 +60,7 @@ class Collected:
     found_with: Config | None = None
     """Optics with which they were found; None where no optics took part in that."""
 
-    least: int = LEAST_SIGHTS
+    least: int = LEAST_IMAGES
     focus_step_nm: float | None = None
     """Of a scan of the focus."""
 
@@ -103,7 +103,7 @@ def _fitted(
     if len(images) < seen.least:
         raise DataError(
             f"{origin['movie']}: shows {count(len(images), 'bright particle')} standing alone, and "
-            f"at least {LEAST_SIGHTS} are needed to learn the optics; record more particles, or "
+            f"at least {LEAST_IMAGES} are needed to learn the optics; record more particles, or "
             "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
         )
     configured = settings_of(config)
@@ -131,7 +131,7 @@ def _fitted(
     if seen.refusal:
         measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
     estimate = measured.estimate
-    pictures = make_pictures(estimate.sights, build, estimate.values)
+    pictures = make_pictures(estimate.images, build, estimate.values)
     return make_result(config, configured, measured, pictures, origin)
 
 
@@ -178,10 +178,10 @@ def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun
         ) -> list[tuple[float, ParticleImage]]:
             return _best_heights(few, shifts, model, settings, mapper)
 
-        near = [sight for _, sight in best(around, anywhere)] if around else []
+        near = [image for _, image in best(around, anywhere)] if around else []
         for _ in range(_TURNS if near else 0):  # each among all, whose rings other heights change
             among = Neighbours(tuple(near), wide).around(near, mapper)
-            near = [sight for _, sight in best(among, [-fringe, 0.0, fringe])]
+            near = [image for _, image in best(among, [-fringe, 0.0, fringe])]
         found = best(Neighbours(tuple(near), wide).around(some, mapper), anywhere)
         misfit = float(np.median([chi2 for chi2, _ in found]))
         return _Begun(settings, [image for _, image in found], near, misfit)
@@ -192,7 +192,7 @@ def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun
             one.images, build, one.settings, names, limits=limits, passes=_OPTICS_PASSES,
             mapper=mapper,
         )  # fmt: skip
-        return placed(fit.values, fit.sights, one.others)
+        return placed(fit.values, fit.images, one.others)
 
     tried = [
         placed(
@@ -215,13 +215,13 @@ def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun
 
 
 def _best_heights(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     shifts_nm: Sequence[float],
     model: ForwardModel,
     settings: Settings,
     mapper: Mapper,
 ) -> list[tuple[float, ParticleImage]]:
-    """Fit every sight from several heights; give the reduced χ² of the best fit, and that.
+    """Fit every image from several heights; give the reduced χ² of the best fit, and that.
 
     Half a fringe away a particle of the other sign looks much the same, but none leaves here: a fit
     with the sign that the mass had is preferred.
@@ -230,12 +230,12 @@ def _best_heights(
     def build(_: Settings) -> ForwardModel:
         return model
 
-    found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in sights]
+    found: list[list[tuple[bool, float, ParticleImage]]] = [[] for _ in images]
     for shift in shifts_nm:
-        moved = [sight.raised(shift) for sight in sights]
+        moved = [image.raised(shift) for image in images]
         begun = with_masses(moved, build, settings)
-        fits = maximise(begun, build, settings, (), passes=_HEIGHT_PASSES, mapper=mapper).sights
-        for sight, fit, of_it in zip(sights, fits, found, strict=True):
-            turned = sight.mass_kda * fit.mass_kda < 0
+        fits = maximise(begun, build, settings, (), passes=_HEIGHT_PASSES, mapper=mapper).images
+        for image, fit, of_it in zip(images, fits, found, strict=True):
+            turned = image.mass_kda * fit.mass_kda < 0
             of_it.append((turned, goodness(fit, model)[0], fit))
     return [min(fits, key=lambda fit: fit[:2])[1:] for fits in found]

@@ -1,9 +1,9 @@
 """One microscope, many particles: the maximum of their joint likelihood.
 
-Every sight of a particle has unknowns of its own (place, mass, background level) and shares those
+Every image of a particle has unknowns of its own (place, mass, background level) and shares those
 of the microscope with all others.  The information matrix is an arrow; its private blocks are
-eliminated sight by sight (their Schur complement), so that the cost grows linearly with the
-sights.  Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
+eliminated image by image (their Schur complement), so that the cost grows linearly with the
+images.  Fisher scoring with Levenberg's damping; a step is taken only if the likelihood rises.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from iscat_analysis.records import FloatArray, Mapper
 _PLACE_STEP_NM = 60.0
 _HEIGHT_STEP_NM = 20.0  # a fringe is some 200 nm high
 _LEVEL_STEP = 0.5
-_Z = 2  # of what is a sight's own
+_Z = 2  # of what is an image's own
 _DAMPING = (1e-3, 1e8)  # first, and where the search gives up
 _FLAT = 1e-10  # share of the largest eigenvalue below which a direction is not determined
-_TOGETHER = 5  # sights of one task; a millisecond each
+_TOGETHER = 5  # images of one task; a millisecond each
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Estimate:
 
     names: tuple[str, ...]
     values: Settings
-    sights: tuple[ParticleImage, ...]
+    images: tuple[ParticleImage, ...]
     information: FloatArray
     scatter: FloatArray
     log_likelihood: float
@@ -75,7 +75,7 @@ class Estimate:
 
 
 def maximise(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     build: Build,
     start: Settings,
     names: Sequence[str],
@@ -88,9 +88,9 @@ def maximise(
     """Maximise the joint likelihood over the microscope and all particles."""
     names = tuple(names)
     values = dict(start)
-    walls = _walls(sights)
-    private = np.clip([sight.private for sight in sights], *walls)
-    at = _Point.evaluate(sights, build, values, names, private, walls, mapper)
+    walls = _walls(images)
+    private = np.clip([image.private for image in images], *walls)
+    at = _Point.evaluate(images, build, values, names, private, walls, mapper)
     damping, used, converged = _DAMPING[0], 1, False
     while used < passes and damping < _DAMPING[1]:
         if at.gain(names) < tolerance:
@@ -99,7 +99,7 @@ def maximise(
         shared, own = at.step(names, damping)
         trial_values = _limited(values, names, shared, limits or {})
         moved = np.clip(private + own, *walls)
-        trial = _Point.evaluate(sights, build, trial_values, names, moved, walls, mapper)
+        trial = _Point.evaluate(images, build, trial_values, names, moved, walls, mapper)
         used += 1
         if trial.value > at.value:
             values, private, at = trial_values, moved, trial
@@ -109,9 +109,9 @@ def maximise(
     return Estimate(
         names=names,
         values=values,
-        sights=tuple(s.moved(p) for s, p in zip(sights, private, strict=True)),
+        images=tuple(s.moved(p) for s, p in zip(images, private, strict=True)),
         information=at.reduced(0.0)[0],
-        scatter=at.scatter([sight.owner for sight in sights]),
+        scatter=at.scatter([image.owner for image in images]),
         log_likelihood=at.value,
         converged=converged,
         passes=used,
@@ -147,26 +147,26 @@ class Asked:
 
 
 def asked_changes(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     build: Build,
     settings: Settings,
     names: Sequence[str],
     mapper: Mapper = map,
 ) -> Asked:
     """Look how pictures ask to change the optics."""
-    private, walls = np.array([sight.private for sight in sights]), _walls(sights)
-    at = _Point.evaluate(sights, build, settings, tuple(names), private, walls, mapper)
+    private, walls = np.array([image.private for image in images]), _walls(images)
+    at = _Point.evaluate(images, build, settings, tuple(names), private, walls, mapper)
     information, score, _ = at.each(0.0)
     return Asked(tuple(names), information, score, at.pixel_scatter()[0])
 
 
-def _walls(sights: Sequence[ParticleImage]) -> FloatArray:
-    """Bounds of what is a sight's own, shape (2, n, 5): a particle stays in its picture."""
-    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in sights])
-    walls = np.full((2, len(sights), PRIVATE), np.inf)
+def _walls(images: Sequence[ParticleImage]) -> FloatArray:
+    """Bounds of what is an image's own, shape (2, n, 5): a particle stays in its picture."""
+    centres = np.array([(s.grid.x_nm.mean(), s.grid.y_nm.mean()) for s in images])
+    walls = np.full((2, len(images), PRIVATE), np.inf)
     walls[0] = -np.inf
     walls[0, :, :2], walls[1, :, :2] = centres - ROAM_NM, centres + ROAM_NM
-    walls[:, :, _Z] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in sights])
+    walls[:, :, _Z] = np.transpose([s.heights_nm or (s.z_nm, s.z_nm) for s in images])
     return walls
 
 
@@ -188,7 +188,7 @@ def _limited(
 
 @dataclass(frozen=True)
 class _Point:
-    """Likelihood, score and information of all sights at one set of parameters."""
+    """Likelihood, score and information of all images at one set of parameters."""
 
     value: float
     score: FloatArray  # (n, k + 5)
@@ -198,7 +198,7 @@ class _Point:
     @classmethod
     def evaluate(
         cls,
-        sights: Sequence[ParticleImage],
+        images: Sequence[ParticleImage],
         build: Build,
         values: Settings,
         names: tuple[str, ...],
@@ -206,19 +206,19 @@ class _Point:
         walls: FloatArray,
         mapper: Mapper,
     ) -> _Point:
-        """Evaluate all sights; an unknown that its wall stops counts as known."""
-        models = models_of(sights, build, values)
+        """Evaluate all images; an unknown that its wall stops counts as known."""
+        models = models_of(images, build, values)
 
         def some(first: int) -> list[tuple[float, FloatArray, FloatArray, FloatArray]]:
             these = slice(first, first + _TOGETHER)
             return [
-                _scores(sight, model, names, own)
-                for sight, model, own in zip(
-                    sights[these], models[these], private[these], strict=True
+                _scores(image, model, names, own)
+                for image, model, own in zip(
+                    images[these], models[these], private[these], strict=True
                 )
             ]
 
-        parts = mapper(some, range(0, len(sights), _TOGETHER))
+        parts = mapper(some, range(0, len(images), _TOGETHER))
         found = [each for part in parts for each in part]
         value = math.fsum(each[0] for each in found)
         score, fisher, squares = (np.array([each[part] for each in found]) for part in (1, 2, 3))
@@ -339,13 +339,13 @@ def _solve(
 
 
 def _scores(
-    sight: ParticleImage, model: Microscope, names: tuple[str, ...], private: FloatArray
+    image: ParticleImage, model: Microscope, names: tuple[str, ...], private: FloatArray
 ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
     """Log-likelihood, score, expected information and its observed squares, shared ones first."""
     x, y, z, mass, level = (float(v) for v in private)
-    place = (sight.grid, x, y, z, mass)
+    place = (image.grid, x, y, z, mass)
     k = len(names)
-    wanted = tuple(dict.fromkeys(base for name in names for base in sight.slopes(name)))
+    wanted = tuple(dict.fromkeys(base for name in names for base in image.slopes(name)))
     if names:
         signal, own, slopes = model.joint_gradient(*place, wanted)
     else:
@@ -354,15 +354,15 @@ def _scores(
     for row, name in zip(rows, names, strict=False):
         row[:] = sum(
             weight * slopes[wanted.index(base)].ravel()
-            for base, weight in sight.slopes(name).items()
+            for base, weight in image.slopes(name).items()
         )
     rows[k : k + LEVEL] = own.reshape(LEVEL, -1)
-    value, residual, weight, of_signal, of_level = sight.noise.terms(sight.data, signal, level)
+    value, residual, weight, of_signal, of_level = image.noise.terms(image.data, signal, level)
     rows[:-1] *= of_signal.ravel()
     rows[-1] = of_level.ravel()
     weighted = rows * weight.ravel()
     scored = rows * residual.ravel()
-    return value + sight.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
+    return value + image.baseline, scored.sum(axis=1), weighted @ rows.T, scored @ scored.T
 
 
 _NEIGHBOUR_PASSES = 6
@@ -386,36 +386,36 @@ class Neighbours:
     ) -> Neighbours:
         """Fit them, and once more among each other's rings."""
 
-        def own(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, ...]:
+        def own(images: Sequence[ParticleImage]) -> tuple[ParticleImage, ...]:
             return maximise(
-                sights, build, settings, (), passes=_NEIGHBOUR_PASSES, mapper=mapper
-            ).sights
+                images, build, settings, (), passes=_NEIGHBOUR_PASSES, mapper=mapper
+            ).images
 
         first = cls(own(with_masses(others, build, settings)), build_wide(settings))
         return cls(own(first.around(first.particles, mapper)), first.wide)
 
     def around(
-        self, sights: Sequence[ParticleImage], mapper: Mapper = map
+        self, images: Sequence[ParticleImage], mapper: Mapper = map
     ) -> tuple[ParticleImage, ...]:
         """Put their rings into what is expected of pictures.
 
         Every particle is drawn into all pictures at once: its field at its height takes longest.
         """
         reached: list[list[tuple[int, float]]] = [[] for _ in self.particles]
-        for index, sight in enumerate(sights):
-            for number, share in sight.neighbours:
+        for index, image in enumerate(images):
+            for number, share in image.neighbours:
                 reached[number].append((index, share))
 
         def drawn(number: int) -> list[tuple[int, FloatArray]]:
             other = self.particles[number]
             place = (other.x_nm, other.y_nm, other.z_nm, other.mass_kda)
             return [
-                (index, share * self.wide.image(sights[index].grid, *place))
+                (index, share * self.wide.image(images[index].grid, *place))
                 for index, share in reached[number]
             ]
 
-        rings = [np.zeros(sight.grid.shape) for sight in sights]
-        for images in mapper(drawn, range(len(self.particles))):
-            for index, image in images:
-                rings[index] += image
-        return tuple(sight.among(ring) for sight, ring in zip(sights, rings, strict=True))
+        rings = [np.zeros(image.grid.shape) for image in images]
+        for drawings in mapper(drawn, range(len(self.particles))):
+            for index, drawing in drawings:
+                rings[index] += drawing
+        return tuple(image.among(ring) for image, ring in zip(images, rings, strict=True))

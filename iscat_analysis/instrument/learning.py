@@ -46,7 +46,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.parameters import (
     FREE,
-    LEAST_SIGHTS,
+    LEAST_IMAGES,
     free_groups,
     heights_free,
     settings_of,
@@ -208,7 +208,7 @@ def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
     """Say that too few particles stand alone."""
     said = (
         f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
-        f"needed to test the optics, {LEAST_SIGHTS} to learn them"
+        f"needed to test the optics, {LEAST_IMAGES} to learn them"
     )
     if by_noise:
         said += "; they stand out by the noise, which is not what the camera's numbers predict"
@@ -313,7 +313,7 @@ def learned_from(
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     scan, way = seen.focus_step_nm is not None, background_mode(config)
     crowded = way == "fixed" and not scan
-    if not crowded or len(seen.images) >= LEAST_SIGHTS:
+    if not crowded or len(seen.images) >= LEAST_IMAGES:
         asked = not scan and not heights_free(config) and set(groups) == set(FREE)
         view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
         found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome

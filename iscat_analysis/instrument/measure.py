@@ -103,7 +103,7 @@ class Measured:
 
 
 def judge(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     build: Callable[[Settings], ForwardModel],
     settings: Settings,
     mapper: Mapper = map,
@@ -111,22 +111,22 @@ def judge(
     """Judge fitted pictures one by one and all together."""
     from scipy.stats import kstest  # a second to load, for those who learn optics
 
-    def one(sight: ParticleImage) -> tuple[float, float]:
-        return goodness(sight, build(sight.seen_with(settings)))
+    def one(image: ParticleImage) -> tuple[float, float]:
+        return goodness(image, build(image.seen_with(settings)))
 
-    found = np.array(list(mapper(one, sights)))
+    found = np.array(list(mapper(one, images)))
     p_values = found[:, 1]
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
 
 
-def _fitted(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _fitted(images: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are fitted."""
-    return [sight for i, sight in enumerate(sights) if i % HELD_OUT != 1]
+    return [image for i, image in enumerate(images) if i % HELD_OUT != 1]
 
 
-def _held_out(sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _held_out(images: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are not."""
-    return list(sights[1::HELD_OUT])
+    return list(images[1::HELD_OUT])
 
 
 @dataclass
@@ -154,30 +154,30 @@ class OpticsSearch:
     mapper: Mapper = map
 
     @one_thread_algebra()
-    def run(self, sights: Sequence[ParticleImage]) -> Measured:
+    def run(self, images: Sequence[ParticleImage]) -> Measured:
         """Measure the microscope, the brightest pictures first."""
-        sights = sorted(sights, key=lambda sight: -sight.snr)
+        images = sorted(images, key=lambda image: -image.snr)
         if self.known is None:
-            best, held_out = self._best_state(*average_particle_images(sights))
+            best, held_out = self._best_state(*average_particle_images(images))
         else:
-            best, held_out = self._of_known_kind(sights, self.known)
+            best, held_out = self._of_known_kind(images, self.known)
         best, held_out = self._cleared(best, held_out)
         best, held = self._identified(best)
-        before = len(best.sights) + len(held_out)
+        before = len(best.images) + len(held_out)
         best, held_out = self._uncontaminated(best, held_out)
-        contaminated = before - len(best.sights) - len(held_out)
+        contaminated = before - len(best.images) - len(held_out)
         best, dropped = self._worthwhile(best, held_out)
         best, undecided = self._analyzer(best)
         best, twin = self._twin(best)
         best, held_out = self._cleared(best, held_out)
         best, held_out = self._signed(best, held_out)
         judged = self._fit(held_out, best.values, ())
-        held_out = judged.sights
+        held_out = judged.images
         judgement = judge(held_out, self.build, best.values, self.mapper)
         nominal = self._fit(with_masses(held_out, self.build, self.configured), self.configured, ())
-        configured = judge(nominal.sights, self.build, self.configured, self.mapper)
+        configured = judge(nominal.images, self.build, self.configured, self.mapper)
         worse = nominal.log_likelihood - judged.log_likelihood > WORSE_GAP
-        final = self._fit((*best.sights, *held_out), best.values, best.names)
+        final = self._fit((*best.images, *held_out), best.values, best.names)
         refusals = self._refusals(final, judgement, twin, worse=worse)
         return Measured(
             settings=final.values, estimate=final, held=held, dropped=dropped,
@@ -187,13 +187,13 @@ class OpticsSearch:
 
     def _fit(
         self,
-        sights: Sequence[ParticleImage],
+        images: Sequence[ParticleImage],
         start: Settings,
         names: Sequence[str],
         passes: int = 40,
     ) -> Estimate:
         return maximise(
-            sights, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
+            images, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
         )
 
     def _cleared(
@@ -204,16 +204,16 @@ class OpticsSearch:
             return best, tuple(held_out)
         near = Neighbours.fitted(self.others, self.build, self.build_wide, best.values, self.mapper)
         self.others = near.particles  # where they are is known the next time
-        among = near.around((*best.sights, *held_out), self.mapper)
-        fitted, judged = among[: len(best.sights)], among[len(best.sights) :]
+        among = near.around((*best.images, *held_out), self.mapper)
+        fitted, judged = among[: len(best.images)], among[len(best.images) :]
         judged = self._own(judged, best.values) if judged else ()
         return self._fit(fitted, best.values, best.names), judged
 
     def _own(
-        self, sights: Sequence[ParticleImage], settings: Settings
+        self, images: Sequence[ParticleImage], settings: Settings
     ) -> tuple[ParticleImage, ...]:
-        """Fit what is a sight's own."""
-        return self._fit(sights, settings, ()).sights
+        """Fit what is an image's own."""
+        return self._fit(images, settings, ()).images
 
     def _best_state(
         self, averages: Sequence[ParticleImage], placed: Sequence[ParticleImage]
@@ -234,34 +234,34 @@ class OpticsSearch:
             far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
             if far or any(same_state(rough, other) for other in tried):
                 continue
-            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.sights]) for k in _PLACE)
-            sights = with_masses(
+            x_nm, y_nm = (np.median([getattr(a, k) for a in rough.images]) for k in _PLACE)
+            images = with_masses(
                 [s.placed(s.x_nm + float(x_nm), s.y_nm + float(y_nm)) for s in placed],
                 self.build,
                 rough.values,
             )
             names = free_names(self.free, rough.values, FREE["zernike"])
             tried.append(rough)
-            fit = self._fit(_fitted(sights), rough.values, names, _TRIAL_PASSES)
-            judged = self._fit(_held_out(sights), fit.values, ())
+            fit = self._fit(_fitted(images), rough.values, names, _TRIAL_PASSES)
+            judged = self._fit(_held_out(images), fit.values, ())
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
             earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
-            joint.append((earned, fit, judged.sights))
+            joint.append((earned, fit, judged.images))
         _, best, held_out = max(joint, key=lambda each: each[0])
         if not best.converged:
-            best = self._fit(best.sights, best.values, best.names)
+            best = self._fit(best.images, best.values, best.names)
         return best, held_out
 
     def _of_known_kind(
-        self, sights: Sequence[ParticleImage], known: Settings
+        self, images: Sequence[ParticleImage], known: Settings
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Go on from a microscope that is near."""
         names = free_names(self.free, known, FREE["zernike"])
-        fitted = _fitted(sights)
+        fitted = _fitted(images)
         best = self._fit(fitted, known, names)
         # focus and phase move all heights, those of pictures that were not fitted to other fringes
-        rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.sights, fitted, strict=True)])
-        held_out = [s.raised(float(rise)) for s in _held_out(sights)]
+        rise = np.median([s.z_nm - was.z_nm for s, was in zip(best.images, fitted, strict=True)])
+        held_out = [s.raised(float(rise)) for s in _held_out(images)]
         return best, self._own(held_out, best.values)
 
     def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
@@ -272,7 +272,7 @@ class OpticsSearch:
             held[name] = worst.why
             kept = tuple(n for n in best.names if n != name)
             settings = {**best.values, name: self.configured[name]}
-            best = self._fit(best.sights, settings, kept)
+            best = self._fit(best.images, settings, kept)
         return best, held
 
     def _uncontaminated(
@@ -280,13 +280,13 @@ class OpticsSearch:
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Leave out the few pictures in which something else happened, if the others are fine."""
         good = [
-            judge(sights, self.build, best.values, self.mapper).p_values > CONTAMINATED_P
-            for sights in (best.sights, held_out)
+            judge(images, self.build, best.values, self.mapper).p_values > CONTAMINATED_P
+            for images in (best.images, held_out)
         ]
         bad = sum(int(np.sum(~g)) for g in good)
-        if not bad or bad > _CONTAMINATED_SHARE * (len(best.sights) + len(held_out)):
+        if not bad or bad > _CONTAMINATED_SHARE * (len(best.images) + len(held_out)):
             return best, tuple(held_out)
-        kept = [s for s, ok in zip(best.sights, good[0], strict=True) if ok]
+        kept = [s for s, ok in zip(best.images, good[0], strict=True) if ok]
         rest = tuple(s for s, ok in zip(held_out, good[1], strict=True) if ok)
         return self._fit(kept, best.values, best.names), rest
 
@@ -304,7 +304,7 @@ class OpticsSearch:
         for rung in reversed(rungs):  # the most first; fewer than too few are not tried
             names = tuple(n for n in best.names if not is_term(n) or n in rung)
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
-            fit = best if rung == terms else self._fit(best.sights, start, names, _RUNG_PASSES)
+            fit = best if rung == terms else self._fit(best.images, start, names, _RUNG_PASSES)
             tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
             if tried[-1][0] < tried[0][0] - _TOO_FEW:
                 break
@@ -316,7 +316,7 @@ class OpticsSearch:
         if "polarization" not in self.free:
             return best, ()
         was = bool(best.values["analyzer"])
-        other = self._fit(best.sights, {**best.values, "analyzer": not was}, best.names, passes=8)
+        other = self._fit(best.images, {**best.values, "analyzer": not was}, best.names, passes=8)
         gap = best.log_likelihood - other.log_likelihood
         if abs(gap) < TWIN_GAP:
             return best, ("analyzer",)
@@ -326,17 +326,17 @@ class OpticsSearch:
         """Look for the microscope on the other side of focus that makes the same pictures."""
         if not {"focus_nm", "reference_phase_deg"} <= set(best.names):
             return best, None
-        z = best.sights[0].z_nm
+        z = best.images[0].z_nm
         mirrored = {
             **best.values,
             **{n: PARAMETERS[n].mirrored * best.values[n] for n in best.names},
         }
         mirrored["focus_nm"] = 2 * z - best.values["focus_nm"]
-        turned = [replace(s, mass_kda=-s.mass_kda) for s in best.sights]
+        turned = [replace(s, mass_kda=-s.mass_kda) for s in best.images]
         other = self._fit(turned, mirrored, best.names, _TWIN_PASSES)
         if best.log_likelihood - other.log_likelihood > _CLOSE * best.log_likelihood:
             return best, None
-        other = self._fit(other.sights, other.values, best.names, _TRIAL_PASSES)
+        other = self._fit(other.images, other.values, best.names, _TRIAL_PASSES)
         other, _ = self._cleared(other, ())  # each among the rings that it makes itself
         gap = best.log_likelihood - other.log_likelihood
         apart = abs(other.values["focus_nm"] - best.values["focus_nm"])
@@ -353,7 +353,7 @@ class OpticsSearch:
         """Choose between a phase and its opposite, which a particle that leaves has."""
         if "reference_phase_deg" not in best.names:
             return best, tuple(held_out)
-        masses = np.array([s.mass_kda for s in best.sights])
+        masses = np.array([s.mass_kda for s in best.images])
         phase = best.values["reference_phase_deg"]
         if abs(np.sign(masses).sum()) > 3 * math.sqrt(masses.size):  # nearly all of them land
             flip = np.sign(masses).sum() < 0
@@ -362,11 +362,11 @@ class OpticsSearch:
         phase = (phase + 180 * flip + 180) % 360 - 180
         # those that were not fitted too: with its height free a strong one does not turn by itself
         turned, judged = (
-            tuple(replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in sights)
-            for sights in (best.sights, held_out)
+            tuple(replace(s, mass_kda=-s.mass_kda if flip else s.mass_kda) for s in images)
+            for images in (best.images, held_out)
         )
         values = {**best.values, "reference_phase_deg": phase}
-        return replace(best, values=values, sights=turned), judged
+        return replace(best, values=values, images=turned), judged
 
     def _refusals(
         self, final: Estimate, judgement: Judgement, twin: Twin | None, *, worse: bool

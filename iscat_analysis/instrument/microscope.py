@@ -42,9 +42,9 @@ TESTED = 24
 """Particles on which optics are tested, the brightest."""
 
 
-def reach_nm(sight: ParticleImage) -> float:
+def reach_nm(image: ParticleImage) -> float:
     """Distance from a particle, which may move in its picture, to the farthest pixel."""
-    return sight.grid.diagonal_nm / 2 + _SHIFT_NM
+    return image.grid.diagonal_nm / 2 + _SHIFT_NM
 
 
 _MODELS_KEPT = 64  # as many as there are pictures with optics of their own
@@ -80,15 +80,15 @@ def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], Forward
     return lambda settings: at_hand(tuple(settings.items()))
 
 
-def rings_of(config: Config, sight: ParticleImage) -> Callable[[Settings], ForwardModel]:
+def rings_of(config: Config, image: ParticleImage) -> Callable[[Settings], ForwardModel]:
     """Make models as far as rings of neighbours matter."""
-    return microscopes(config, RINGS_NM + sight.grid.diagonal_nm)
+    return microscopes(config, RINGS_NM + image.grid.diagonal_nm)
 
 
-def goodness(sight: ParticleImage, model: ForwardModel) -> tuple[float, float]:
+def goodness(image: ParticleImage, model: ForwardModel) -> tuple[float, float]:
     """Reduced χ² and p-value of a fitted picture."""
-    likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
-    return goodness_of_fit(likelihood, sight.private, sight.free)
+    likelihood = Likelihood(model, image.grid, image.noise, image.data)
+    return goodness_of_fit(likelihood, image.private, image.free)
 
 
 def with_sign(config: Config) -> tuple[Config | None, str]:
@@ -123,7 +123,7 @@ _DESCRIBED_SHARE = 0.25  # of the pictures, that must be described where others 
 
 
 def median_p(
-    sights: list[ParticleImage],
+    images: list[ParticleImage],
     config: Config,
     others: Sequence[ParticleImage] = (),
     mapper: Mapper = map,
@@ -133,29 +133,29 @@ def median_p(
     The rings of neighbours, where any are known, are put into the pictures that fail without.
     """
     settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
+    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
-    shown: Sequence[ParticleImage] = sights[:TESTED]
+    shown: Sequence[ParticleImage] = images[:TESTED]
     x, y = 0.0, 0.0
     if not heights_free(config):
         averages, shown = average_particle_images(shown)
         x, y = _centre(averages[0], model, build, settings)
 
     def median(pictures: Sequence[ParticleImage]) -> tuple[float, Sequence[ParticleImage]]:
-        fitted = maximise(pictures, build, settings, (), mapper=mapper).sights
-        return float(np.median([goodness(sight, model)[1] for sight in fitted])), fitted
+        fitted = maximise(pictures, build, settings, (), mapper=mapper).images
+        return float(np.median([goodness(image, model)[1] for image in fitted])), fitted
 
-    moved = [sight.placed(sight.x_nm + x, sight.y_nm + y) for sight in shown]
+    moved = [image.placed(image.x_nm + x, image.y_nm + y) for image in shown]
     found, fitted = median(with_masses(moved, build, settings))
-    if found >= REJECTED_P or not any(sight.neighbours for sight in fitted):
+    if found >= REJECTED_P or not any(image.neighbours for image in fitted):
         return found, fitted
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
-    near = Neighbours.fitted(elsewhere, build, rings_of(config, sights[0]), settings, mapper)
+    near = Neighbours.fitted(elsewhere, build, rings_of(config, images[0]), settings, mapper)
     return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
 
 
 def not_alone(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     config: Config,
     others: Sequence[ParticleImage] = (),
     mapper: Mapper = map,
@@ -167,21 +167,21 @@ def not_alone(
     From a place that others drew aside a fit ends in another optimum: each begins anew here.
     """
     settings = settings_of(config)
-    build = microscopes(config, max(map(reach_nm, sights)) + math.sqrt(2) * _STARTS_NM[-1])
+    build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
     model = build(settings)
 
-    def fitted(sight: ParticleImage) -> ParticleImage:
-        x, y = _centre(sight, model, build, settings)
-        (placed,) = with_masses([sight.placed(x, y)], build, settings)
-        return maximise([placed], build, settings, ()).sights[0]
+    def fitted(image: ParticleImage) -> ParticleImage:
+        x, y = _centre(image, model, build, settings)
+        (placed,) = with_masses([image.placed(x, y)], build, settings)
+        return maximise([placed], build, settings, ()).images[0]
 
-    some = list(mapper(fitted, sights[:TESTED]))
-    if any(sight.neighbours for sight in some):
+    some = list(mapper(fitted, images[:TESTED]))
+    if any(image.neighbours for image in some):
         near = Neighbours.fitted(others, build, rings_of(config, some[0]), settings, mapper)
         pictures = near.around(some, mapper)
-        some = list(maximise(pictures, build, settings, (), mapper=mapper).sights)
-    chi2, p = np.transpose([goodness(sight, model) for sight in some])
-    mass = np.array([sight.mass_kda for sight in some])
+        some = list(maximise(pictures, build, settings, (), mapper=mapper).images)
+    chi2, p = np.transpose([goodness(image, model) for image in some])
+    mass = np.array([image.mass_kda for image in some])
     poor = p < REJECTED_P
     if not poor.any() or poor.all():
         return [], float(np.median(p))
@@ -194,7 +194,7 @@ def not_alone(
 
 
 def _centre(
-    sight: ParticleImage,
+    image: ParticleImage,
     model: ForwardModel,
     build: Callable[[Settings], ForwardModel],
     settings: Settings,
@@ -203,13 +203,13 @@ def _centre(
 
     From a place half a ring away a fit ends in another optimum, with the mass of the other sign.
     """
-    sight = sight.placed(sight.x_nm, sight.y_nm)
-    starts = [sight.placed(sight.x_nm + x, sight.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
+    image = image.placed(image.x_nm, image.y_nm)
+    starts = [image.placed(image.x_nm + x, image.y_nm + y) for x in _STARTS_NM for y in _STARTS_NM]
 
     def misfit(one: ParticleImage) -> float:
         return goodness(one, model)[0]
 
     likely = sorted(with_masses(starts, build, settings), key=misfit)[:_FITTED]
-    fits = [maximise([sight], build, settings, ()).sights[0] for sight in likely]
+    fits = [maximise([image], build, settings, ()).images[0] for image in likely]
     best = min(fits, key=misfit)
     return best.x_nm, best.y_nm

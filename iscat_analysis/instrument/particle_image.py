@@ -18,7 +18,7 @@ from iscat_analysis.optics.parameters import FOCUS_STEP, Settings
 from iscat_analysis.records import BoolArray, FloatArray
 
 PRIVATE = 5
-"""Unknowns of one sight, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
+"""Unknowns of one image, as `Likelihood` has them: x, y, z [nm], mass [kDa], logarithm of the
 background level."""
 
 ROAM_NM = 300.0
@@ -79,7 +79,7 @@ class ParticleImage:
 
     @property
     def private(self) -> FloatArray:
-        """Start of the sight's own unknowns, shape (5,)."""
+        """Start of the image's own unknowns, shape (5,)."""
         return np.array([self.x_nm, self.y_nm, self.z_nm, self.mass_kda, self.level])
 
     @property
@@ -88,7 +88,7 @@ class ParticleImage:
         return np.array([True, True, self.heights_nm is not None, True, True])
 
     def among(self, contrast: FloatArray) -> ParticleImage:
-        """Return the sight with the contrast of its neighbours in its expectation."""
+        """Return the image with the contrast of its neighbours in its expectation."""
         rings = 1 + contrast
         data = self.noise.multiplied(self.data, rings / self.rings)
         bare = self.noise.multiplied(data, 1 / rings)
@@ -145,13 +145,13 @@ class ParticleImage:
 
 
 def models_of(
-    sights: Sequence[ParticleImage], build: Build, settings: Settings
+    images: Sequence[ParticleImage], build: Build, settings: Settings
 ) -> list[Microscope]:
     """Give the microscope of every picture; those alike share one."""
     models: dict[tuple[Any, ...], Microscope] = {}
     out = []
-    for sight in sights:
-        own = sight.seen_with(settings)
+    for image in images:
+        own = image.seen_with(settings)
         key = tuple(own.items())
         if key not in models:
             models[key] = build(own)
@@ -167,15 +167,15 @@ _PARTS = 20  # of a pixel, to which it is found
 FARTHEST_CENTRE_PX = 4.0  # a picture's first centre is off by no more
 
 
-def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
-    """Measured contrast of a sight and the variance of its noise.
+def contrast_of(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
+    """Measured contrast of an image and the variance of its noise.
 
     Shapes: `contrast, variance` (ny, nx).
     """
-    terms = sight.noise.terms(sight.data, np.zeros(sight.grid.shape), 0.0)
+    terms = image.noise.terms(image.data, np.zeros(image.grid.shape), 0.0)
     information = terms.information * terms.by_signal**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        contrast = sight.noise.measured_signal(sight.data)
+        contrast = image.noise.measured_signal(image.data)
     used = (information > 0) & np.isfinite(contrast)
     level = float(np.average(contrast[used], weights=information[used]))
     variance = 1 / np.where(used, information, 1e-6)
@@ -183,27 +183,27 @@ def contrast_of(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
 
 
 def with_masses(
-    sights: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
+    images: Sequence[ParticleImage], build: Build, settings: Mapping[str, Any]
 ) -> tuple[ParticleImage, ...]:
-    """Give every sight the mass that fits it best where it stands."""
+    """Give every image the mass that fits it best where it stands."""
     out = []
-    for sight, model in zip(sights, models_of(sights, build, settings), strict=True):
-        parts = _parts(model, sight, (sight.x_nm, sight.y_nm))
-        contrast, variance = contrast_of(sight)
+    for image, model in zip(images, models_of(images, build, settings), strict=True):
+        parts = _parts(model, image, (image.x_nm, image.y_nm))
+        contrast, variance = contrast_of(image)
         weight = 1 / variance
         pictures = np.array([part - np.average(part, weights=weight) for part in parts])
         gram = np.einsum("yx,iyx,jyx->ij", weight, pictures, pictures)
         overlaps = np.einsum("yx,iyx,yx->i", weight, pictures, contrast)
         mass, _ = best_amplitudes(overlaps[0], overlaps[1], gram[0, 0], gram[0, 1], gram[1, 1])
-        out.append(replace(sight, mass_kda=float(mass)))
+        out.append(replace(image, mass_kda=float(mass)))
     return tuple(out)
 
 
 def _parts(
-    model: Any, sight: ParticleImage, place: tuple[float, float]
+    model: Any, image: ParticleImage, place: tuple[float, float]
 ) -> tuple[FloatArray, FloatArray]:
     """Contrast per mass, and per square of the mass: interference, and the scattered light."""
-    signal, slopes = model.gradient(sight.grid, *place, sight.z_nm, UNIT_KDA)
+    signal, slopes = model.gradient(image.grid, *place, image.z_nm, UNIT_KDA)
     slope = slopes[3]
     return (2 * signal - UNIT_KDA * slope) / UNIT_KDA, (UNIT_KDA * slope - signal) / UNIT_KDA**2
 
@@ -238,35 +238,35 @@ def best_amplitudes(
 
 
 def average_particle_images(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
 ) -> tuple[tuple[ParticleImage, ...], tuple[ParticleImage, ...]]:
     """Average the pictures of each focus, registered on each other, with the sign of each."""
-    placed = list(sights)
+    placed = list(images)
     averages = {}
-    for offset in sorted({sight.focus_steps for sight in sights}):
-        members = [i for i, sight in enumerate(sights) if sight.focus_steps == offset]
-        averages[offset], group = _average([sights[i] for i in members])
-        for i, sight in zip(members, group, strict=True):
-            placed[i] = sight
+    for offset in sorted({image.focus_steps for image in images}):
+        members = [i for i, image in enumerate(images) if image.focus_steps == offset]
+        averages[offset], group = _average([images[i] for i in members])
+        for i, image in zip(members, group, strict=True):
+            placed[i] = image
     offsets = list(averages)
     chosen = np.unique(np.linspace(0, len(offsets) - 1, min(_FOCI, len(offsets))).round())
     return tuple(averages[offsets[int(i)]] for i in chosen), tuple(placed)
 
 
-def _average(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, list[ParticleImage]]:
+def _average(images: Sequence[ParticleImage]) -> tuple[ParticleImage, list[ParticleImage]]:
     """Average pictures of one focus; their places are those of the average's centre."""
-    contrasts, variances = zip(*(contrast_of(sight) for sight in sights), strict=True)
-    pixel = sights[0].grid.pixel_nm
+    contrasts, variances = zip(*(contrast_of(image) for image in images), strict=True)
+    pixel = images[0].grid.pixel_nm
     shifts = np.array([
         (
-            (sight.y_nm - float(np.mean(sight.grid.y_nm))) / pixel,
-            (sight.x_nm - float(np.mean(sight.grid.x_nm))) / pixel,
+            (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
+            (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
         )
-        for sight in sights
+        for image in images
     ])  # fmt: skip
     template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
     variance = np.full(template.shape, float(np.median(variances[0])))
-    for _ in range(_ROUNDS if len(sights) > 1 else 0):
+    for _ in range(_ROUNDS if len(images) > 1 else 0):
         total, weight = np.zeros_like(template), np.zeros_like(template)
         for index, (contrast, noise) in enumerate(zip(contrasts, variances, strict=True)):
             shifts[index] = _register(contrast, template, shifts[index])
@@ -282,16 +282,16 @@ def _average(sights: Sequence[ParticleImage]) -> tuple[ParticleImage, list[Parti
     data[1] = counts + data[0]
     grid = PixelGrid.centred(template.shape[0], pixel)
     average = ParticleImage(
-        grid, CONDITIONAL, data, 0.0, 0.0, sights[0].z_nm,
-        focus_steps=sights[0].focus_steps,
+        grid, CONDITIONAL, data, 0.0, 0.0, images[0].z_nm,
+        focus_steps=images[0].focus_steps,
     )  # fmt: skip
     placed = [
         replace(
-            sight,
-            x_nm=float(np.mean(sight.grid.x_nm) + dx * pixel),
-            y_nm=float(np.mean(sight.grid.y_nm) + dy * pixel),
+            image,
+            x_nm=float(np.mean(image.grid.x_nm) + dx * pixel),
+            y_nm=float(np.mean(image.grid.y_nm) + dy * pixel),
         )
-        for sight, (dy, dx) in zip(sights, shifts, strict=True)
+        for image, (dy, dx) in zip(images, shifts, strict=True)
     ]
     return average, placed
 
@@ -311,37 +311,37 @@ def _register(contrast: FloatArray, template: FloatArray, shift: FloatArray) -> 
 
 
 def place_particle_images(
-    sights: Sequence[ParticleImage], nominal: ForwardModel
+    images: Sequence[ParticleImage], nominal: ForwardModel
 ) -> list[ParticleImage]:
     """Register pictures on their average, and say how much of it each shows."""
-    (average,), placed = average_particle_images(sights)
+    (average,), placed = average_particle_images(images)
     scale = peak_per_amplitude(nominal)
     shown = average.data[0] / (average.data[1] - average.data[0]) - 1
     top = float(np.abs(shown).max())
     out = []
-    for sight in placed:
+    for image in placed:
         rows, columns = (
-            (axis[:, None] - at) / sight.grid.pixel_nm + (n - 1) / 2
+            (axis[:, None] - at) / image.grid.pixel_nm + (n - 1) / 2
             for axis, at, n in (
-                (sight.grid.y_nm, sight.y_nm, shown.shape[0]),
-                (sight.grid.x_nm, sight.x_nm, shown.shape[1]),
+                (image.grid.y_nm, image.y_nm, shown.shape[0]),
+                (image.grid.x_nm, image.x_nm, shown.shape[1]),
             )
         )
         places = np.broadcast_arrays(rows, columns.T)
         moved = ndimage.map_coordinates(shown, places, order=3, mode="nearest") / top
-        contrast, weight = signal_of(sight, nominal, np.zeros(sight.grid.shape))
+        contrast, weight = signal_of(image, nominal, np.zeros(image.grid.shape))
         moved = moved - np.average(moved, weights=weight)
         strength = np.sum(weight * moved * contrast) / np.sum(weight * moved**2)
-        out.append(replace(sight, mass_kda=float(strength) / scale))
+        out.append(replace(image, mass_kda=float(strength) / scale))
     return out
 
 
 def signal_of(
-    sight: ParticleImage, nominal: ForwardModel, signal: FloatArray
+    image: ParticleImage, nominal: ForwardModel, signal: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Measured signal of a picture and its information, 0 where masked; the model takes no part.
 
     Shapes: `signal` (ny, nx), both results (ny, nx).
     """
-    likelihood = Likelihood(nominal, sight.grid, sight.noise, sight.data)
+    likelihood = Likelihood(nominal, image.grid, image.noise, image.data)
     return np.nan_to_num(likelihood.measured_signal()), likelihood.signal_information(signal)

@@ -57,28 +57,28 @@ class Pictures:
     na: float
 
 
-def make_pictures(sights: Sequence[ParticleImage], build: Build, settings: Settings) -> Pictures:
+def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Settings) -> Pictures:
     """Average the pictures and what the microscope makes of them.
 
     Data and model are moved by the same interpolation, so that it shows in neither residual.
     """
-    shape, pixel = sights[0].grid.shape, sights[0].grid.pixel_nm
+    shape, pixel = images[0].grid.shape, images[0].grid.pixel_nm
     sums, weight, noise = np.zeros((2, *shape)), 0.0, np.zeros(shape)
-    typical = float(np.median([abs(sight.mass_kda) for sight in sights]))
-    for sight in sights:
-        place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda)
-        model, _ = build(sight.seen_with(settings)).gradient(*place)
-        contrast, variance = contrast_of(sight)
+    typical = float(np.median([abs(image.mass_kda) for image in images]))
+    for image in images:
+        place = (image.grid, image.x_nm, image.y_nm, image.z_nm, image.mass_kda)
+        model, _ = build(image.seen_with(settings)).gradient(*place)
+        contrast, variance = contrast_of(image)
         used = variance < 1e5
         contrast = np.where(used, contrast, model)
         model = model - float(np.average(model[used], weights=1 / variance[used]))
         offset = (
-            (sight.y_nm - float(np.mean(sight.grid.y_nm))) / pixel,
-            (sight.x_nm - float(np.mean(sight.grid.x_nm))) / pixel,
+            (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
+            (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
         )
-        scale, level = sight.mass_kda / typical, float(np.median(variance))
-        for total, image in zip(sums, (contrast, model), strict=True):
-            moved = ndimage.shift(image, [-o for o in offset], order=3, mode="nearest")
+        scale, level = image.mass_kda / typical, float(np.median(variance))
+        for total, shown in zip(sums, (contrast, model), strict=True):
+            moved = ndimage.shift(shown, [-o for o in offset], order=3, mode="nearest")
             total += scale * moved / level
         weight += scale**2 / level
         noise += scale**2 / level
@@ -133,7 +133,7 @@ class OpticsCalibration:
     covariance: FloatArray
     measured: Measured
     pictures: Pictures
-    sights: int
+    images: int
     source: Mapping[str, str]
     notes: tuple[str, ...]
 
@@ -201,7 +201,7 @@ class OpticsCalibration:
             parts.append(f"mask of NA {self.value('mask_na'):.3f}")
         parts.append(f"{self.measured.settings['polarization']} polarisation")
         return (
-            f"{', '.join(parts)} from {self.sights} {pictures_of}; reduced chi2 of those that "
+            f"{', '.join(parts)} from {self.images} {pictures_of}; reduced chi2 of those that "
             f"were not fitted {np.mean(judged.chi2_reduced):.3f} "
             f"({np.mean(before.chi2_reduced):.3g} as configured)"
         )
@@ -247,7 +247,7 @@ class OpticsCalibration:
         lines += [f"{key} = {in_toml(text)}" for key, text in self.source.items()]
         if FOCUS_STEP in self.names:
             lines += [f"{FOCUS_STEP} = {self.value(FOCUS_STEP):.9g}"]
-        return "\n".join([*lines, f"particles = {self.sights}", ""])
+        return "\n".join([*lines, f"particles = {self.images}", ""])
 
     def to_dict(self) -> dict[str, Any]:
         """Give what ``optics.json`` holds."""
@@ -267,7 +267,7 @@ class OpticsCalibration:
             "twin": None if twin is None else {"settings": dict(twin.settings), "gap": twin.gap},
             "held_out": _judged(found.judgement),
             "held_out_as_configured": _judged(found.configured),
-            "particles": self.sights,
+            "particles": self.images,
             "contaminated": found.contaminated,
             "source": dict(self.source),
             "pictures": {k: v.tolist() if hasattr(v, "tolist") else v for k, v in shown.items()},
@@ -312,7 +312,7 @@ def make_result(
         covariance=covariance,
         measured=measured,
         pictures=pictures,
-        sights=len(estimate.sights),
+        images=len(estimate.images),
         source=source,
         notes=(*_notes(measured), *_on_the_pixel(config, configured, measured)),
     )

@@ -23,7 +23,7 @@ from iscat_analysis.instrument.fit_optics import Collected, misfit_of
 from iscat_analysis.instrument.loop import Rounds
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.instrument.uneven import FieldOfView, asked_change, in_uneven_field
-from iscat_analysis.optics.parameters import LEAST_SIGHTS, heights_free, settings_of
+from iscat_analysis.optics.parameters import LEAST_IMAGES, heights_free, settings_of
 from iscat_analysis.records import Status, Windows
 
 LEAST_ROUGH = 6
@@ -58,7 +58,7 @@ class StandingAlone:
             return None
         found, config = rounds.all[0].found.measured, self.seen.config
         settings, mapper = found.settings, self.pool.map
-        if not asked_change(found.estimate.sights, config, settings, self.view, mapper).matters:
+        if not asked_change(found.estimate.images, config, settings, self.view, mapper).matters:
             return None
         return in_uneven_field(self.seen, settings, self.view, mapper)
 
@@ -116,4 +116,4 @@ def seen_in_field(
     events, _ = fit_field(context, windows, pool=pool)
     # with free heights what wrong optics leave over is beside particles, which would not be alone
     known = [e.fit.theta for e in events if not (free and Status.SIDELOBE in e.flags)]
-    return known_places(windows, config, known, LEAST_SIGHTS)
+    return known_places(windows, config, known, LEAST_IMAGES)

@@ -51,17 +51,17 @@ class Start:
     explained: float
 
 
-def _quadratures(model: Any, sight: ParticleImage) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _quadratures(model: Any, image: ParticleImage) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Contrast per mass at reference phases 0 and 90°, and scattered light per squared mass.
 
     The particle is in the centre.
     """
-    pixels = model.pixels(sight.grid)
-    along, power = np.zeros(sight.grid.shape, complex), np.zeros(sight.grid.shape)
+    pixels = model.pixels(image.grid)
+    along, power = np.zeros(image.grid.shape, complex), np.zeros(image.grid.shape)
     for down, high in zip(pixels.offsets, pixels.weights, strict=True):
         for right, wide in zip(pixels.offsets, pixels.weights, strict=True):
             dx, dy = np.meshgrid(pixels.x + right, pixels.y + down)
-            field = model.field(dx, dy, sight.z_nm, UNIT_KDA) / UNIT_KDA
+            field = model.field(dx, dy, image.z_nm, UNIT_KDA) / UNIT_KDA
             along += wide * high * field[0]
             power += wide * high * np.sum(np.abs(field) ** 2, axis=0)
     return 2 * along.real, 2 * along.imag, power
@@ -277,7 +277,7 @@ class StateSearch:
             return self._fit(there, start.values, _FIRST_PASSES)
 
         def more(fit: Estimate) -> Estimate:
-            return fit if fit.converged else self._fit(fit.sights, fit.values, _MORE_PASSES)
+            return fit if fit.converged else self._fit(fit.images, fit.values, _MORE_PASSES)
 
         fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_likelihood)
         fits = [
@@ -300,10 +300,10 @@ class StateSearch:
         ]
         return list(self.mapper(more, leading))
 
-    def _fit(self, sights: Sequence[ParticleImage], start: Settings, passes: int) -> Estimate:
+    def _fit(self, images: Sequence[ParticleImage], start: Settings, passes: int) -> Estimate:
         names = free_names(self.free, start, PRIMARY + SECONDARY)
         return maximise(
-            sights, self.build, start, names, limits=self.limits, tolerance=_ROUGH, passes=passes
+            images, self.build, start, names, limits=self.limits, tolerance=_ROUGH, passes=passes
         )
 
     def _hidden_masks(

@@ -45,7 +45,7 @@ from iscat_analysis.optics.forward import (
     with_template,
 )
 from iscat_analysis.optics.measured import Template, lattice_step_nm
-from iscat_analysis.optics.parameters import LEAST_SIGHTS, settings_of
+from iscat_analysis.optics.parameters import LEAST_IMAGES, settings_of
 from iscat_analysis.records import FloatArray, Mapper, Progress, silent
 from iscat_analysis.text import in_toml
 from iscat_analysis.threads import threads
@@ -165,10 +165,10 @@ def measure_template(
             if len(alone) >= _PLENTY:
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
-        if len(alone) < LEAST_SIGHTS:
+        if len(alone) < LEAST_IMAGES:
             raise DataError(
                 f"{movie.path.name}: shows {count(len(alone), 'bright particle')} without another "
-                f"nearby, and at least {LEAST_SIGHTS} are needed to measure a picture; record more "
+                f"nearby, and at least {LEAST_IMAGES} are needed to measure a picture; record more "
                 "particles, fewer at a time, or brighter ones"
             )
         nominal = forward_model(cut, max(map(reach_nm, alone)) + roi_nm / 10)
@@ -190,7 +190,7 @@ def measure_template(
 
 
 def _judged(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     nominal: ForwardModel,
     config: Config,
     settings: Mapping[str, float],
@@ -212,12 +212,12 @@ def _judged(
         model = with_template(nominal, found.template)
         return judge(some, lambda _: model, settings_of(config), mapper)
 
-    first = fit([s for i, s in enumerate(sights) if i % _HELD_OUT != 1])
-    held = fitted_with(sights[1::_HELD_OUT], first)
-    kept = [(some, judged(some, first).p_values > _CONTAMINATED_P) for some in (first.sights, held)]
+    first = fit([s for i, s in enumerate(images) if i % _HELD_OUT != 1])
+    held = fitted_with(images[1::_HELD_OUT], first)
+    kept = [(some, judged(some, first).p_values > _CONTAMINATED_P) for some in (first.images, held)]
     bad = sum(int(np.sum(~good)) for _, good in kept)
     contaminated = 0
-    if 0 < bad <= _CONTAMINATED_SHARE * len(sights):
+    if 0 < bad <= _CONTAMINATED_SHARE * len(images):
         contaminated = bad
         rest = [s for s, ok in zip(*kept[0], strict=True) if ok]
         first = fit(rest)
@@ -231,20 +231,20 @@ def _judged(
             f"{float(np.mean(judgement.chi2_reduced)):.3f})"
         )
     return MeasuredPicture(
-        config, fit([*first.sights, *held]), judgement, contaminated, source, tuple(refusals)
+        config, fit([*first.images, *held]), judgement, contaminated, source, tuple(refusals)
     )
 
 
-def _alone(sights: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> list[ParticleImage]:
+def _alone(images: Sequence[ParticleImage], others: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Leave out pictures into which another particle reaches."""
 
-    def is_alone(sight: ParticleImage) -> bool:
-        room = sight.grid.pixel_nm * max(sight.grid.shape) / 2 + _CLEAR_NM
-        x, y = float(np.mean(sight.grid.x_nm)), float(np.mean(sight.grid.y_nm))
-        near = (others[number] for number, share in sight.neighbours if abs(share) > _NEW)
+    def is_alone(image: ParticleImage) -> bool:
+        room = image.grid.pixel_nm * max(image.grid.shape) / 2 + _CLEAR_NM
+        x, y = float(np.mean(image.grid.x_nm)), float(np.mean(image.grid.y_nm))
+        near = (others[number] for number, share in image.neighbours if abs(share) > _NEW)
         return all(max(abs(o.x_nm - x), abs(o.y_nm - y)) > room for o in near)
 
-    return [sight for sight in sights if is_alone(sight)]
+    return [image for image in images if is_alone(image)]
 
 
 _ROUNDS = 8
@@ -309,13 +309,13 @@ class PictureFit:
     """A template and the pictures that made it."""
 
     template: Template
-    sights: tuple[ParticleImage, ...]
+    images: tuple[ParticleImage, ...]
     effective: float
     rounds: int
 
 
 def fit_picture(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     nominal: ForwardModel,
     *,
     roi_nm: float,
@@ -324,10 +324,10 @@ def fit_picture(
     mapper: Mapper = map,
 ) -> PictureFit:
     """Fit the picture that all particles share."""
-    pixel = sights[0].grid.pixel_nm
-    side = max(sights[0].grid.shape) * pixel
+    pixel = images[0].grid.pixel_nm
+    side = max(images[0].grid.shape) * pixel
     waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + _ROOM_NM))
-    own = list(sights)
+    own = list(images)
     offsets, weights = nominal.samples
     blur = (offsets * pixel, weights)
     coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
@@ -353,23 +353,23 @@ def fit_picture(
     return PictureFit(template, tuple(own), effective, used)
 
 
-def fit_own(sight: ParticleImage, model: ForwardModel, *, level: bool) -> ParticleImage:
+def fit_own(image: ParticleImage, model: ForwardModel, *, level: bool) -> ParticleImage:
     """Fit what is a picture's own."""
-    likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
-    start = np.array([sight.x_nm, sight.y_nm, model.height_nm, sight.mass_kda, sight.level])
-    room = np.array([_ROAM_NM, _ROAM_NM, 0.0, 20 * abs(sight.mass_kda), float(level)])
-    half = (np.array(sight.grid.shape[::-1]) - 1) / 2 * sight.grid.pixel_nm
-    centre = np.array([sight.grid.x_nm.mean(), sight.grid.y_nm.mean()])
+    likelihood = Likelihood(model, image.grid, image.noise, image.data)
+    start = np.array([image.x_nm, image.y_nm, model.height_nm, image.mass_kda, image.level])
+    room = np.array([_ROAM_NM, _ROAM_NM, 0.0, 20 * abs(image.mass_kda), float(level)])
+    half = (np.array(image.grid.shape[::-1]) - 1) / 2 * image.grid.pixel_nm
+    centre = np.array([image.grid.x_nm.mean(), image.grid.y_nm.mean()])
     start[:2] = np.clip(start[:2], centre - np.minimum(half, _ROAM_NM), centre + _ROAM_NM)
     low, high = start - room, start + room
     low[:2], high[:2] = centre - _ROAM_NM, centre + _ROAM_NM
     free = np.array([True, True, False, True, level])
     found = likelihood.maximize(start, free, low, high).theta
-    return sight.moved(found)
+    return image.moved(found)
 
 
 def _solve(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     nominal: ForwardModel,
     waves: _Waves,
     coefficients: FloatArray,
@@ -387,12 +387,12 @@ def _solve(
     began = bool(np.any(coefficients))
     along, up = waves.slopes(coefficients)
 
-    def one(sight: ParticleImage) -> tuple[FloatArray, FloatArray]:
-        grid, strength, gain = sight.grid, sight.mass_kda * scale, math.exp(sight.level)
-        basis = waves.on(grid.x_nm - sight.x_nm, grid.y_nm - sight.y_nm, blur)
+    def one(image: ParticleImage) -> tuple[FloatArray, FloatArray]:
+        grid, strength, gain = image.grid, image.mass_kda * scale, math.exp(image.level)
+        basis = waves.on(grid.x_nm - image.x_nm, grid.y_nm - image.y_nm, blur)
         shown = strength * (basis @ coefficients)
         bright = (1 + shown / 2) ** 2
-        contrast, weight = signal_of(sight, nominal, (bright - 1).reshape(grid.shape))
+        contrast, weight = signal_of(image, nominal, (bright - 1).reshape(grid.shape))
         root = np.sqrt(weight.ravel())
         rest = root * (contrast.ravel() - (gain * bright - 1))
         rate = root * gain * (1 + shown / 2) * strength
@@ -406,7 +406,7 @@ def _solve(
             rest = rest - q @ (q.T @ rest)
         return rows.T @ rows, rows.T @ rest
 
-    found = list(mapper(one, sights))
+    found = list(mapper(one, images))
     information = np.sum([each[0] for each in found], axis=0)
     pull = np.sum([each[1] for each in found], axis=0) + information @ coefficients
     values, vectors = np.linalg.eigh(prior.T @ information @ prior)
@@ -447,20 +447,20 @@ def _gauge(
     coefficients: FloatArray,
     half_nm: float,
     step_nm: float,
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
 ) -> tuple[FloatArray, tuple[float, float], float]:
     """Centre the energy, make the peak 1 and landings positive; give the shift and the factor."""
     axis = np.arange(-half_nm, half_nm + step_nm / 2, step_nm)
-    image = (waves.on(axis, axis, None) @ coefficients).reshape(axis.size, axis.size)
-    energy = image**2 / np.sum(image**2)
+    pattern = (waves.on(axis, axis, None) @ coefficients).reshape(axis.size, axis.size)
+    energy = pattern**2 / np.sum(pattern**2)
     x, y = float(energy.sum(axis=0) @ axis), float(energy.sum(axis=1) @ axis)
     centred = waves.moved(coefficients, x, y)
-    image = (waves.on(axis, axis, None) @ centred).reshape(axis.size, axis.size)
-    row, column = np.unravel_index(int(np.argmax(np.abs(image))), image.shape)
+    pattern = (waves.on(axis, axis, None) @ centred).reshape(axis.size, axis.size)
+    row, column = np.unravel_index(int(np.argmax(np.abs(pattern))), pattern.shape)
     fine = step_nm * np.linspace(-1, 1, 2 * _FINE + 1)
     near = waves.on(axis[column] + fine, axis[row] + fine, None) @ centred
     size = float(np.abs(near).max())
-    if sum(math.copysign(1.0, sight.mass_kda) for sight in sights) < 0:
+    if sum(math.copysign(1.0, image.mass_kda) for image in images) < 0:
         size = -size
     return centred / size, (x, y), size
 
@@ -469,7 +469,7 @@ def _template(
     waves: _Waves,
     coefficients: FloatArray,
     covariance: FloatArray,
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     *,
     roi_nm: float,
     side_nm: float,
@@ -492,8 +492,8 @@ def _template(
         contrast=image,
         sigma=np.sqrt(variance) * window,
         step_nm=step_nm,
-        pixel_nm=sights[0].grid.pixel_nm,
+        pixel_nm=images[0].grid.pixel_nm,
         roi_nm=roi_nm,
         peak_se=float(np.sqrt(rest @ covariance @ rest)),
-        sights=len(sights),
+        sights=len(images),
     )

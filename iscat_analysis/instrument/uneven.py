@@ -37,7 +37,7 @@ from iscat_analysis.optics.field_map import (
 )
 from iscat_analysis.optics.parameters import (
     FREE,
-    LEAST_SIGHTS,
+    LEAST_IMAGES,
     Settings,
     free_names,
     prior_range,
@@ -110,35 +110,35 @@ class FieldOfView:
         """Frame in the middle."""
         return sum(self.frames) // 2
 
-    def placed(self, sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+    def placed(self, images: Sequence[ParticleImage]) -> list[ParticleImage]:
         """Give pictures their places, and the times of the frames that show their particle."""
         first, last = self.frames
         part = max((last - first) / _PERIODS, 1.0)
         x, y, half = self.centre_px
         out = []
-        for sight in sights:
-            time = round((sight.shown - self.middle) / part) * part / DRIFT_FRAMES
-            after = tuple(sight.shown >= frame for frame in self.jumps)
+        for image in images:
+            time = round((image.shown - self.middle) / part) * part / DRIFT_FRAMES
+            after = tuple(image.shown >= frame for frame in self.jumps)
             at_x, at_y = (
-                float(np.mean(axis)) / self.pixel_nm for axis in (sight.grid.x_nm, sight.grid.y_nm)
+                float(np.mean(axis)) / self.pixel_nm for axis in (image.grid.x_nm, image.grid.y_nm)
             )
             place = ((at_x - x) / half, (at_y - y) / half)
             time = time if self.in_time else 0.0
-            out.append(replace(sight, place=place, focus_steps=time, after=after))
+            out.append(replace(image, place=place, focus_steps=time, after=after))
         return out
 
-    def undivided(self, sights: Sequence[ParticleImage]) -> list[ParticleImage]:
+    def undivided(self, images: Sequence[ParticleImage]) -> list[ParticleImage]:
         """Leave pictures out whose frames lie on both sides of a jump."""
         return [
-            sight
-            for sight in sights
-            if not any(abs(frame - sight.step) < 2 * abs(sight.shown - sight.step)
+            image
+            for image in images
+            if not any(abs(frame - image.step) < 2 * abs(image.shown - image.step)
                        for frame in self.jumps)
         ]  # fmt: skip
 
-    def jumping(self, sights: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
+    def jumping(self, images: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
         """Add a jump of the focus that lies between two pictures, in the order of time."""
-        return replace(self, jumps=(*self.jumps, jump_frame(self, sights, between)))
+        return replace(self, jumps=(*self.jumps, jump_frame(self, images, between)))
 
     def optics(self, config: Config) -> Config:
         """Say in a configuration for what part of the sample and what time its terms hold."""
@@ -185,17 +185,17 @@ EVEN = Change()
 
 
 def asked_change(
-    sights: Sequence[ParticleImage],
+    images: Sequence[ParticleImage],
     config: Config,
     settings: Settings,
     view: FieldOfView,
     mapper: Mapper = map,
 ) -> Change:
     """Find the kind of change that pictures ask for most, beside another focus and phase."""
-    seen = view.placed(sights)
-    if len({sight.spot for sight in seen}) < LEAST_PICTURES:
+    seen = view.placed(images)
+    if len({image.spot for image in seen}) < LEAST_PICTURES:
         return EVEN
-    build = microscopes(config, max(map(reach_nm, sights)))
+    build = microscopes(config, max(map(reach_nm, images)))
     wishes = _Wishes.of(seen, build, settings, _SHARED, view, mapper)
     return next(iter([*wishes.changes(), *wishes.rest()]), EVEN)
 
@@ -204,7 +204,7 @@ def asked_change(
 class _Wishes:
     """What pictures ask for beside parameters that all of them share."""
 
-    sights: Sequence[ParticleImage]
+    images: Sequence[ParticleImage]
     shared: Sequence[str]
     asked: Asked
     view: FieldOfView
@@ -212,7 +212,7 @@ class _Wishes:
     @classmethod
     def of(
         cls,
-        sights: Sequence[ParticleImage],
+        images: Sequence[ParticleImage],
         build: Build,
         settings: Settings,
         shared: Sequence[str],
@@ -222,8 +222,8 @@ class _Wishes:
         """Ask pictures."""
         terms = (term for names in KINDS.values() for term in names)
         bases = dict.fromkeys(b for name in (*shared, *terms) for b in BASES.get(name, (name,)))
-        asked = asked_changes(sights, build, settings, tuple(bases), mapper)
-        return cls(sights, shared, asked, view)
+        asked = asked_changes(images, build, settings, tuple(bases), mapper)
+        return cls(images, shared, asked, view)
 
     def changes(self) -> list[Change]:
         """Give the kinds of change, the clearest first."""
@@ -238,11 +238,11 @@ class _Wishes:
 
     def rest(self) -> list[Change]:
         """Say whether parts of the movie ask for a focus of their own."""
-        number = min(_BLOCKS, len(self.sights) // _BLOCK)
+        number = min(_BLOCKS, len(self.images) // _BLOCK)
         if not self.view.in_time or number < 2:
             return []
-        order = np.argsort([sight.shown for sight in self.sights])
-        slopes = np.zeros((len(self.sights), number - 1, len(self.asked.names)))
+        order = np.argsort([image.shown for image in self.images])
+        slopes = np.zeros((len(self.images), number - 1, len(self.asked.names)))
         for block, pictures in enumerate(np.array_split(order, number)[1:]):
             slopes[pictures, block, self.asked.names.index("focus_nm")] = 1.0
         rises, significance = self._step(slopes)
@@ -256,11 +256,11 @@ class _Wishes:
 
         A single picture on its other side may as well show something else, and is no jump.
         """
-        known, number = len(self.view.jumps), len(self.sights)
+        known, number = len(self.view.jumps), len(self.images)
         if not self.view.in_time or known == len(JUMPS):
             return []
-        order = np.argsort([sight.shown for sight in self.sights])
-        taken = {sum(not self.sights[k].after[jump] for k in order) for jump in range(known)}
+        order = np.argsort([image.shown for image in self.images])
+        taken = {sum(not self.images[k].after[jump] for k in order) for jump in range(known)}
         asked: dict[int, tuple[float, FloatArray]] = {}
         for before in sorted({*range(1, number)} - taken):
             slopes = np.zeros((number, 1, len(self.asked.names)))
@@ -274,10 +274,10 @@ class _Wishes:
 
     def _slopes(self, names: Sequence[str]) -> FloatArray:
         """Give what parameters change about the optics of every picture, (n, m, k)."""
-        out = np.zeros((len(self.sights), len(names), len(self.asked.names)))
-        for number, sight in enumerate(self.sights):
+        out = np.zeros((len(self.images), len(names), len(self.asked.names)))
+        for number, image in enumerate(self.images):
             for term, name in enumerate(names):
-                for base, weight in sight.slopes(name).items():
+                for base, weight in image.slopes(name).items():
                     out[number, term, self.asked.names.index(base)] = weight
         return out
 
@@ -297,7 +297,7 @@ class _Wishes:
         size, significance = self._step(slopes)
         terms = dict(zip(names, size.tolist(), strict=True))
         if not (
-            len(self.sights) >= LEAST_PICTURES
+            len(self.images) >= LEAST_PICTURES
             and _by_no_chance(significance, len(names), trials)
             and is_plausible(terms, self.view.frames)
         ):
@@ -341,14 +341,14 @@ _VOTE = 6.0  # standard errors that each particle counts for at most
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
-def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tuple[int, int]) -> int:
+def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tuple[int, int]) -> int:
     """Find the frame of a jump between two pictures: what has landed changes in it, all at once.
 
     Around each particle every frame is compared with the change from one end to the other, and the
     standard errors of a step are added.  Each has a vote of at most so many until the frames are
     near: what lands beside a few of them outweighs no jump, which all of them see.
     """
-    order = sorted(sights, key=lambda sight: sight.shown)
+    order = sorted(images, key=lambda image: image.shown)
     last, first = (order[k] for k in between)
     low = max(round(last.frames[0]) - _ENDS, view.frames[0])
     high = min(round(2 * first.frames[1] - first.step) + _ENDS, view.frames[1])
@@ -356,10 +356,10 @@ def jump_frame(view: FieldOfView, sights: Sequence[ParticleImage], between: tupl
     places = [
         tuple(
             slice(max(round(at / view.pixel_nm) - reach, 0), round(at / view.pixel_nm) + reach + 1)
-            for at in (sight.y_nm, sight.x_nm)
+            for at in (image.y_nm, image.x_nm)
         )
-        for sight in order
-        if sight.step < low
+        for image in order
+        if image.step < low
     ]
     found, vote = round((last.shown + first.shown) / 2), _VOTE
     while places and high - low > 2 * _ENDS + 1:
@@ -394,11 +394,11 @@ def in_uneven_field(
     None where pictures that were not fitted want no change.
     """
     images, config = seen.images, seen.config
-    if len(images) < LEAST_SIGHTS:
+    if len(images) < LEAST_IMAGES:
         return seen  # too few for any optics, which is said where they are fitted
     build = microscopes(config, max(map(reach_nm, images)))
     signed = with_masses(images, build, settings)  # what leaves is seen before
-    pictures = sorted(view.placed(signed), key=lambda sight: -sight.snr)
+    pictures = sorted(view.placed(signed), key=lambda image: -image.snr)
 
     def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
         return maximise(some, build, start, names, passes=_PASSES, mapper=mapper)
@@ -419,14 +419,14 @@ def in_uneven_field(
     kept, refused = list[tuple[str, ...]](), set[str]()
     while True:
         best = fitted(pictures, values, names)
-        wishes = _Wishes.of(best.sights, build, best.values, names, view, mapper)
+        wishes = _Wishes.of(best.images, build, best.values, names, view, mapper)
         change = next((each for each in wishes.changes() if each.kind not in refused), EVEN)
         if not change.matters:
             break
         refused.add(change.kind)
         terms, seen_by, judged, least = tuple(change.terms), view, pictures, before
         if change.kind == JUMP:
-            seen_by = view.jumping(best.sights, (change.jump - 1, change.jump))
+            seen_by = view.jumping(best.images, (change.jump - 1, change.jump))
             judged = seen_by.placed(seen_by.undivided(pictures))
             least = tried(judged, values, names)[1]
         start = {**best.values, **dict.fromkeys(terms, 0.0)}
@@ -450,6 +450,6 @@ def in_uneven_field(
     if not kept and not refusal:
         return None
     return Collected(
-        view.optics(config), best.sights, view.placed(seen.others),
+        view.optics(config), best.images, view.placed(seen.others),
         near=best.values, refusal=refusal,
     )  # fmt: skip

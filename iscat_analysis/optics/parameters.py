@@ -99,10 +99,10 @@ FREE = {
 """What ``--free`` may name, and the continuous parameters that each stands for; whether light is
 linear or circular is a choice beside them."""
 
-LEAST_SIGHTS = 12
+LEAST_IMAGES = 12
 """Pictures without which nothing is calibrated: eight to fit and four to judge."""
 
-MOST_SIGHTS = 60
+MOST_IMAGES = 60
 """Pictures that are used at most, two thirds of them to fit."""
 
 FAINTEST = 8.0

@@ -88,7 +88,7 @@ class Aligned:
             masked=light <= 0,
         )
 
-    def sight(self, context: AnalysisContext, number: int) -> ParticleImage:
+    def particle_image(self, context: AnalysisContext, number: int) -> ParticleImage:
         """Give one picture in the form that the measurement of the microscope takes."""
         likelihood = self.likelihood(context, number)
         theta = self.theta[number]

@@ -26,7 +26,7 @@ from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.learning import adopted
 from iscat_analysis.instrument.loop import Rounds, learn
 from iscat_analysis.instrument.microscope import REJECTED_P
-from iscat_analysis.optics.parameters import FREE, MOST_SIGHTS, Settings, heights_free, settings_of
+from iscat_analysis.optics.parameters import FREE, MOST_IMAGES, Settings, heights_free, settings_of
 from iscat_analysis.records import BoolArray
 from iscat_analysis.tracking.aligned import Aligned
 from iscat_analysis.tracking.block_store import Block
@@ -212,8 +212,8 @@ class Tracks:
                 return None
             near = settings_of(self.begun.config) if self.described else None
         aligned, context = self.begun.block.aligned, self.begun.context
-        shown = [] if aligned is None else _brightest(aligned, MOST_SIGHTS)
-        images = [aligned.sight(context, n) for n in shown] if aligned is not None else []
+        shown = [] if aligned is None else _brightest(aligned, MOST_IMAGES)
+        images = [aligned.particle_image(context, n) for n in shown] if aligned is not None else []
         return Collected(self.start, images, near=near, found_with=self.begun.config)
 
     def describes(self, seen: Collected) -> bool:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrations import GRID, PHOTONS, PIXEL_NM, configuration, make_sights
+from calibrations import GRID, PHOTONS, PIXEL_NM, configuration, make_particle_images
 
 import iscat_analysis as ia
 from iscat_analysis.bounds.optics_forecast import forecast_optics
@@ -78,7 +78,7 @@ def test_a_fit_of_pictures_has_the_errors_that_were_foreseen() -> None:
     mass, count = 6000.0, 24
     changes = {"z11": 12.0, "z7": 9.0, "focus_nm": -340.0}
     names = ("focus_nm", "na", "reference_phase_deg", *filter(is_term, FREE["zernike"]))
-    _, truth, build = make_sights(changes, count, seed=31, masses_kda=(mass,), leaving=0.0)
+    _, truth, build = make_particle_images(changes, count, seed=31, masses_kda=(mass,), leaving=0.0)
     config = configuration()
     fit = maximise(truth, build, {**settings_of(config), **changes}, names)
     true = ia.configure(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from calibrations import configuration, make_sights
+from calibrations import configuration, make_particle_images
 from instruments import Instrument, focus_scan, strength_of_sphere
 
 import iscat_analysis as ia
@@ -116,14 +116,14 @@ def test_the_best_strength_of_a_strong_particle() -> None:
 def test_the_direction_of_linear_light_is_told(direction: float) -> None:
     config = configuration()
     changes = {"polarization_deg": direction, "focus_nm": -350.0}
-    sights, _, build = make_sights(changes, 15, seed=int(direction))
+    images, _, build = make_particle_images(changes, 15, seed=int(direction))
     found = OpticsSearch(
         settings_of(config),
         build,
         ("focus", "phase", "polarization"),
         optics_limits(1.515, 1.515),
         side=-1,
-    ).run(sights)
+    ).run(images)
     assert not found.refusals
     assert found.settings["polarization"] == "linear"
     sigma = dict(

@@ -72,7 +72,7 @@ def test_optics_are_learned_with_the_height_of_every_particle(
     sigma = dict(zip(estimate.names, np.sqrt(np.diag(estimate.covariance)), strict=True))
     assert abs(estimate.values["focus_nm"] + 560.0) < SIGMAS * sigma["focus_nm"]
     assert abs(estimate.values["na"] - 1.40) < SIGMAS * sigma["na"]
-    places = np.array([(s.x_nm, s.y_nm, s.z_nm) for s in estimate.sights])
+    places = np.array([(s.x_nm, s.y_nm, s.z_nm) for s in estimate.images])
     nearest = np.hypot(*(places[:, None, :2] - movie[1][:, :2]).T).argmin(axis=0)
     assert np.abs(places - movie[1][nearest]).max() < 8.0
 

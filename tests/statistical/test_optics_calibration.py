@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
+from calibrations import GRID, PHOTONS, configuration, make_particle_images, microscope
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
@@ -38,35 +38,35 @@ def _measure(
     **light: Any,
 ) -> Measured:
     config = configuration() if config is None else config
-    sights, _, build = make_sights(changes, count, seed=seed, config=config, **light)
+    images, _, build = make_particle_images(changes, count, seed=seed, config=config, **light)
     return OpticsSearch(settings_of(config), build, free, optics_limits(1.515, 1.515), side=-1).run(
-        sights
+        images
     )
 
 
 def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None:
     """Its particle lies 750 nm from the centre, and models reach as far as particles may roam."""
     config = configuration()
-    sights, _, _ = make_sights({}, 8, seed=12)
+    images, _, _ = make_particle_images({}, 8, seed=12)
     signal = microscope(config, {}).image(GRID, 540.0, -520.0, 5.0, 6000.0)
     before, after = np.random.default_rng(13).poisson(
         [np.full(GRID.shape, PHOTONS), PHOTONS * (1 + signal)]
     )
-    data = sights[-1].data.copy()
+    data = images[-1].data.copy()
     data[0], data[1] = after, before + after
-    sights[-1] = replace(sights[-1], data=data, x_nm=540.0, y_nm=-520.0, snr=1.0)
-    sights.sort(key=lambda sight: -sight.snr)
+    images[-1] = replace(images[-1], data=data, x_nm=540.0, y_nm=-520.0, snr=1.0)
+    images.sort(key=lambda image: -image.snr)
     reach = GRID.diagonal_nm / 2 + 450.0
 
     def build(settings: Mapping[str, Any]) -> ForwardModel:
         return build_microscope(config, reach, settings)
 
-    _, placed = average_particle_images(sights)
+    _, placed = average_particle_images(images)
     assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
     found = OpticsSearch(
         settings_of(config), build, ROUND, optics_limits(1.515, 1.515), side=-1
-    ).run(sights)  # fmt: skip
-    assert len(found.estimate.sights) >= 6
+    ).run(images)  # fmt: skip
+    assert len(found.estimate.images) >= 6
 
 
 def _pulls(found: Measured, changes: dict[str, Any], config: Config | None = None) -> np.ndarray:  # type: ignore[type-arg]
@@ -116,15 +116,15 @@ def test_what_may_not_change_is_missed() -> None:
 
 def test_optics_that_make_other_pictures_worse_are_refused() -> None:
     """Two thirds of the pictures are of another focus; control: they all are of that."""
-    sights, _, build = make_sights({"focus_nm": -340.0}, 18, seed=21)
-    of_configured, _, _ = make_sights({}, 18, seed=21)
-    order = sorted(range(18), key=lambda k: -sights[k].snr)
+    images, _, build = make_particle_images({"focus_nm": -340.0}, 18, seed=21)
+    of_configured, _, _ = make_particle_images({}, 18, seed=21)
+    order = sorted(range(18), key=lambda k: -images[k].snr)
     mixed = [
-        replace((of_configured if rank % 3 == 1 else sights)[k], snr=100.0 - rank)
+        replace((of_configured if rank % 3 == 1 else images)[k], snr=100.0 - rank)
         for rank, k in enumerate(order)
     ]
     configured, limits = settings_of(configuration()), optics_limits(1.515, 1.515)
-    for pictures, refused in ((mixed, True), (sights, False)):
+    for pictures, refused in ((mixed, True), (images, False)):
         found = OpticsSearch(configured, build, ("focus",), limits, side=-1).run(pictures)
         worse = "the configured optics describe pictures that were not fitted better"
         assert (worse in found.refusals) == refused
@@ -146,21 +146,21 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
 
 
 def test_too_few_particles_are_refused_with_what_to_record() -> None:
-    sights, _, _ = make_sights({}, 8, seed=17, masses_kda=(300.0,))
+    images, _, _ = make_particle_images({}, 8, seed=17, masses_kda=(300.0,))
     with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        fit_optics(Collected(configuration(), sights), ROUND, {"movie": "faint.tif"})
+        fit_optics(Collected(configuration(), images), ROUND, {"movie": "faint.tif"})
 
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
     config = configuration()
-    sights, _, build = make_sights({"na": 1.33}, 15, seed=19)
+    images, _, build = make_particle_images({"na": 1.33}, 15, seed=19)
     found = OpticsSearch(
         settings_of(config),
         build,
         ("focus", "na", "phase"),
         {**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
         side=-1,
-    ).run(sights)
+    ).run(images)
     assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
 
 
@@ -171,7 +171,7 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
     said, factor = configuration(), 1.06
     pixel = said.camera.pixel_size_nm
     assert pixel is not None
-    sights, _, _ = make_sights({}, 18, seed=20)
+    images, _, _ = make_particle_images({}, 18, seed=20)
     larger = said.model_copy(
         update={"camera": said.camera.model_copy(update={"pixel_size_nm": factor * pixel})}
     )
@@ -182,20 +182,20 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
             x_nm=factor * s.x_nm,
             y_nm=factor * s.y_nm,
         )
-        for s in sights
+        for s in images
     ]
     found = fit_optics(Collected(larger, stretched), ROUND, {"movie": "m.tif"})
     assert isinstance(found, OpticsCalibration)
     (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
     guess = float(note.partition("pixels of about ")[2].split()[0])
     assert guess == pytest.approx(pixel, rel=0.02)
-    fine = fit_optics(Collected(said, sights), ROUND, {"movie": "m.tif"})
+    fine = fit_optics(Collected(said, images), ROUND, {"movie": "m.tif"})
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 
 def test_what_the_pictures_do_not_tell_is_held() -> None:
     """Particles far below the noise do not tell an aperture to 0.05: it is named and held."""
-    _, truth, build = make_sights({}, 14, seed=18, photons=150.0)
+    _, truth, build = make_particle_images({}, 14, seed=18, photons=150.0)
     configured = settings_of(configuration())
     names = ("focus_nm", "na", "reference_phase_deg", "z11")
     rough = maximise(truth, build, configured, names, passes=1)
@@ -205,5 +205,5 @@ def test_what_the_pictures_do_not_tell_is_held() -> None:
     for name in held:
         assert found.values[name] == configured[name]
         assert name not in found.names
-    bright = maximise(make_sights({}, 14, seed=18)[1], build, configured, names, passes=1)
+    bright = maximise(make_particle_images({}, 14, seed=18)[1], build, configured, names, passes=1)
     assert not search._identified(bright)[1]

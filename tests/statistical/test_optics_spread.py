@@ -17,7 +17,7 @@ from iscat_analysis.optics.parameters import settings_of
 from iscat_analysis.records import FloatArray
 
 MOVIES = 30
-SIGHTS = 24
+IMAGES = 24
 PHOTONS = 4e6
 """Background photoelectrons per pixel, before and after."""
 
@@ -40,8 +40,8 @@ TRUE = {
 def _movie(pictures: Pictures, random: np.random.Generator) -> list[ParticleImage]:
     """Draw a movie's worth of pictures, made by the quadrature, which shares nothing."""
     model = build_microscope(configuration(), 2600.0, settings_of(configuration()))
-    sights = []
-    for _ in range(SIGHTS):
+    images = []
+    for _ in range(IMAGES):
         x, y = random.uniform(-42.0, 42.0, 2)
         contrast = pictures.contrast(
             (GRID.x_nm - x)[None, :], (GRID.y_nm - y)[:, None], float(random.choice(MASSES_KDA))
@@ -49,8 +49,8 @@ def _movie(pictures: Pictures, random: np.random.Generator) -> list[ParticleImag
         before = random.poisson(PHOTONS, GRID.shape).astype(float)
         after = random.poisson(PHOTONS * (1 + contrast)).astype(float)
         data = conditional(model, GRID, before, after, 1.0).data
-        sights.append(ParticleImage(GRID, CONDITIONAL, data, float(x), float(y), 5.0))
-    return sights
+        images.append(ParticleImage(GRID, CONDITIONAL, data, float(x), float(y), 5.0))
+    return images
 
 
 def _spreads(movies: int, seed: int) -> tuple[FloatArray, FloatArray]:

@@ -37,7 +37,7 @@ def picture(random: np.random.Generator, snr: float) -> tuple[FloatArray, ...]:
     return contrast, place, np.rint(place) + random.integers(-1, 2, 2)
 
 
-def sight(contrast: FloatArray, first: FloatArray) -> ParticleImage:
+def image(contrast: FloatArray, first: FloatArray) -> ParticleImage:
     data = np.zeros((4, SIDE, SIDE))
     data[0], data[2], data[3] = PHOTONS * (1 + contrast), 1.0, 1.0
     data[1] = PHOTONS + data[0]
@@ -52,7 +52,7 @@ def misplaced(seed: int, snr: float, number: int = 12) -> FloatArray:
     random = np.random.default_rng([31, seed])
     contrasts, places, first = zip(*(picture(random, snr) for _ in range(number)), strict=True)
     first = (places[0], *first[1:])
-    placed = average_particle_images([sight(c, f) for c, f in zip(contrasts, first, strict=True)])[
+    placed = average_particle_images([image(c, f) for c, f in zip(contrasts, first, strict=True)])[
         1
     ]
     found = np.array([[one.y_nm, one.x_nm] for one in placed]) / PIXEL_NM

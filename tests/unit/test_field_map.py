@@ -87,15 +87,15 @@ def test_the_learner_knows_how_pictures_change_with_a_coefficient() -> None:
     """The parameters of a picture, and their slopes, are those of its place and time."""
     settings = settings_of(_config())
     light = asimov_poisson(forward_model(_config(), REACH_NM), GRID, np.zeros(5), 1.0, 1.0)
-    sight = ParticleImage(
+    image = ParticleImage(
         GRID, light.noise, light.data, 0.0, 0.0, 5.0, focus_steps=0.3, place=(0.6, -0.4),
         after=(False, True),
     )  # fmt: skip
-    assert sight.spot == Spot(0.6, -0.4, 0.3, (False, True))
+    assert image.spot == Spot(0.6, -0.4, 0.3, (False, True))
     for name in (*FIELD, "focus_drift_nm", "focus_bend_nm", "focus_jump_2_nm"):
-        low, high = (sight.seen_with({**settings, name: size}) for size in (0.0, 2.0))
+        low, high = (image.seen_with({**settings, name: size}) for size in (0.0, 2.0))
         slopes = {k: (high[k] - low[k]) / 2 for k in low if isinstance(low[k], float)}
-        expected = {key: sight.slopes(name).get(key, 0.0) for key in slopes}
+        expected = {key: image.slopes(name).get(key, 0.0) for key in slopes}
         assert slopes == pytest.approx(expected)
         assert any(expected.values())
     assert set(FIELD) < set(WEIGHTS)

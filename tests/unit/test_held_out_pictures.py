@@ -19,15 +19,15 @@ from iscat_analysis.optics.parameters import Settings
 HEIGHTS_NM = (0.0, 1000.0)
 
 
-def _sights(count: int, mass_kda: float) -> tuple[ParticleImage, ...]:
+def _particle_images(count: int, mass_kda: float) -> tuple[ParticleImage, ...]:
     grid = PixelGrid.centred(5, 84.0)
     one = ParticleImage(grid, POISSON, np.ones((4, 5, 5)), 0.0, 0.0, 100.0, heights_nm=HEIGHTS_NM)
     return tuple(replace(one, mass_kda=mass_kda, z_nm=100.0 + 50 * k) for k in range(count))
 
 
-def _estimate(sights: Sequence[ParticleImage], values: Settings) -> Estimate:
+def _estimate(images: Sequence[ParticleImage], values: Settings) -> Estimate:
     return Estimate(
-        ("reference_phase_deg",), values, tuple(sights), np.eye(1), np.eye(1), 0.0, True, 1
+        ("reference_phase_deg",), values, tuple(images), np.eye(1), np.eye(1), 0.0, True, 1
     )
 
 
@@ -36,13 +36,13 @@ class _Moving(OpticsSearch):
 
     def _fit(
         self,
-        sights: Sequence[ParticleImage],
+        images: Sequence[ParticleImage],
         start: Settings,
         names: Sequence[str],
         passes: int = 40,
     ) -> Estimate:
         del passes
-        moved = [s.raised(200.0) for s in sights] if names else sights
+        moved = [s.raised(200.0) for s in images] if names else images
         return _estimate(moved, start)
 
 
@@ -55,23 +55,23 @@ def _search(kind: type[OpticsSearch] = OpticsSearch) -> OpticsSearch:
 @pytest.mark.parametrize(("mass", "phase"), [(-400.0, 173.0), (400.0, -7.0)])
 def test_pictures_that_judge_turn_with_the_phase(mass: float, phase: float) -> None:
     """A strong particle of free height stays where it is: χ² 1.07 became 2.05."""
-    best = _estimate(_sights(12, mass), {"reference_phase_deg": -7.0})
-    turned, judged = _search()._signed(best, _sights(6, mass))
+    best = _estimate(_particle_images(12, mass), {"reference_phase_deg": -7.0})
+    turned, judged = _search()._signed(best, _particle_images(6, mass))
     assert turned.values["reference_phase_deg"] == pytest.approx(phase)
-    assert {s.mass_kda for s in (*turned.sights, *judged)} == {400.0}
+    assert {s.mass_kda for s in (*turned.images, *judged)} == {400.0}
 
 
 def test_pictures_that_judge_follow_the_heights_of_the_others() -> None:
     """From where they were they would end in another fringe: χ² 1.05 became 3.9."""
-    sights = _sights(12, 400.0)
+    images = _particle_images(12, 400.0)
     search = _search(_Moving)
-    best, judged = search._of_known_kind(sights, search.configured)
-    assert len(best.sights) + len(judged) == len(sights)
-    assert [s.z_nm for s in judged] == [s.z_nm + 200.0 for s in sights[1::3]]
+    best, judged = search._of_known_kind(images, search.configured)
+    assert len(best.images) + len(judged) == len(images)
+    assert [s.z_nm for s in judged] == [s.z_nm + 200.0 for s in images[1::3]]
 
 
 def test_no_picture_leaves_the_heights_that_are_possible() -> None:
-    (sight,) = _sights(1, 400.0)
-    assert sight.raised(-300.0).z_nm == HEIGHTS_NM[0]
-    assert sight.raised(3000.0).z_nm == HEIGHTS_NM[1]
-    assert replace(sight, heights_nm=None).raised(50.0).z_nm == sight.z_nm
+    (image,) = _particle_images(1, 400.0)
+    assert image.raised(-300.0).z_nm == HEIGHTS_NM[0]
+    assert image.raised(3000.0).z_nm == HEIGHTS_NM[1]
+    assert replace(image, heights_nm=None).raised(50.0).z_nm == image.z_nm

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibrations import GRID, PHOTONS, configuration, make_sights, microscope
+from calibrations import GRID, PHOTONS, configuration, make_particle_images, microscope
 from scenes import PIXEL_NM, Stack, make_config
 from scipy.ndimage import gaussian_filter, shift
 
@@ -38,9 +38,9 @@ def _learn(
 ) -> tuple[bool, dict[str, Any], list[str]]:
     """Whether the configuration stayed, the summary, and what the user was told."""
     config = _config(calibrate)
-    sights, _, _ = make_sights(changes, count, seed=3)
+    images, _, _ = make_particle_images(changes, count, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: noise_differs)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
     learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
@@ -69,17 +69,17 @@ def test_places_on_a_ring_do_not_condemn_the_optics(y_nm: float) -> None:
     """Out of focus the brightest spot may be of a ring, in all pictures alike."""
     config = configuration(focus_nm=-450.0)
     for changes, fits in (({}, True), ({"focus_nm": -300.0}, False)):
-        sights, _, _ = make_sights(changes, 8, seed=5, config=config)
-        moved = [replace(sight, y_nm=sight.y_nm + y_nm) for sight in sights]
+        images, _, _ = make_particle_images(changes, 8, seed=5, config=config)
+        moved = [replace(image, y_nm=image.y_nm + y_nm) for image in images]
         assert (median_p(moved, config)[0] > REJECTED_P) == fits
 
 
 def test_a_place_far_from_the_centre_of_its_picture_stops_nothing() -> None:
     """A bright spot between two particles may be half a micron away from either."""
     config = configuration()
-    sights, _, _ = make_sights({}, 6, seed=5, config=config)
-    far = [replace(sight, x_nm=500.0, y_nm=-500.0) for sight in sights[:2]]
-    pairs, median = not_alone([*sights[2:], *far], config)
+    images, _, _ = make_particle_images({}, 6, seed=5, config=config)
+    far = [replace(image, x_nm=500.0, y_nm=-500.0) for image in images[:2]]
+    pairs, median = not_alone([*images[2:], *far], config)
     assert not pairs
     assert median > REJECTED_P
 
@@ -89,7 +89,7 @@ def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage
     config = configuration()
     model = microscope(config, changes)
     rng = np.random.default_rng(seed)
-    sights = []
+    images = []
     for _ in range(count):
         apart, angle = rng.uniform(300, 1000), rng.uniform(0, 2 * np.pi)
         first = model.image(GRID, 0.0, 0.0, 5.0, 2000.0)
@@ -97,10 +97,10 @@ def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage
         both = (1 + first) * (1 + model.image(GRID, x, y, 5.0, 2000.0))
         before, after = rng.poisson(PHOTONS, GRID.shape), rng.poisson(PHOTONS * both)
         data = conditional(model, GRID, before.astype(float), after.astype(float), 1.0).data
-        sights.append(
+        images.append(
             ParticleImage(GRID, CONDITIONAL, data, x / 2, y / 2, 5.0, mass_kda=0.0, snr=1e3)
         )
-    return sights
+    return images
 
 
 @pytest.mark.parametrize(("changes", "fits"), [({}, True), ({"z11": 25.0}, False)])
@@ -109,10 +109,10 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
 ) -> None:
     """Six of eleven bright places are two particles; control: optics that are wrong."""
     config = _config("auto")
-    singles, _, _ = make_sights(changes, 5, seed=3)
-    sights = [*_pairs(changes, 6, 4), *singles]
+    singles, _, _ = make_particle_images(changes, 5, seed=3)
+    images = [*_pairs(changes, 6, 4), *singles]
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     said: list[str] = []
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     learned, summary = learn_optics(MOVIE, config, camera, warn=said.append)
@@ -162,9 +162,9 @@ def test_a_phase_that_the_line_of_masses_turns_is_told(
     monkeypatch: pytest.MonkeyPatch, focus_nm: float
 ) -> None:
     """Beyond focus particles are bright; the control is on the configured side."""
-    sights, _, _ = make_sights({"focus_nm": focus_nm}, 16, seed=3)
+    images, _, _ = make_particle_images({"focus_nm": focus_nm}, 16, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     config = _config("auto").model_copy(
         update={"calibration": Calibration(gradient_per_kda=-3.1e-5)}
     )
@@ -262,9 +262,9 @@ def test_particles_at_heights_of_their_own_do_not_condemn_the_optics(
     """The test takes them for particles at particle.height_nm, which these modes do not."""
     config = _config("auto")
     free = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": mode})})
-    sights, _, _ = make_sights({"focus_nm": -450.0}, 8, seed=3)
+    images, _, _ = make_particle_images({"focus_nm": -450.0}, 8, seed=3)
     monkeypatch.setattr(learning, "noise_differs", lambda *_: False)
-    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (sights, []))
+    monkeypatch.setattr(learning, "bright_particle_images", lambda *_, **__: (images, []))
     camera = camera_from_config(config.camera, (64, 64), "uint16")
     said: list[str] = []
     assert learn_optics(MOVIE, free, camera, warn=said.append) == (free, {})

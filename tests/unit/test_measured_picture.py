@@ -83,23 +83,25 @@ def test_the_scattered_light_is_the_least_that_the_interference_allows() -> None
     assert np.all((exact[0] + exact[1]) / 2 >= light - 1e-6)
 
 
-def _sights(truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int) -> list[ParticleImage]:
+def _particle_images(
+    truth: ForwardModel, masses: np.ndarray[Any, Any], seed: int
+) -> list[ParticleImage]:
     rng = np.random.default_rng(seed)
-    sights = []
+    images = []
     for mass in masses:
         grid = PixelGrid.centred(19, PIXEL)
         x, y = rng.uniform(-50, 50, 2)
         signal = truth.amplitude_image(grid, x, y, truth.height_nm, float(mass))
         before, after = rng.poisson(LIGHT, grid.shape), rng.poisson(LIGHT * (1 + signal))
         data = conditional(truth, grid, before.astype(float), after.astype(float), 1.0)
-        sights.append(
+        images.append(
             ParticleImage(
                 grid=grid, noise=data.noise, data=data.data,
                 x_nm=float(x + rng.normal(0, 20)), y_nm=float(y + rng.normal(0, 20)),
                 z_nm=truth.height_nm, snr=20.0,
             )
         )  # fmt: skip
-    return sights
+    return images
 
 
 def test_a_template_describes_what_the_model_does_not() -> None:
@@ -108,26 +110,26 @@ def test_a_template_describes_what_the_model_does_not() -> None:
     rng = np.random.default_rng(5)
     size = 8e-3 / peak_per_amplitude(truth)
     masses = size * rng.choice([0.5, 1.0, 1.5], 44)
-    sights = place_particle_images(_sights(truth, masses, 6), nominal)
-    made, held = sights[:30], sights[30:]
+    images = place_particle_images(_particle_images(truth, masses, 6), nominal)
+    made, held = images[:30], images[30:]
     found = fit_picture(made, nominal, roi_nm=ROI, step_nm=_step(), level=False)
     assert found.template.sights == 30
     assert np.abs(found.template.contrast).max() == pytest.approx(1.0, abs=0.05)
     model = with_template(nominal, found.template)
-    judged = [fit_own(sight, model, level=False) for sight in held]
-    p_values = [goodness(sight, model)[1] for sight in judged]
+    judged = [fit_own(image, model, level=False) for image in held]
+    p_values = [goodness(image, model)[1] for image in judged]
     assert np.sum(np.array(p_values) < 1e-2) <= 2
     assert np.median(p_values) > 0.1
-    wrong = [goodness(fit_own(sight, nominal, level=False), nominal)[1] for sight in held]
+    wrong = [goodness(fit_own(image, nominal, level=False), nominal)[1] for image in held]
     assert np.median(wrong) < 1e-3
     # the strengths are right in proportion, with the error that the bound of the template says
     ratio, error = [], []
-    for sight, mass in zip(judged, masses[30:], strict=True):
-        theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, sight.mass_kda, sight.level])
-        likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
+    for image, mass in zip(judged, masses[30:], strict=True):
+        theta = np.array([image.x_nm, image.y_nm, image.z_nm, image.mass_kda, image.level])
+        likelihood = Likelihood(model, image.grid, image.noise, image.data)
         bounds = event_bounds(likelihood, theta, ("x_nm", "y_nm", "mass_kda"), float("nan"))
         assert np.all(np.isnan(bounds.qcrb))
-        ratio.append(sight.mass_kda / mass)
+        ratio.append(image.mass_kda / mass)
         error.append(bounds.crb_joint[3] / mass)
     weight = 1 / np.square(error)
     scale = np.average(ratio, weights=weight)

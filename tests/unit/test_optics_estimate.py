@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calibrations import GRID, configuration, make_sights, microscope
+from calibrations import GRID, configuration, make_particle_images, microscope
 
 from iscat_analysis.config import config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
@@ -52,27 +52,27 @@ def test_pixel_terms_are_derivatives(noise: NoiseModel) -> None:
 
 
 def test_value_is_that_of_the_likelihood_of_fits() -> None:
-    sights, _, build = make_sights({}, 2, seed=4)
+    images, _, build = make_particle_images({}, 2, seed=4)
     settings = settings_of(configuration())
     model = build(settings)
-    for sight in sights:
-        likelihood = Likelihood(model, sight.grid, sight.noise, sight.data)
-        theta = np.array([sight.x_nm, sight.y_nm, sight.z_nm, 5000.0, 0.01])
-        place = (sight.grid, sight.x_nm, sight.y_nm, sight.z_nm, 5000.0)
-        mine = sight.noise.terms(sight.data, model.gradient(*place)[0], 0.01)[0]
+    for image in images:
+        likelihood = Likelihood(model, image.grid, image.noise, image.data)
+        theta = np.array([image.x_nm, image.y_nm, image.z_nm, 5000.0, 0.01])
+        place = (image.grid, image.x_nm, image.y_nm, image.z_nm, 5000.0)
+        mine = image.noise.terms(image.data, model.gradient(*place)[0], 0.01)[0]
         assert mine == pytest.approx(likelihood.values(theta[None])[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("heights_nm", [None, (0.0, 200.0)])
 def test_private_unknowns_are_eliminated_exactly(heights_nm: tuple[float, float] | None) -> None:
     """The reduced information is the inverse of the shared block of the whole inverse."""
-    sights, _, build = make_sights({"z11": 8.0}, 3, seed=5)
-    sights = [replace(sight, heights_nm=heights_nm) for sight in sights]
+    images, _, build = make_particle_images({"z11": 8.0}, 3, seed=5)
+    images = [replace(image, heights_nm=heights_nm) for image in images]
     settings = settings_of(configuration())
-    private = np.array([sight.private for sight in sights])
+    private = np.array([image.private for image in images])
     private[:, 3] = 6000.0
-    at = _Point.evaluate(sights, build, settings, NAMES, private, _walls(sights), map)
-    k, n = len(NAMES), len(sights)
+    at = _Point.evaluate(images, build, settings, NAMES, private, _walls(images), map)
+    k, n = len(NAMES), len(images)
     whole = np.zeros((k + PRIVATE * n, k + PRIVATE * n))
     whole[:k, :k] = at.fisher[:, :k, :k].sum(axis=0)
     for e in range(n):
@@ -87,14 +87,14 @@ def test_private_unknowns_are_eliminated_exactly(heights_nm: tuple[float, float]
 
 
 def test_score_is_the_slope_of_the_joint_likelihood() -> None:
-    sights, _, build = make_sights({"z11": 8.0}, 2, seed=6)
+    images, _, build = make_particle_images({"z11": 8.0}, 2, seed=6)
     settings = {**settings_of(configuration()), "z7": 3.0}
-    private = np.array([sight.private for sight in sights])
+    private = np.array([image.private for image in images])
     private[:, 3] = 6000.0
 
     def at(name: str, change: float) -> _Point:
         moved = {**settings, name: settings[name] + change}
-        return _Point.evaluate(sights, build, moved, NAMES, private, _walls(sights), map)
+        return _Point.evaluate(images, build, moved, NAMES, private, _walls(images), map)
 
     middle = at("z7", 0.0)
     for index, name in enumerate(NAMES):
@@ -105,7 +105,7 @@ def test_score_is_the_slope_of_the_joint_likelihood() -> None:
 
 def test_a_particle_beyond_its_wall_does_not_keep_the_others_from_converging() -> None:
     """Held where its wall is, it counts as known; what it still wants is no gain to wait for."""
-    _, truth, build = make_sights({"z11": 8.0}, 6, seed=10)
+    _, truth, build = make_particle_images({"z11": 8.0}, 6, seed=10)
     lost = truth[0]
     cut = 12  # columns: the particle stands six pixels, 500 nm, left of the new centre
     grid = PixelGrid(lost.grid.x_nm[cut:], lost.grid.y_nm, lost.grid.pixel_nm)
@@ -114,14 +114,14 @@ def test_a_particle_beyond_its_wall_does_not_keep_the_others_from_converging() -
     found = maximise([lost, *truth[1:]], build, start, NAMES)
     wall = grid.x_nm.mean() - 300.0
     assert lost.x_nm < wall - 100.0  # the trap is set
-    assert found.sights[0].x_nm == pytest.approx(wall)
+    assert found.images[0].x_nm == pytest.approx(wall)
     assert found.converged
     assert found.values["z11"] == pytest.approx(8.0, abs=4 * found.bound[4, 4] ** 0.5)
 
 
 def test_the_average_of_shifted_pictures() -> None:
-    sights, truth, _ = make_sights({}, 6, seed=7)
-    jolted = [replace(s, x_nm=s.x_nm + 90.0, y_nm=s.y_nm - 60.0) for s in sights]
+    images, truth, _ = make_particle_images({}, 6, seed=7)
+    jolted = [replace(s, x_nm=s.x_nm + 90.0, y_nm=s.y_nm - 60.0) for s in images]
     (average,), placed = average_particle_images(jolted)
     assert average.grid.shape == GRID.shape
     found = np.array([(s.x_nm, s.y_nm) for s in placed])
@@ -132,8 +132,10 @@ def test_the_average_of_shifted_pictures() -> None:
 
 def test_every_focus_is_tried() -> None:
     """A start 600 nm from the truth is not needed: the coarse search finds its neighbourhood."""
-    sights, _, build = make_sights({"focus_nm": 310.0, "reference_phase_deg": 40.0}, 6, seed=8)
-    averages, _ = average_particle_images(sights)
+    images, _, build = make_particle_images(
+        {"focus_nm": 310.0, "reference_phase_deg": 40.0}, 6, seed=8
+    )
+    averages, _ = average_particle_images(images)
     now = settings_of(configuration())
     candidates = [{**now, "focus_nm": f} for f in np.arange(-1000.0, 1000.0, 80.0)]
     best = search_starts(averages, build, candidates, most=2)[0]
@@ -164,9 +166,9 @@ def _values(config):  # type: ignore[no-untyped-def]
 
 def test_limits_hold() -> None:
     """Pictures of a wider aperture than the limit allows end at it, not beyond."""
-    sights, truth, build = make_sights({"na": 1.44}, 4, seed=9)
+    images, truth, build = make_particle_images({"na": 1.44}, 4, seed=9)
     limits = {**optics_limits(1.515, 1.515), "na": (1.3, 1.43)}
     found = maximise(truth, build, settings_of(configuration()), ("na",), limits=limits, passes=15)
     assert found.values["na"] == 1.43
-    assert isinstance(sights[0], ParticleImage)
+    assert isinstance(images[0], ParticleImage)
     assert microscope(configuration(), {}) is not None
