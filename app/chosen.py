@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 import panel as pn
 import param
 
-from iscat_analysis.errors import IscatError
+from iscat_analysis.errors import DataError, IscatError
 from iscat_analysis.movie.addresses import path_beside, setup_beside
 
 T = TypeVar("T")
@@ -112,6 +112,14 @@ class Notice:
             except Exception as error:
                 self.say(f"{type(error).__name__}: {error}", "error")
                 raise
+
+
+def masses_in(text: str) -> list[float]:
+    """Read masses that somebody wrote, as in 66, 146."""
+    try:
+        return [float(part) for part in text.replace(";", ",").split(",") if part.strip()]
+    except ValueError:
+        raise DataError(f"{text}: write masses in kDa, as in 66, 146") from None
 
 
 def in_line(*parts: Any) -> pn.FlexBox:
