@@ -286,7 +286,7 @@ class Film:
 
     def _shown_by_player(self, frame: int) -> None:
         self._by_player = True
-        self.frame.value = self._at = frame
+        self.frame.value = self._at = self._chosen.view = frame
         self._by_player = False
 
     def _browser_has_drawn(self, attr: str, old: Any, new: Any) -> None:
@@ -296,7 +296,7 @@ class Film:
 
     def _frame_moved(self, _: Any) -> None:
         if not self._by_player:
-            self._at = self.frame.value
+            self._at = self._chosen.view = self.frame.value
             self._next = float(self._at)
             self._show()
             if self.search.value:

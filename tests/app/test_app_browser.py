@@ -165,6 +165,12 @@ def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> Non
 
     page.open("Set up")
     page.says("camera.pixel_size_nm [nm]")
+    page.type("optics.na", "-1")
+    page.says("input should be greater than 0")
+    page.type("optics.na", "1.42")
+    page.until("all is well again", lambda: "greater than 0" not in page.text())
+    page.click("Show what the search finds with these values", ".bk-label")
+    page.says("times the noise, in frames")
     page.click("Save iscat.toml")
     page.says("saved as")
     assert ia.load_config(folder / "iscat.toml").background.window_frames == 20

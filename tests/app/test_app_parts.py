@@ -124,6 +124,19 @@ def test_frames_that_are_left_out_add_up_in_the_form(tmp_path: Path) -> None:
     assert ia.load_config(tmp_path / "iscat.toml").fit.excluded_frames == ((5, 9), (20, 40))
 
 
+def test_what_is_wrong_stands_below_its_field(tmp_path: Path) -> None:
+    chosen = Chosen()
+    chosen.choose(tmp_path / "movie.tif")
+    form = Form(chosen)
+    form.refresh()
+    form._widgets["optics.na"].value = "-1"
+    shown = {key for key, wrong in form._warned.items() if wrong.visible}
+    assert shown == {"optics.na"}
+    assert "greater than 0" in form._warned["optics.na"].object
+    form._widgets["optics.na"].value = "1.3"
+    assert not any(wrong.visible for wrong in form._warned.values())
+
+
 @pytest.fixture
 def standards(tmp_path: Path) -> Path:
     """Make a result whose peaks lie at 66, 132 and 264 kDa."""
