@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import panel as pn
 from bokeh.events import DoubleTap, Tap
-from bokeh.models import ColumnDataSource, Whisker
+from bokeh.models import ColumnDataSource, Range1d, Whisker
 from bokeh.plotting import figure
 
 from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
@@ -82,14 +82,13 @@ class Calibrate:
         plot.scatter("mass", "contrast", source=self._points, size=9, color="#0072B2")
         plot.add_layout(Whisker(base="mass", lower="low", upper="high", source=self._points))
         peaks = figure(width=520, height=300, x_axis_label="|contrast| [%]", y_axis_label="events",
-                       tools="xwheel_zoom,xpan,reset,tap")  # fmt: skip
+                       tools="xwheel_zoom,xpan,reset,tap", y_range=Range1d(0, 1))  # fmt: skip
         peaks.quad(left="left", right="right", top="top", bottom=0, source=self._bars,
                    color="#8A8F96", line_color="white", nonselection_alpha=1)  # fmt: skip
         peaks.scatter("x", "y", source=self._marks, marker="inverted_triangle", size=12,
                       color="colour", nonselection_alpha=1)  # fmt: skip
         peaks.text("x", "y", text="text", source=self._marks, text_align="center", y_offset=-10,
                    text_font_size="12px", text_color="colour", nonselection_alpha=1)  # fmt: skip
-        peaks.y_range.start = 0
         for kind in (Tap, DoubleTap):  # of two clicks that are fast the second is the latter
             peaks.on_event(kind, lambda event: self._clicked(event.x))
         plot.toolbar.logo = peaks.toolbar.logo = None
@@ -177,7 +176,8 @@ class Calibrate:
             options={text: k for k, text in enumerate(texts)},
             value=0 if texts and peak is None else peak,
         )
-        self._histogram.y_range.end = 1.3 * max(top.max(initial=0.0), 1.0)
+        end = 1.3 * max(top.max(initial=0.0), 1.0)
+        self._histogram.y_range.update(end=end, reset_end=end)
 
     # ---- calibrations -----------------------------------------------------------------------
 

@@ -453,7 +453,8 @@ class Film:
         self._band.update(left=first, right=stop if some else first)
 
     def _span(self) -> tuple[int, int]:
-        return self.first.value, self.last.value + 1
+        first, last = self.first.value, self.last.value  # None where the field is empty
+        return first or 0, (self.frame.end if last is None else last) + 1
 
     def _exclude(self, _: Any) -> None:
         first, stop = self._chosen.excluded = self._span()

@@ -122,7 +122,10 @@ class Form:
                     width=480,
                 ),
                 pn.Column("### Everything else", self._rest, width=520),
-                pn.Column(self._preview.body, "### The file", self._written, width=420),
+                pn.Column(
+                    self._preview.body, "### The file", self._written, width=420,
+                    margin=(0, 0, 0, 12),
+                ),
             ),
         )  # fmt: skip
 

@@ -164,8 +164,8 @@ class Results:
         self._handles.on_change("data", self._write_means)
         self.find.on_click(lambda _: self._find_species(None))
         self.refit.on_click(lambda _: self._find_species(self._means()))
-        add.on_click(lambda _: self._add_gate(self.low.value, self.high.value))
-        pick.on_click(lambda _: self._select(self.low.value, self.high.value))
+        add.on_click(lambda _: self._add_gate(*self._ends()))
+        pick.on_click(lambda _: self._select(*self._ends()))
         drop.on_click(lambda _: self._set_gates([]))
         reject.on_click(self._reject)
         back.on_click(self._take_back)
@@ -267,6 +267,9 @@ class Results:
     def _dragged(self, event: SelectionGeometry) -> None:
         if event.final and event.geometry.get("type") == "rect":
             self._add_gate(event.geometry["x0"], event.geometry["x1"])
+
+    def _ends(self) -> tuple[float, float]:
+        return self.low.value or 0.0, self.high.value or 0.0  # None where the field is empty
 
     def _add_gate(self, low: float, high: float) -> None:
         low, high = sorted((max(round(low, 1), 0.0), round(high, 1)))

@@ -169,7 +169,7 @@ def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> Non
     page.says("input should be greater than 0")
     page.type("optics.na", "1.42")
     page.until("all is well again", lambda: "greater than 0" not in page.text())
-    page.click("Show what the search finds with these values", ".bk-label")
+    page.tick("Show what the search finds with these values")
     page.says("times the noise, in frames")
     page.click("Save iscat.toml")
     page.says("saved as")
