@@ -14,6 +14,9 @@ import iscat_analysis as ia
 GRADIENT = -3.1e-5
 """Contrast per kDa."""
 
+SERIES_NM = (3.0, 10.0, 30.0)
+"""Concentrations of a protein whose dimers have K_D = 10 nM."""
+
 
 def result_of(folder: Path, masses: NDArray[np.float64], sigma_kda: float) -> Path:
     """Write a folder as an analysis would, with events of these masses that all are ok."""
