@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cmath
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -395,6 +396,13 @@ class Particle(Section):
     def nominal_diameter_nm(self) -> float:
         """Diameter of a sphere of the nominal mass [nm]."""
         return sphere_diameter_nm(self.nominal_mass_kda, self.density)
+
+    @property
+    def given_index(self) -> complex | None:
+        """Refractive index that is given, else None: that of the kind depends on the wavelength."""
+        if self.permittivity is not None:
+            return cmath.sqrt(complex(*self.permittivity))
+        return None if self.index is None else complex(self.index)
 
     @property
     def is_sphere(self) -> bool:

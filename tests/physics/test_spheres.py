@@ -272,6 +272,10 @@ BAD = [
     ({"particle": {"diameter_nm": 5000.0}}, "larger than the square"),
     ({"particle": {"height_nm": 20.0}}, "reach into the coverslip"),
     ({"particle": {"kind": "custom", "index": 1.33, "density_kg_m3": 1000.0}}, "scatters no light"),
+    ({"particle": {"kind": "custom", "permittivity": [1.33**2, 0.0], "density_kg_m3": 1000.0}},
+     "scatters no light"),
+    ({"particle": {"model": "shell", "kind": "custom", "index": 1.33, "shell_nm": 5.0,
+                   "shell_index": 1.33, "density_kg_m3": 1000.0}}, "scatters no light"),
     ({"particle": {"model": "shell", "shell_nm": 90.0, "shell_index": 1.48,
                    "density_kg_m3": 1000.0}}, "more than the radius"),
     ({"particle": {"model": "shell", "shell_nm": 5.0}}, "needs shell_index"),
@@ -289,6 +293,17 @@ def test_what_cannot_be_is_said(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(Exception, match=message) as caught:
         of("iscat", **changes)
     assert type(caught.value).__name__ == "ConfigError"
+
+
+def test_a_part_that_is_seen_is_enough() -> None:
+    """A shell of the sample's index around silica, and a vesicle full of the sample, are seen."""
+    shell = {"model": "shell", "shell_nm": 5.0, "density_kg_m3": 1500.0}
+    for more in (
+        {"kind": "silica", "shell_index": 1.33},
+        {"kind": "custom", "index": 1.33, "shell_index": 1.46},
+        {"kind": "custom", "permittivity": [1.33**2, 0.1], "shell_index": 1.33},
+    ):
+        assert of("iscat", particle=shell | more).particle.is_sphere
 
 
 def test_a_bubble_has_the_other_sign() -> None:
