@@ -197,9 +197,22 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
 
 
 def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
-    """Give the same share of all masses."""
-    del config
-    return {"mass_kda": share * np.abs(table["mass_kda"].to_numpy(float))}
+    """Give what contrasts that are all wrong by a share do to masses.
+
+    Masses of dipoles are wrong by that share.  The contrast of a sphere is not in proportion to its
+    mass, and its picture changes with it.
+    """
+    mass = np.abs(table["mass_kda"].to_numpy(float))
+    if config.fit.mode != "size" or not share:
+        return {"mass_kda": share * mass}
+    known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
+    if not known.any():
+        return {}
+    respond = response_of(config, table, ())
+    places = table.loc[known, ["z_nm", "mass_kda"]].to_numpy(float).tolist()
+    out = np.full(mass.size, np.nan)
+    out[known] = [abs(share * respond.to_contrast(z, kda)) * kda for z, kda in places]
+    return {"mass_kda": out}
 
 
 def _of_the_selection(
