@@ -26,7 +26,7 @@ from iscat_analysis.records import (
     with_diameters,
 )
 from iscat_analysis.tracking.tracked_optics import mass_error
-from iscat_analysis.trust.budget import budget_of
+from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
@@ -97,10 +97,9 @@ def reported_rows(
     table = make_rows(fits, columns)
     if mode == "size":
         table = with_diameters(table, config.particle.density)
+    unknown = SPHERES if mode == "size" else SCALE if config.calibration is None else None
     budget = budget_of(
-        table, shared, achieved,
-        calibrated=config.calibration is not None or mode == "size",
-        scaled=config.fit.sigma == "measured",
+        table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
