@@ -16,7 +16,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.height_spread import spread_of_heights
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.nuisances import Evidence, evidence_of
-from iscat_analysis.inference.split_frames import Series, repeats_of
+from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
 from iscat_analysis.search.sliding import Patch, locate_step
@@ -187,7 +187,7 @@ def breathing(
             for side in noise
         )
         repeats.append(repeats_of(tuple(sides)))
-    own = np.stack(repeats)[:, :, [2, -1]]
+    own = np.stack(repeats)[:, :BLOCK_ROWS, [2, -1]]
     tiles = np.full((5, 40), 400.0)
     achieved = {"mass_kda": pooled(own, tiles.copy(), tiles)}
     table = rows(len(masses)).assign(mass_kda=masses)
