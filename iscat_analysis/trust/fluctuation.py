@@ -35,11 +35,12 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, MODES, spectra_of
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 
-_PRIOR = 0.02  # probability that a movie fluctuates, before its frames are looked at
-_ALONE = 0.1  # probability that an event changes on its own
-_SEEN = 0.8  # probability from which it is told; by chance in fewer than 1 of 100 steady movies
-_RELATIVE = np.geomspace(0.01, 0.3, 18)
-_CORRELATIONS = np.geomspace(2.0, 300.0, 16)  # frames
+_PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
+_ALONE = 0.05  # probability that an event changes on its own
+_SEEN = 0.7  # probability from which it is told; one event alone gives no more than 0.69
+_RELATIVE = np.geomspace(0.01, 0.3, 60)
+_CORRELATIONS = np.geomspace(2.0, 600.0, 18)  # frames
+_SLOWEST = 2.0  # correlation time over a window; what is slower is a course, not a fluctuation
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})
 
 
@@ -92,8 +93,7 @@ class Fluctuation:
         own = spectra[np.arange(len(spectra)), (mass[good] > 0).astype(int)]
         squares, counts = own[:, :, FREE_PARAMETERS[mode].index("mass_kda")], own[:, :, -1]
         window = float(np.median(there[good]))
-        # what is slower than a window is a course, and not a fluctuation
-        taus = _CORRELATIONS[_CORRELATIONS <= max(window, _CORRELATIONS[0])]
+        taus = _CORRELATIONS[max(_SLOWEST * window, _CORRELATIONS[0]) >= _CORRELATIONS]
         evidence = _Evidence.of(squares, counts, (mass**2 / one)[good], taus, pooled, window)
         posterior = evidence.posterior
         variance = _RELATIVE[:, None] ** 2
@@ -103,9 +103,10 @@ class Fluctuation:
             return None
         given = posterior / posterior.sum()
         mean = float(np.sum(given * _RELATIVE[:, None]))
-        error = math.sqrt(float(np.sum(given * variance)) - mean**2)
+        step = mean * math.log(_RELATIVE[1] / _RELATIVE[0])
+        error = math.sqrt(max(float(np.sum(given * variance)) - mean**2, 0.0) + step**2 / 12)
         tau = math.exp(float(np.sum(given * np.log(taus))))
-        return cls(float(posterior.sum()), mean, error, tau, np.nan_to_num(added))
+        return cls(min(float(posterior.sum()), 1.0), mean, error, tau, np.nan_to_num(added))
 
     @property
     def is_seen(self) -> bool:
