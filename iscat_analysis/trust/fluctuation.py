@@ -33,7 +33,7 @@ from scipy.special import logsumexp
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, MODES, spectra_of
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
 _ALONE = 0.05  # probability that an event changes on its own
@@ -75,8 +75,15 @@ class Fluctuation:
         table: pd.DataFrame,
         repeats: Sequence[FloatArray],
         achieved: Mapping[str, EmpiricalSpread],
+        shared_place: BoolArray,
     ) -> Fluctuation | None:
-        """Look for it in the frames of all events; None where the frames speak against it."""
+        """Look for it in the frames of all events; None where the frames speak against it.
+
+        A small step at the place of another particle shows the fluctuation of that one, too large
+        for the mass of its own, and is left out.
+
+        Shapes: `shared_place` (events,).
+        """
         pooled = achieved.get("mass_kda")
         if mode != "mass" or pooled is None or pooled.single or len(pooled.empty) < 2:
             return None
@@ -86,7 +93,7 @@ class Fluctuation:
         one = crb**2 * before * after / (before + after)  # variance of a single frame
         marks = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
-        good &= np.isfinite(mass**2 / one)
+        good &= np.isfinite(mass**2 / one) & ~shared_place
         if not good.any() or repeats[0].shape[0] == BLOCK_ROWS:
             return None
         spectra = spectra_of(np.stack(repeats)[good])

@@ -190,8 +190,8 @@ def breathing(
     own = np.stack(repeats)[:, :BLOCK_ROWS, [2, -1]]
     tiles = np.full((5, 40), 400.0)
     achieved = {"mass_kda": pooled(own, tiles.copy(), tiles)}
-    table = rows(len(masses)).assign(mass_kda=masses)
-    return Fluctuation.of("mass", table, repeats, achieved), np.array(errors)
+    table, alone = rows(len(masses)).assign(mass_kda=masses), np.zeros(len(masses), dtype=bool)
+    return Fluctuation.of("mass", table, repeats, achieved, alone), np.array(errors)
 
 
 @pytest.mark.parametrize(("relative", "tau"), [(0.05, 20.0), (0.1, 5.0)])
