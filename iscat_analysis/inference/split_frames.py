@@ -17,6 +17,7 @@ noise is white; the first, the mean, is left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,7 +175,7 @@ def _spectrum(series: Series) -> FloatArray:
     value = series.values / power
     mean = np.sum(weight * value, axis=1) / np.sum(weight, axis=1)
     squares = dct((value - mean[:, None]) * np.sqrt(weight), axis=1, norm="ortho") ** 2
-    for b, (first, stop) in enumerate(zip(MODES[:-1], MODES[1:], strict=True)):
+    for b, (first, stop) in enumerate(pairwise(MODES)):
         part = squares[:, first:stop]
         out[b, :-1], out[b, -1] = part.sum(axis=1), part.shape[1]
     return out

@@ -107,9 +107,7 @@ def reported_rows(
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_changing(
-    fits: pd.DataFrame, evidence: Evidence | None
-) -> tuple[pd.DataFrame, str]:
+def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
     if evidence is None:
         return fits, ""

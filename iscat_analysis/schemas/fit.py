@@ -448,7 +448,9 @@ class Summary(Document):
     )
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
     extension: Extension = maybe("Mode mass: width of the images beyond that of the model")
-    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, if the frames speak for one")
+    fluctuation: Fluctuation = maybe(
+        "Mode mass: slow fluctuation of contrasts, if the frames speak for one"
+    )
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
         "If rows, columns or a smooth part of the light changed, and were corrected"

@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
@@ -101,11 +102,14 @@ class Fluctuation:
         squares, counts = own[:, :, FREE_PARAMETERS[mode].index("mass_kda")], own[:, :, -1]
         window = float(np.median(there[good]))
         taus = _CORRELATIONS[max(_SLOWEST * window, _CORRELATIONS[0]) >= _CORRELATIONS]
-        evidence = _Evidence.of(squares, counts, (mass**2 / one)[good], taus, pooled, window)
+        evidence = _Evidence.of(
+            squares, counts, there[good], (mass**2 / one)[good], taus, pooled, window
+        )
         posterior = evidence.posterior
         variance = _RELATIVE[:, None] ** 2
-        left = np.stack([[_of_mean(int(n), tau) for tau in taus] for n in there])
-        added = mass**2 * np.einsum("st,nt->n", posterior * variance, left)
+        numbers, which = np.unique(there.astype(np.int64), return_inverse=True)
+        left = np.array([[_of_mean(n, tau) for tau in taus] for n in numbers.tolist()])
+        added = mass**2 * (left @ np.sum(posterior * variance, axis=0))[which]
         if evidence.factor <= 1:
             return None
         given = posterior / posterior.sum()
@@ -154,6 +158,7 @@ class _Evidence:
         cls,
         squares: FloatArray,
         counts: FloatArray,
+        there: FloatArray,
         strength: FloatArray,
         taus: FloatArray,
         pooled: EmpiricalSpread,
@@ -161,15 +166,18 @@ class _Evidence:
     ) -> _Evidence:
         """Compare the spectra with the noise and with every fluctuation.
 
-        Shapes: `squares, counts` (events, bins), `strength` (events,), `taus` (τ,).
+        Shapes: `squares, counts` (events, bins), `there, strength` (events,), `taus` (τ,).
         """
         total = np.zeros((_RELATIVE.size, taus.size))
-        for square, count, snr2 in zip(squares, counts, strength.tolist(), strict=True):
-            frames = int(count.sum()) + 1
+        expected: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
+        for square, count, n, snr2 in zip(squares, counts, there, strength, strict=True):
             held = count > 0
             if not held.any():
                 continue
-            noise, shape = _expected(frames, int(held.sum()), taus, pooled, window)
+            key = max(int(count.sum()) + 1, int(n)), int(held.sum())
+            if key not in expected:
+                expected[key] = _expected(*key, taus, pooled, window)
+            noise, shape = expected[key]
             signal = snr2 * _RELATIVE[:, None, None] ** 2 * shape / noise
             gain = square[held] / noise * signal / (1 + signal) - count[held] * np.log1p(signal)
             ratio = 0.5 * gain.sum(axis=2)
@@ -210,7 +218,7 @@ def _expected(
     return np.add.reduceat(noise, starts) / held, np.add.reduceat(shape, starts, axis=1) / held
 
 
-def _components(modes: FloatArray, frames: int, tau: float) -> FloatArray:
+def _components(modes: NDArray[np.int64], frames: int, tau: float) -> FloatArray:
     """Variance of cosine components of a process of unit variance and correlation exp(−t/τ).
 
     Two such cosines that are k frames apart have the product ((n − k) cos kθ − sin kθ / sin θ) / n,
