@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.inference.split_frames import BLOCK_ROWS, MODES, spectra_of
+from iscat_analysis.inference.split_frames import MODES, spectra_of
 from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
@@ -95,7 +95,7 @@ class Fluctuation:
         marks = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         good &= np.isfinite(mass**2 / one) & ~shared_place
-        if not good.any() or repeats[0].shape[0] == BLOCK_ROWS:
+        if not good.any():
             return None
         spectra = spectra_of(np.stack(repeats)[good])
         own = spectra[np.arange(len(spectra)), (mass[good] > 0).astype(int)]
