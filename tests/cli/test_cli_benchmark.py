@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("sketched")
 SMALL = ["--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]", "--no-posterior"]
 
 
-@pytest.mark.parametrize("scheme", ["iscat", "darkfield"])
+@pytest.mark.parametrize("scheme", ["iscat", pytest.param("darkfield", marks=pytest.mark.large)])
 def test_benchmark(
     scheme: str, sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

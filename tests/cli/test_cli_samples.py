@@ -111,6 +111,7 @@ def test_the_folder_is_complete(mode: str, fitted) -> None:
     json.loads((fitted[mode] / "summary.json").read_text(), parse_constant=pytest.fail)
 
 
+@pytest.mark.large
 def test_the_written_configuration_reruns_the_job(fitted, movies, tmp_path, capsys) -> None:
     written = fitted["mass"] / "config.toml"
     assert tomllib.loads(written.read_text())["fit"]["mode"] == "mass"

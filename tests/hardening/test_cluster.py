@@ -213,6 +213,7 @@ def test_tiles_of_a_field_give_the_same_bytes(
     assert _content(tmp_path / "far.iscat") == _content(tmp_path / "here.iscat")
 
 
+@pytest.mark.large
 def test_an_interrupt_keeps_finished_chunks_and_leaves_the_cluster_alive(
     cluster: Workers, landing: Path, here: Path, tmp_path: Path
 ) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pandas as pd
+import pytest
 from event_tables import draw_table
 from numpy.typing import NDArray
 from scipy.stats import kstest
@@ -41,6 +42,7 @@ def p_of(found: Comparison) -> list[float]:
     return [test.p_value for test in (found.same, found.same_masses, found.same_fractions)]
 
 
+@pytest.mark.large
 def test_equal_samples_differ_as_often_as_they_should(
     repetitions: Callable[[int, int], int],
 ) -> None:

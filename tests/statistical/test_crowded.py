@@ -178,7 +178,8 @@ def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPat
     assert sum(not e.flags for e in found) < 50
 
 
-@pytest.mark.parametrize("nm", [-12.0, pytest.param(8.0, marks=pytest.mark.large)])
+@pytest.mark.large
+@pytest.mark.parametrize("nm", [-12.0, 8.0])
 def test_nothing_is_found_together_in_what_a_wrong_model_leaves_over(
     nm: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -62,12 +62,10 @@ def _index() -> complex:
     return complex(np.interp(525.0, wavelengths, n), np.interp(525.0, wavelengths, k))
 
 
-SCANS = [
-    (1, 1.0),
-    *(pytest.param(seed, dim, marks=pytest.mark.large) for seed in (2, 3, 4) for dim in (1.0, 0.2)),
-]
+SCANS = [(1, 1.0), *((seed, dim) for seed in (2, 3, 4) for dim in (1.0, 0.2))]
 
 
+@pytest.mark.large
 @pytest.mark.parametrize(("seed", "attenuation"), SCANS)
 def test_a_scan_of_gold_tells_steps_and_aberrations(seed: int, attenuation: float) -> None:
     instrument, found = _scan(seed, attenuation)

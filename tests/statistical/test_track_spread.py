@@ -135,6 +135,7 @@ def _flicker(pink: float) -> tuple[float, float]:
     return np.sqrt(1 + excess * LEVEL_E / (1 + 1 / BEFORE)), np.sqrt(1 + jump * LEVEL_E)
 
 
+@pytest.mark.large
 def test_frames_without_particles_tell_the_noise_of_tracks() -> None:
     """The interval holds 1 where the noise is as expected, and √1.5 where it is 1.5 times that."""
     clean, noisy = (_run(kind, 1, frames=FEW_FRAMES) for kind in ("clean", "excess"))

@@ -206,6 +206,7 @@ def test_study_has_the_promised_fields(study: dict[str, dict[str, object]]) -> N
             assert set(entry[name]) >= FIELDS
 
 
+@pytest.mark.large
 def test_study_repeats_itself_with_any_number_of_workers(study: dict[str, object]) -> None:
     again = run_benchmark(configuration(**SMALL), trials=20, seed=3, workers=1, posterior=False)
     for mode in ("mass", "localize", "joint"):

@@ -73,6 +73,7 @@ def test_the_movie_tells_a_focus_that_gives_no_contrast(flat: Path, focus_nm: fl
     assert np.abs(pulls).max() < 4.0
 
 
+@pytest.mark.large
 def test_heights_of_their_own_tell_the_focus_too(tmp_path: Path) -> None:
     movie = _movie(tmp_path / "movie.tif", heights=HEIGHTS, **{"optics.focus_nm": -500.0}, **JOINT)
     result = ia.fit_movie(movie, config={**SETUP, **JOINT, "optics.focus_nm": -10.0})

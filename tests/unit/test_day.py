@@ -503,6 +503,7 @@ def test_the_day_is_calibrated_before_its_samples(day: Path) -> None:
     assert (np.abs(fits["mass_kda"] - [900.0, 1500.0]) < 5 * error).all()
 
 
+@pytest.mark.large
 def test_a_changed_calibrant_analyses_what_depends_on_it(day: Path, tmp_path: Path) -> None:
     lab = tmp_path / "day"
     shutil.copytree(day, lab)

@@ -76,7 +76,10 @@ def test_a_movie_without_an_error_is_left_out() -> None:
     assert means.movies.tolist() == [1.0, 0.0]
 
 
-@pytest.mark.parametrize(("scatter", "samples", "movies"), [(0, 4, 1), (1, 6, 3), (3, 2, 3)])
+@pytest.mark.parametrize(
+    ("scatter", "samples", "movies"),
+    [(0, 4, 1), *(pytest.param(*one, marks=pytest.mark.large) for one in ((1, 6, 3), (3, 2, 3)))],
+)
 def test_equal_samples_are_rarely_found_to_differ(
     scatter: float, samples: int, movies: int, repetitions
 ) -> None:

@@ -157,7 +157,7 @@ def test_always_is_told_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
     assert said[0].startswith("the optics cannot be learned from this movie: movie.tif: shows 8 ")
 
 
-@pytest.mark.parametrize("focus_nm", [-380.0, 300.0])
+@pytest.mark.parametrize("focus_nm", [-380.0, pytest.param(300.0, marks=pytest.mark.large)])
 def test_a_phase_that_the_line_of_masses_turns_is_told(
     monkeypatch: pytest.MonkeyPatch, focus_nm: float
 ) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -461,24 +459,3 @@ def test_noise_and_drift_of_the_background(moves: bool, tmp_path: Path) -> None:
 def test_no_drift_where_there_is_no_pattern(tmp_path: Path) -> None:
     found, _ = _run(_small(simulation={"background": "flat"}), tmp_path)
     assert found.summary["background"]["drift_px"] is None
-
-
-def test_a_few_events_do_without_a_library_that_looks_for_minima(tmp_path: Path) -> None:
-    sample = Path(__file__).resolve().parents[2] / "sample_configs" / "mass.toml"
-    changes = [
-        "simulation.shape=[64, 64]", "simulation.frames=60", "posterior.enabled=false",
-        "simulation.events=[{frame=30, x_px=31.3, y_px=30.8, mass_kda=2000.0}]",
-        "background.frames=[0, 30]", "fit.frames=[30, 60]",
-    ]  # fmt: skip
-    write_stack(load_config(sample, changes), tmp_path / "movie.tif", seed=1)
-    text = (
-        "import sys; from pathlib import Path\n"
-        "from iscat_analysis.config import load_config\n"
-        "from iscat_analysis.pipeline import fit_stack\n"
-        "movie, sample, *changes = sys.argv[1:]\n"
-        "table = fit_stack(Path(movie), load_config(Path(sample), changes)).table\n"
-        "print(len(table), 'scipy.optimize' in sys.modules)"
-    )
-    command = [sys.executable, "-c", text, str(tmp_path / "movie.tif"), str(sample), *changes]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["1", "False"]

@@ -107,7 +107,9 @@ def test_a_membrane_whose_heights_were_lost_is_recognised() -> None:
 @pytest.mark.parametrize(
     "mover",
     [
-        {"d_um2_s": 4.0, "space": "volume", "ceiling_nm": 1000.0},
+        pytest.param(
+            {"d_um2_s": 4.0, "space": "volume", "ceiling_nm": 1000.0}, marks=pytest.mark.large
+        ),
         {"d_um2_s": 0.1, "space": "volume", "ceiling_nm": 100.0},
     ],
 )

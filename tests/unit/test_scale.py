@@ -269,7 +269,7 @@ def test_the_budget_adds_up_to_the_column() -> None:
     assert explained_kda(budget) == pytest.approx(own)  # of the bias that is taken off
 
 
-CAMERA: dict[str, Any] = {
+MEASURED: dict[str, Any] = {
     "gain_e_per_adu": {"value": 4.0, "se": 0.1, "from": "measured"},
     "offset_adu": {"value": 100.0, "se": 12.0, "from": "dark frames"},
     "light_adu": 2000.0,
@@ -294,7 +294,7 @@ CAMERA: dict[str, Any] = {
 def test_the_budget_has_the_camera(
     offset: dict[str, Any], expected: dict[str, tuple[float, str]]
 ) -> None:
-    camera = {**CAMERA, "offset_adu": CAMERA["offset_adu"] | offset}
+    camera = {**MEASURED, "offset_adu": MEASURED["offset_adu"] | offset}
     found = contributions(_config(), _event(), camera=camera)
     budget = budget_of(_event(), found, {}, calibrated=True, scaled=False)
     lines = {one["name"].split(",")[0]: one for one in budget if "camera" in one["name"]}

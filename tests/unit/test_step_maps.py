@@ -42,7 +42,9 @@ class Judged(StepMaps):
 CALLS: list[tuple[int, float, float]] = []
 
 
-@pytest.mark.parametrize("heaviest", [480.0, 3000.0], ids=["weak", "strong"])
+@pytest.mark.parametrize(
+    "heaviest", [480.0, pytest.param(3000.0, marks=pytest.mark.large)], ids=["weak", "strong"]
+)
 def test_maps_are_those_made_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, heaviest: float
 ) -> None:
