@@ -71,13 +71,15 @@ def reported_rows(
     if extension is not None:
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
     changing_light = ""
+    shared_place = np.zeros(len(fits), dtype=bool)
     if found.heading == "landing":
-        resolution_nm = config.optics.wavelength_nm / config.optics.na
-        fits, changing_light = _with_changing(fits, evidence, resolution_nm)
+        shared_place = at_a_shared_place(fits, config.optics.wavelength_nm / config.optics.na)
+        fits = flagged(fits, Status.CHANGING, shared_place)
+        fits, changing_light = _with_changing(fits, evidence)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
-        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved)
+        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved, shared_place)
     if fluctuation is not None:
         sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
         fits = fits.assign(sigma_mass_kda=sigma)
@@ -104,11 +106,8 @@ def reported_rows(
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_changing(
-    fits: pd.DataFrame, evidence: Evidence | None, resolution_nm: float
-) -> tuple[pd.DataFrame, str]:
+def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
-    fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits, resolution_nm))
     if evidence is None:
         return fits, ""
     unseen, frames = may_rise(fits, evidence)

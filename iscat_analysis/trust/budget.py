@@ -121,8 +121,8 @@ def width_warning(across: Sequence[Mapping[str, Any]], *, calibrated: bool) -> s
     wide = []
     for one in across:
         low, width = one["width_low"], one["width_kda"]
-        if low is None or width is None or not math.isfinite(low):
-            continue
+        if low is None or width is None or not math.isfinite(low) or not one["mass_kda"]:
+            continue  # nothing is a share of no mass
         sigma = width / math.sqrt(max(one["spread_over_sigma"] ** 2 - 1, 1e-12))
         if low > max(one["explained_kda"], _LEAST_WIDTH * sigma):
             wide.append((one, width, low))
