@@ -15,7 +15,7 @@ from bokeh.plotting import figure
 import iscat_analysis as ia
 from iscat_analysis.answers.binding import CONCENTRATIONS
 from iscat_analysis.species.mass_action import Model
-from iscat_app.chosen import Notice, table_of
+from iscat_app.chosen import Notice, masses_in, table_of
 
 _MODELS: dict[str, Model] = {"two M make a dimer": "dimer", "A and B make AB": "ab"}
 _COLUMNS = {"concentration_nm": "monomers in all [nM]", "a_nm": "A in all [nM]",
@@ -85,12 +85,7 @@ class BindingPart:
                     "Choose two results or more, and give all concentrations.", "error"
                 )
                 return
-            text = self._masses.value.replace(";", ",")
-            try:
-                masses = [float(part) for part in text.split(",") if part.strip()] or None
-            except ValueError:
-                self._notice.say("Write the masses as 66, or as 40, 80.", "error")
-                return
+            masses = masses_in(self._masses.value) or None
             inactive = self._inactive.value
             self._notice.work(
                 "Fitting K_D",

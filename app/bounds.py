@@ -29,7 +29,7 @@ class Bounds:
         self._chosen = chosen
         self._notice = Notice()
         self._config: ia.Config | None = None
-        self._computes = self._again = self._seen = False
+        self._seen = False
         slider = pn.widgets.FloatSlider
         self._sliders = {
             "optics.na": slider(label="NA", start=0.8, end=1.48, step=0.01, value=1.42),
@@ -78,19 +78,12 @@ class Bounds:
         self._follow()
 
     def _follow(self, *_: Any) -> None:
-        """Compute, and once more where something has changed meanwhile: sliders move fast."""
-        if self._computes:
-            self._again = True
-            return
-        self._computes, config, settings = True, self._config, self._settings()
-
-        def job() -> tuple[ia.Bounds, np.ndarray[Any, Any], float]:
-            try:
-                return _computed(config, settings)
-            finally:
-                self._computes = False
-
-        self._notice.work("" if self._seen else "Computing, the first time", job, self._show)
+        """Compute what the sliders say now: they move faster than that."""
+        config, settings = self._config, self._settings()
+        self._notice.latest(
+            "" if self._seen else "Computing, the first time",
+            lambda: _computed(config, settings), self._show,
+        )  # fmt: skip
 
     def _settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {key: s.value for key, s in self._sliders.items()}
@@ -118,9 +111,6 @@ class Bounds:
             f"before; pixels of {found.config.camera.pixel_size_nm:g} nm.</p>"
             f"<p><small>Computed in {1000 * took_s:.0f} ms.</small></p>"
         )
-        if self._again:
-            self._again = False
-            self._follow()
 
 
 def _computed(

@@ -8,22 +8,24 @@ from typing import Any
 import numpy as np
 import panel as pn
 from bokeh.events import DoubleTap, Tap
-from bokeh.models import ColumnDataSource, Whisker
+from bokeh.models import ColumnDataSource, Range1d, Whisker
 from bokeh.plotting import figure
 
 from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
 from iscat_analysis.calibration.mass import ContrastPeak, MassCalibration
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import path_beside
 from iscat_app.calibrations import Taken
-from iscat_app.chosen import Chosen, Notice, in_line, table_of
+from iscat_app.chosen import Chosen, Notice, in_line, masses_in, table_of
 from iscat_app.files import listed
 from iscat_app.runs import Job, Kind, Queue
 
 _HEAD = ("standard [kDa]", "contrast", "±", "by the line [kDa]", "95 %", "residual [%]")
 _NO_DARK = "(none)"
 _HINT = (
-    "<small>Click a peak to give it the lightest mass that has none yet, and again to take it "
-    "back. Without clicks the peaks are found that fit the masses best.</small>"
+    "<small>Click a peak, or choose it from the list, to give it the lightest mass that has none "
+    "yet, and again to take it back. Where nobody chooses, the peaks are found that fit the masses "
+    "best.</small>"
 )
 
 
@@ -43,6 +45,8 @@ class Calibrate:
                                                placeholder="66, 146, 480", width=260)  # fmt: skip
         fit = pn.widgets.Button(label="Fit the line", color="primary", width=120)
         forget = pn.widgets.Button(label="Take all masses back", width=160)
+        self._peak = pn.widgets.Select(label="Peak", width=200)
+        give = pn.widgets.Button(label="Give it a mass, or take it back", width=210)
         self._dark = pn.widgets.Select(label="Frames without light", options=[_NO_DARK], width=260)
         camera = pn.widgets.Button(label="Measure the camera of this movie", width=240)
         optics = pn.widgets.Button(label="Learn the optics from this movie", width=240)
@@ -50,13 +54,14 @@ class Calibrate:
         self._taken = Taken(chosen, self._notice)
         self._standards.param.watch(lambda _: self._assign({}), "value")
         fit.on_click(self._fit)
+        give.on_click(lambda _: self._give(self._peak.value))
         forget.on_click(lambda _: self._assign({}))
         camera.on_click(lambda _: self._measure("camera"))
         optics.on_click(lambda _: self._measure("optics"))
         self.body = pn.Column(
             self._notice.pane,
             "### Masses, from standards",
-            in_line(self._standards, fit, forget),
+            in_line(self._standards, self._peak, give, forget, fit),
             pn.pane.HTML(_HINT),
             pn.FlexBox(self._histogram_pane, self._line_pane),
             self._table,
@@ -77,14 +82,13 @@ class Calibrate:
         plot.scatter("mass", "contrast", source=self._points, size=9, color="#0072B2")
         plot.add_layout(Whisker(base="mass", lower="low", upper="high", source=self._points))
         peaks = figure(width=520, height=300, x_axis_label="|contrast| [%]", y_axis_label="events",
-                       tools="xwheel_zoom,xpan,reset,tap")  # fmt: skip
+                       tools="xwheel_zoom,xpan,reset,tap", y_range=Range1d(0, 1))  # fmt: skip
         peaks.quad(left="left", right="right", top="top", bottom=0, source=self._bars,
                    color="#8A8F96", line_color="white", nonselection_alpha=1)  # fmt: skip
         peaks.scatter("x", "y", source=self._marks, marker="inverted_triangle", size=12,
                       color="colour", nonselection_alpha=1)  # fmt: skip
         peaks.text("x", "y", text="text", source=self._marks, text_align="center", y_offset=-10,
                    text_font_size="12px", text_color="colour", nonselection_alpha=1)  # fmt: skip
-        peaks.y_range.start = 0
         for kind in (Tap, DoubleTap):  # of two clicks that are fast the second is the latter
             peaks.on_event(kind, lambda event: self._clicked(event.x))
         plot.toolbar.logo = peaks.toolbar.logo = None
@@ -122,27 +126,31 @@ class Calibrate:
 
     def _masses(self) -> list[float] | None:
         try:
-            return sorted(
-                float(t) for t in self._standards.value.replace(";", ",").split(",") if t.strip()
-            )
-        except ValueError:
-            self._notice.say("Write the masses as 66, 146, 480.", "error")
+            return sorted(masses_in(self._standards.value))
+        except DataError as error:
+            self._notice.say(str(error), "error")
             return None
 
     def _clicked(self, contrast_percent: float | None) -> None:
-        """Give the nearest peak the next mass, or take its mass back."""
+        if self.peaks and contrast_percent is not None:
+            away = [abs(100 * peak.contrast - contrast_percent) for peak in self.peaks]
+            self._give(int(np.argmin(away)))
+
+    def _give(self, peak: int | None) -> None:
+        """Give a peak the next mass, or take its mass back."""
         masses = self._masses()
-        if not masses or not self.peaks or contrast_percent is None:
+        if peak is None or masses is None:
             return
-        away = [abs(100 * peak.contrast - contrast_percent) for peak in self.peaks]
-        peak = int(np.argmin(away))
+        if not masses:
+            self._notice.say("Write the masses of the standards first.")
+            return
         free = [mass for mass in masses if mass not in self.assigned.values()]
         if peak in self.assigned:
             self._assign({k: mass for k, mass in self.assigned.items() if k != peak})
         elif free:
             self._assign(self.assigned | {peak: free[0]})
         else:
-            self._notice.say("Every mass has a peak: click one to take its mass back.")
+            self._notice.say("Every mass has a peak: take one back first.")
 
     def _assign(self, assigned: dict[int, float]) -> None:
         self.assigned = assigned
@@ -159,7 +167,17 @@ class Calibrate:
             "text": [f"{assigned[k]:g} kDa" if k in assigned else "" for k in range(len(places))],
             "colour": ["#D55E00" if k in assigned else "#0072B2" for k in range(len(places))],
         }
-        self._histogram.y_range.end = 1.3 * max(top.max(initial=0.0), 1.0)
+        texts = [
+            f"{k + 1}: {x:.3g} %" + (f", {assigned[k]:g} kDa" if k in assigned else "")
+            for k, x in enumerate(places)
+        ]  # fmt: skip
+        peak = self._peak.value if self._peak.value in range(len(texts)) else None
+        self._peak.param.update(
+            options={text: k for k, text in enumerate(texts)},
+            value=0 if texts and peak is None else peak,
+        )
+        end = 1.3 * max(top.max(initial=0.0), 1.0)
+        self._histogram.y_range.update(end=end, reset_end=end)
 
     # ---- calibrations -----------------------------------------------------------------------
 

@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 import panel as pn
 import param
 
-from iscat_analysis.errors import IscatError
+from iscat_analysis.errors import DataError, IscatError
 from iscat_analysis.movie.addresses import path_beside, setup_beside
 
 T = TypeVar("T")
@@ -29,6 +29,7 @@ class Chosen(param.Parameterized):
     span = param.Tuple(default=None, length=2, doc="Frames to analyse, half-open.")
     excluded = param.Tuple(default=None, length=2, doc="Frames to leave out, half-open.")
     frame = param.Integer(default=None, allow_None=True, doc="Frame of the event that is shown.")
+    view = param.Integer(default=None, allow_None=True, doc="Frame that Look shows.")
     event = param.Integer(default=None, allow_None=True, doc="Its number, for a ring of its own.")
     changed = param.Integer(default=0, doc="Counts what changes on the disk.")
 
@@ -37,7 +38,8 @@ class Chosen(param.Parameterized):
         if result is None and movie is not None:
             result = path_beside(movie, ".iscat")
         found = result if result is not None and (result / "summary.json").is_file() else None
-        self.param.update(movie=movie, result=found, frame=None, event=None)
+        view = self.view if movie == self.movie else None
+        self.param.update(movie=movie, result=found, frame=None, event=None, view=view)
 
     def look_again(self) -> None:
         """See whether there is a result by now."""
@@ -71,6 +73,8 @@ class Notice:
     def __init__(self) -> None:
         self.pane = pn.pane.HTML("", sizing_mode="stretch_width", visible=False)
         self.text, self.busy = "", False
+        self._newest: Callable[[], None] | None = None
+        self._is_at_it = False
 
     def say(self, text: str, kind: str = "info") -> None:
         """Show a text, as text whatever is in it; an empty one hides the line."""
@@ -89,7 +93,25 @@ class Notice:
         except (OSError, MemoryError) as error:
             self.say(f"{type(error).__name__}: {error}", "error")
 
-    def work(self, what: str, job: Callable[[], T], then: Callable[[T], None]) -> None:
+    def latest(self, what: str, job: Callable[[], T], then: Callable[[T], None]) -> None:
+        """Do the newest of jobs that are asked for faster than they can be done."""
+        self._newest = lambda: self.work(what, job, then, self._go_on)
+        if not self._is_at_it:
+            self._go_on()
+
+    def _go_on(self) -> None:
+        newest, self._newest = self._newest, None
+        self._is_at_it = newest is not None
+        if newest is not None:
+            newest()
+
+    def work(
+        self,
+        what: str,
+        job: Callable[[], T],
+        then: Callable[[T], None],
+        after: Callable[[], None] = lambda: None,
+    ) -> None:
         """Do something that takes long in a thread, as the page goes on, and then show it."""
         document = pn.state.curdoc
         if what:
@@ -97,21 +119,34 @@ class Notice:
 
         def finished(future: Future[T]) -> None:
             if document.session_context is not None and not document.session_context.destroyed:
-                document.add_next_tick_callback(lambda: self._show(future, then))
+                document.add_next_tick_callback(lambda: self._show(future, then, after))
 
         _THREADS.submit(job).add_done_callback(finished)
 
-    def _show(self, future: Future[T], then: Callable[[T], None]) -> None:
+    def _show(
+        self, future: Future[T], then: Callable[[T], None], after: Callable[[], None]
+    ) -> None:
         """Show what a thread has made, as one change of the page."""
-        with self.told():
-            try:
-                found = future.result()
-                if self.busy:
-                    self.say("")
-                then(found)
-            except Exception as error:
-                self.say(f"{type(error).__name__}: {error}", "error")
-                raise
+        try:
+            with self.told():
+                try:
+                    found = future.result()
+                    if self.busy:
+                        self.say("")
+                    then(found)
+                except Exception as error:
+                    self.say(f"{type(error).__name__}: {error}", "error")
+                    raise
+        finally:
+            after()
+
+
+def masses_in(text: str) -> list[float]:
+    """Read masses that somebody wrote, as in 66, 146."""
+    try:
+        return [float(part) for part in text.replace(";", ",").split(",") if part.strip()]
+    except ValueError:
+        raise DataError(f"{text}: write masses in kDa, as in 66, 146") from None
 
 
 def in_line(*parts: Any) -> pn.FlexBox:

@@ -12,8 +12,14 @@ from bokeh.models import Legend
 from bokeh.plotting import figure
 
 import iscat_analysis as ia
-from iscat_analysis.answers.gates import MassHistogram, counted_rows, mass_histogram
+from iscat_analysis.answers.gates import (
+    MassHistogram,
+    counted_events,
+    counted_rows,
+    mass_histogram,
+)
 from iscat_analysis.report.gates import PALETTES
+from iscat_analysis.species.tables import EventTable
 from iscat_app.binding import BindingPart
 from iscat_app.chosen import Chosen, Notice, in_line, link_to, table_of
 from iscat_app.rejections import Rejections
@@ -50,7 +56,7 @@ class Compare:
         self._plot = pn.pane.Bokeh(None)
         day = pn.widgets.Button(label="Analyse the folder as a day", width=200)
         self._pages = pn.pane.HTML("")
-        self._binding = BindingPart(self._notice, self._tables)
+        self._binding = BindingPart(self._notice, self._events)
         self._table = pn.pane.HTML("", sizing_mode="stretch_width")
         for widget in (self._paths, self._bin, self._stacked):
             widget.param.watch(lambda _: self._draw(), "value")
@@ -107,6 +113,14 @@ class Compare:
                 tables.append((name, table))
         return tables
 
+    def _events(self) -> list[tuple[str, EventTable]]:
+        """Take them as events, with what the search of each result missed."""
+        paths = [Path(text) for text in self._paths.value]
+        return [
+            (name, counted_events(path, table))
+            for path, (name, table) in zip(paths, self._tables(), strict=True)
+        ]
+
     def _draw(self) -> None:
         self._notice.say("")
         with self._notice.told():
@@ -135,7 +149,7 @@ class Compare:
 
     def _test(self, _: Any) -> None:
         with self._notice.told():
-            named = self._tables()
+            named = self._events()
             if len(named) < 2:
                 self._notice.say("Choose two or more results.", "error")
                 return

@@ -182,7 +182,8 @@ class Files:
 
     def _dropped(self, event: Any) -> None:
         """Save files that were dropped, under names that nothing else has."""
-        for name, data in (event.new or {}).items():
+        while event.new:  # it keeps what it has until this is taken out
+            name, data = event.new.popitem()
             safe = re.sub(r"[^\w.\- ]", "_", Path(name).name).lstrip(".") or "movie.tif"
             target = self.folder / safe
             with self._notice.told():

@@ -9,7 +9,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import panel as pn
-from bokeh.models import BoxSelectTool, ColumnDataSource, CustomJS, LinearAxis, Range1d, Spinner
+from bokeh.models import (
+    BoxAnnotation,
+    BoxSelectTool,
+    ColumnDataSource,
+    CustomJS,
+    LinearAxis,
+    Range1d,
+    Spinner,
+)
 from bokeh.plotting import figure
 
 import iscat_analysis as ia
@@ -68,7 +76,7 @@ class Film:
         self._x, self._y = Range1d(0, 1), Range1d(1, 0)
         self._figure = figure(
             width=_SIDE_PX + 60, height=_SIDE_PX + 40, x_range=self._x, y_range=self._y,
-            tools="pan,wheel_zoom,box_zoom,reset,save", active_scroll="wheel_zoom",
+            tools="pan,wheel_zoom,box_zoom,zoom_in,zoom_out,reset,save", active_scroll="wheel_zoom",
             output_backend="canvas", toolbar_location="right",
         )  # fmt: skip
         self._figure.grid.visible, self._figure.toolbar.logo = False, None
@@ -112,6 +120,8 @@ class Film:
             "frame", "noise", source=self._trace, color="#D55E00", y_range_name="noise"
         )
         marks = self._light.scatter("frame", "light", source=self._trace, size=3, alpha=0)
+        self._band = BoxAnnotation(left=0, right=0, fill_alpha=0.15, fill_color=_DOUBTFUL)
+        self._light.add_layout(self._band)
         self._light.add_tools(BoxSelectTool(dimensions="width", renderers=[marks]))
 
     def _make_widgets(self) -> None:
@@ -127,7 +137,8 @@ class Film:
         )
         self.search = pn.widgets.Checkbox(label="Mark what the search sees in this frame")
         self.events = pn.widgets.Checkbox(label="Ring the events of the result", value=True)
-        self.span = pn.widgets.StaticText(label="Frames marked in the light", value="all")
+        self.first = pn.widgets.IntInput(label="Marked frames, from", start=0, value=0, width=140)
+        self.last = pn.widgets.IntInput(label="to", start=0, value=0, width=140)
         self.use_span = pn.widgets.Button(label="Analyse only these frames", disabled=True)
         self.leave_out = pn.widgets.Button(label="Leave these frames out", disabled=True)
         self.facts = pn.pane.HTML("", width=320)
@@ -139,6 +150,8 @@ class Film:
         self.search.param.watch(self._search_changed, "value")
         self.events.param.watch(lambda _: self._ring(), "value")
         self._trace.selected.on_change("indices", self._marked)
+        for end in (self.first, self.last):
+            end.param.watch(lambda _: self._show_span(), "value")
         self.use_span.on_click(self._keep_span)
         self.leave_out.on_click(self._exclude)
         self.body = pn.Column(
@@ -151,7 +164,7 @@ class Film:
                 ),
                 pn.Column(
                     self.kind, self.rate, self.window, self.contrast, self.events, self.search,
-                    self.facts, self.span, self.use_span, self.leave_out,
+                    self.facts, pn.Row(self.first, self.last), self.use_span, self.leave_out,
                     pn.pane.Bokeh(self._drawn), width=340,
                 ),
             ),
@@ -220,6 +233,8 @@ class Film:
         self._bar.data = _bar_of(width, height) if pixel_nm else {"x": [], "y": [], "text": []}
         self.window.param.update(end=max(self._film.longest, 2), value=self._film.window)
         self.frame.param.update(end=frames - 1)
+        for end, value in ((self.first, 0), (self.last, frames - 1)):
+            end.param.update(end=frames - 1, value=value)
         self._fit_limits()
         self._shown_by_player(self._film.frames[0])
         self._show()
@@ -271,7 +286,7 @@ class Film:
 
     def _shown_by_player(self, frame: int) -> None:
         self._by_player = True
-        self.frame.value = self._at = frame
+        self.frame.value = self._at = self._chosen.view = frame
         self._by_player = False
 
     def _browser_has_drawn(self, attr: str, old: Any, new: Any) -> None:
@@ -281,7 +296,7 @@ class Film:
 
     def _frame_moved(self, _: Any) -> None:
         if not self._by_player:
-            self._at = self.frame.value
+            self._at = self._chosen.view = self.frame.value
             self._next = float(self._at)
             self._show()
             if self.search.value:
@@ -426,13 +441,20 @@ class Film:
 
     def _marked(self, attr: str, old: Any, new: list[int]) -> None:
         del attr, old
-        frames = np.asarray(self._trace.data["frame"])[new] if new else np.array([])
-        self.use_span.disabled = self.leave_out.disabled = not len(frames)
-        self.span.value = f"{frames.min()} to {frames.max()}" if len(frames) else "all"
+        if new:
+            frames = np.asarray(self._trace.data["frame"])[new]
+            self.first.value, self.last.value = int(frames.min()), int(frames.max())
+
+    def _show_span(self) -> None:
+        """Shade the frames that are marked, unless these are all."""
+        first, stop = self._span()
+        some = first < stop and (first, stop) != (0, self.frame.end + 1)
+        self.use_span.disabled = self.leave_out.disabled = not some
+        self._band.update(left=first, right=stop if some else first)
 
     def _span(self) -> tuple[int, int]:
-        first, last = (int(text) for text in self.span.value.split(" to "))
-        return first, last + 1
+        first, last = self.first.value, self.last.value  # None where the field is empty
+        return first or 0, (self.frame.end if last is None else last) + 1
 
     def _exclude(self, _: Any) -> None:
         first, stop = self._chosen.excluded = self._span()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ import iscat_analysis as ia
 from iscat_analysis.pipeline.setup import Setup, write_setup
 from iscat_app.calibrations import Taken
 from iscat_app.chosen import Chosen, Notice
-from iscat_app.setup_file import plain, read_texts, toml_text, write_texts
+from iscat_app.preview import DetectionPreview
+from iscat_app.setup_file import config_of, plain, read_texts, toml_text, write_texts
 
 FIRST = (
     "camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind", "fit.mode",
@@ -99,8 +101,13 @@ class Form:
         self._widgets: dict[str, Any] = {}
         self._shown: tuple[Any, ...] | None = None
         self._first = pn.Column()
+        self._asked_first: list[Any] = []
         self._rest = pn.Accordion(sizing_mode="stretch_width")
         self._written = pn.pane.Str("", sizing_mode="stretch_width")
+        self._warned: dict[str, Any] = {}  # what is wrong with a key, by key
+        self._fills = False
+        self._complaint = pn.pane.HTML("", width=440, visible=False)
+        self._preview = DetectionPreview(chosen, self._notice)
         self._taken = Taken(chosen, self._notice)
         propose = pn.widgets.Button(label="Propose from the movie", width=190)
         save = pn.widgets.Button(label="Save iscat.toml", color="primary", width=150)
@@ -110,11 +117,15 @@ class Form:
             self._notice.pane,
             pn.FlexBox(
                 pn.Column(
-                    "### What matters most", self._first, pn.Row(save, propose), self._taken.body,
+                    "### What matters most", self._first, pn.Row(save, propose),
+                    self._complaint, self._taken.body,
                     width=480,
                 ),
                 pn.Column("### Everything else", self._rest, width=520),
-                pn.Column("### The file", self._written, width=420),
+                pn.Column(
+                    self._preview.body, "### The file", self._written, width=420,
+                    margin=(0, 0, 0, 12),
+                ),
             ),
         )  # fmt: skip
 
@@ -122,6 +133,16 @@ class Form:
         """Show the configuration of the movie that is chosen."""
         if not self._widgets:
             self._make_widgets()
+        self._fills = True
+        try:
+            self._fill()
+        finally:
+            self._fills = False
+        if not len(self._first):  # only now, or a slow browser takes back what somebody writes
+            self._first.extend(self._asked_first)
+        self._check()
+
+    def _fill(self) -> None:
         self._taken.refresh()
         now = self._chosen.movie, self._chosen.changed
         if now != self._shown:
@@ -142,15 +163,19 @@ class Form:
                 widget.value = toml_text([*had, list(self._chosen.excluded)])
 
     def _make_widgets(self) -> None:
+        first: dict[str, Any] = {}
         sections: dict[str, list[Any]] = {}
         for field in fields():
             widget = _widget_of(field)
+            widget.param.watch(lambda _: self._check(), "value")
             self._widgets[field.key] = widget
-            shown = pn.Column(widget, pn.pane.HTML(_help(field), width=400))
-            if field.key not in FIRST:
+            wrong = self._warned[field.key] = pn.pane.HTML("", width=400, visible=False)
+            shown = pn.Column(widget, wrong, pn.pane.HTML(_help(field), width=400))
+            if field.key in FIRST:
+                first[field.key] = shown
+            else:
                 sections.setdefault(field.key.partition(".")[0], []).append(shown)
-        for key in FIRST:
-            self._first.append(self._widgets[key])
+        self._asked_first = [first[key] for key in FIRST]
         # The browser needs seconds for all of these, so a section is sent when it is unfolded.
         places = [pn.Column() for _ in sections]
         self._rest.extend(list(zip(sections, places, strict=True)))
@@ -161,6 +186,20 @@ class Form:
                     places[number].extend([*sections.values()][number])
 
         self._rest.param.watch(fill, "active")
+
+    def _check(self) -> None:
+        """Say below each field what is wrong with it, and search with what is right."""
+        if self._fills:
+            return
+        said, config = "", None
+        try:
+            config = config_of(self._texts() | self._others())
+        except ia.ConfigError as error:
+            said = str(error).removeprefix("the form: ")
+        _warn(self._complaint, said)  # also where a section is folded
+        for key, wrong in self._warned.items():
+            _warn(wrong, "; ".join(part for part in said.split("; ") if _names(part, key)))
+        self._preview.follow(config)
 
     def _texts(self) -> dict[str, str]:
         texts = {}
@@ -221,6 +260,16 @@ def _widget_of(field: Field) -> Any:
         return pn.widgets.Select(label=field.label, options=[_UNSET, *texts], width=380)
     default = "" if field.default is None else _default(field.default)
     return pn.widgets.TextInput(label=field.label, placeholder=default, width=380)
+
+
+def _warn(pane: Any, text: str) -> None:
+    pane.visible = bool(text)
+    pane.object = f'<div class="notice error" role="alert">{html.escape(text)}</div>'
+
+
+def _names(said: str, key: str) -> bool:
+    """Say whether a message is about a key."""
+    return re.search(rf"(?<![\w.]){re.escape(key)}(?![\w.])", said.replace(": ", " ")) is not None
 
 
 def _default(value: Any) -> str:

@@ -62,10 +62,10 @@ def page_of(folder: Path, queue: Queue) -> Any:
         chosen.choose(Path(given))
     start = folder if chosen.movie is None else chosen.movie.parent
     dark = _given("theme") == "dark"
-    results, runs = Results(chosen), RunTab(chosen, queue)
+    results, runs, compare = Results(chosen), RunTab(chosen, queue), Compare(chosen, queue)
     parts: list[Part] = [
-        Files(chosen, start), Film(chosen), Form(chosen), runs, results, Compare(chosen, queue),
-        Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results),
+        Files(chosen, start), Film(chosen), Form(chosen), runs, results, compare,
+        Calibrate(chosen, queue), Bounds(chosen), Export(chosen, results, compare),
     ]  # fmt: skip
     # Filled when first opened, for speed, and kept: what the browser says of a list that the server
     # has taken away is lost without a word, as it would be of `dynamic` tabs.

@@ -16,17 +16,16 @@ import iscat_analysis as ia
 from iscat_analysis.answers.gates import (
     Gate,
     MassHistogram,
+    counted_events,
     counted_rows,
     gate,
     mass_histogram,
     usual_bin,
 )
 from iscat_analysis.species.describe import Branch
-from iscat_app.chosen import Chosen, Notice, in_line, link_to, table_of
+from iscat_analysis.species.tables import EventTable
+from iscat_app.chosen import Chosen, Notice, in_line, link_to, masses_in, table_of
 from iscat_app.rejections import Rejections
-
-DRAWS = 50
-"""Simulated repetitions behind the intervals of the species."""
 
 _BLUE, _GREY, _RED = "#0072B2", "#8A8F96", "#D55E00"
 _LEFT_PX = 660
@@ -37,7 +36,8 @@ _BRANCHES: dict[str, Branch] = {
 }
 _HINT = (
     "<small>Drag over the histogram for a gate; click a bar, or dots below, to select events. The "
-    "point tool moves, adds (click) and removes (Backspace) the diamonds of species.</small>"
+    "point tool moves, adds (click) and removes (Backspace) the diamonds of species, and so do the "
+    "masses in the field. Species are of events that are ok.</small>"
 )
 _GATE_HEAD = (
     "gate [kDa]",
@@ -140,6 +140,8 @@ class Results:
         self.flagged = pn.widgets.Checkbox(label="flagged too")
         self.find = pn.widgets.Button(label="Find the species", width=140)
         self.refit = pn.widgets.Button(label="Fit again from the diamonds", width=210)
+        self.begin = pn.widgets.TextInput(label="Species begin at [kDa]", placeholder="66, 146",
+                                          width=300)  # fmt: skip
         self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=100)
         self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=100)
         add = pn.widgets.Button(label="Add the gate", width=100)
@@ -158,10 +160,12 @@ class Results:
         back = pn.widgets.Button(label="Take the event back", width=160)
         for widget in (self.bin, self.kernel, self.branch, self.flagged):
             widget.param.watch(lambda _: self._draw(), "value")
+        self.begin.param.watch(self._begin_typed, "value")
+        self._handles.on_change("data", self._write_means)
         self.find.on_click(lambda _: self._find_species(None))
         self.refit.on_click(lambda _: self._find_species(self._means()))
-        add.on_click(lambda _: self._add_gate(self.low.value, self.high.value))
-        pick.on_click(lambda _: self._select(self.low.value, self.high.value))
+        add.on_click(lambda _: self._add_gate(*self._ends()))
+        pick.on_click(lambda _: self._select(*self._ends()))
         drop.on_click(lambda _: self._set_gates([]))
         reject.on_click(self._reject)
         back.on_click(self._take_back)
@@ -169,14 +173,14 @@ class Results:
         self.body = pn.Column(
             self._notice.pane,
             in_line(
-                self.bin, self.kernel, self.branch, self.flagged, self.find, self.refit,
-                self._report,
+                self.bin, self.kernel, self.branch, self.flagged, self.find, self._report,
             ),
             pn.FlexBox(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML(_HINT),
                     in_line(self.low, self.high, add, pick, drop),
+                    in_line(self.begin, self.refit),
                     self._gate_table, self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
                     width=_LEFT_PX,
@@ -231,7 +235,7 @@ class Results:
             return
         with self._notice.told():
             counts = counted_rows(
-                self.table, branch=_BRANCHES[self.branch.value], ok_only=not self.flagged.value,
+                self.table, branch=self.counted_branch, ok_only=not self.flagged.value,
                 rejected=self.rejected,
             )  # fmt: skip
             if not self.table[counts].equals(self._seen):
@@ -264,6 +268,9 @@ class Results:
         if event.final and event.geometry.get("type") == "rect":
             self._add_gate(event.geometry["x0"], event.geometry["x1"])
 
+    def _ends(self) -> tuple[float, float]:
+        return self.low.value or 0.0, self.high.value or 0.0  # None where the field is empty
+
     def _add_gate(self, low: float, high: float) -> None:
         low, high = sorted((max(round(low, 1), 0.0), round(high, 1)))
         if high > low:
@@ -295,17 +302,43 @@ class Results:
         """Give the masses at which somebody left the diamonds."""
         return sorted({round(float(x), 2) for x in self._handles.data["x"] if x > 0})
 
+    def _write_means(self, attr: str, old: Any, new: Any) -> None:
+        del attr, old, new
+        self.begin.value = ", ".join(f"{mass:g}" for mass in self._means())
+
+    def _begin_typed(self, event: Any) -> None:
+        """Put the diamonds where somebody writes."""
+        with self._notice.told():
+            masses = sorted(masses_in(event.new))
+            if masses != self._means():
+                curve = self.species_curve()
+                height = np.interp(masses, *curve) if curve else np.zeros(len(masses))
+                self._handles.data = {"x": np.array(masses), "y": height}
+
+    def events(self) -> EventTable:
+        """Give the events that count, with what the search of the whole result missed."""
+        if self.result is None:
+            raise ia.DataError("there is no result yet")
+        return counted_events(self.result.folder, self._seen)
+
+    @property
+    def counted_branch(self) -> Branch:
+        """Which side of zero counts."""
+        return _BRANCHES[self.branch.value]
+
     def _find_species(self, start: list[float] | None) -> None:
         """Fit species, as many as there are, or from where somebody says."""
-        seen, branch = self._seen, _BRANCHES[self.branch.value]
+        seen, branch = self._seen, self.counted_branch
         if start is not None and not start:
-            self._notice.say("Find the species first, or set diamonds with the point tool.")
+            self._notice.say("Find the species first, or give masses to begin at.")
         elif len(seen):
-            self._notice.work(
-                "Finding species",
-                lambda: ia.find_species(seen, start_kda=start, branch=branch, draws=DRAWS),
-                lambda found: self._take_species(found, seen, start),
-            )
+            with self._notice.told():
+                events = self.events()
+                self._notice.work(
+                    "Finding species",
+                    lambda: ia.find_species(events, start_kda=start, branch=branch),
+                    lambda found: self._take_species(found, seen, start),
+                )
 
     def _take_species(
         self, found: ia.Distribution, seen: pd.DataFrame, start: list[float] | None

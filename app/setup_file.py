@@ -35,6 +35,19 @@ def toml_text(value: Any) -> str:
 
 def write_texts(path: Path, texts: Mapping[str, str]) -> ia.Config:
     """Check texts by key, and write them as a configuration file."""
+    written = _written(texts)
+    checked = parse_config(tomllib.loads(written), where=str(path))
+    with whole_file(path) as partial:
+        partial.write_text(written, encoding="utf-8")
+    return checked
+
+
+def config_of(texts: Mapping[str, str]) -> ia.Config:
+    """Check texts by key."""
+    return parse_config(tomllib.loads(_written(texts)), where="the form")
+
+
+def _written(texts: Mapping[str, str]) -> str:
     tables: dict[str, list[str]] = {}
     for key, text in texts.items():
         section, _, name = key.partition(".")
@@ -42,10 +55,7 @@ def write_texts(path: Path, texts: Mapping[str, str]) -> ia.Config:
     written = "# Written by `iscat app`; `iscat config` prints every key there is.\n"
     for section, lines in tables.items():
         written += f"\n[{section}]\n" + "\n".join(lines) + "\n"
-    checked = parse_config(tomllib.loads(written), where=str(path))
-    with whole_file(path) as partial:
-        partial.write_text(written, encoding="utf-8")
-    return checked
+    return written
 
 
 def plain(text: str) -> str:

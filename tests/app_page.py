@@ -82,6 +82,17 @@ class Page:
             ),
         )
 
+    def tick(self, text: str) -> None:
+        """Click the box beside a text."""
+        box = self.until(
+            f"{text} has a box",
+            lambda: self.script(
+                "return named('.bk-label', arguments[0])?.getRootNode().querySelector('input')",
+                text,
+            ),
+        )
+        self.driver.execute_script("arguments[0].click()", box)
+
     def type(self, label: str, text: str) -> None:
         """Write into the field below a label, and leave it."""
         field = self.until(

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.describe import Branch
+from iscat_analysis.species.tables import EventTable, event_table
 
 MOST_BARS = 2000
 """Bars of a histogram at most."""
@@ -80,6 +82,19 @@ def counted_rows(
     if rejected:
         counts &= ~table["event"].isin(list(rejected)).to_numpy(bool)
     return np.asarray(counts)
+
+
+def counted_events(folder: Path, rows: pd.DataFrame) -> EventTable:
+    """Take rows of the table of a result as events of species.
+
+    What was missed and what the calibration leaves open are of the whole result, as `find_species`
+    takes them from its folder, whichever of its events count.
+    """
+    whole = event_table(folder)
+    return replace(
+        event_table(rows, name=folder.name), efficiency=whole.efficiency,
+        edge_kda=whole.edge_kda, scale_error=whole.scale_error, window_frames=whole.window_frames,
+    )  # fmt: skip
 
 
 def usual_bin(table: pd.DataFrame) -> float:

@@ -18,6 +18,9 @@ PALETTES: Mapping[str, tuple[str, ...]] = {
 }
 """Colours of samples, by name."""
 
+FONTS = ("sans-serif", "serif", "monospace")
+"""Families of letters."""
+
 Format = Literal["svg", "pdf", "png"]
 
 
@@ -27,6 +30,7 @@ def histogram_figure(
     width_cm: float = 12.0,
     height_cm: float = 8.0,
     font_pt: float = 9.0,
+    font: str = "sans-serif",
     palette: str = "colour-blind safe",
     gates: Sequence[Any] = (),
     curve: tuple[Any, Any] | None = None,
@@ -38,7 +42,7 @@ def histogram_figure(
     """
     colours = PALETTES[palette]
     shares = len(samples) > 1
-    with mpl.rc_context({**STYLE, "font.size": font_pt}):
+    with mpl.rc_context({**STYLE, "font.size": font_pt, "font.family": font}):
         figure = new_figure(width_cm / 2.54, height_cm / 2.54)
         axes = figure.add_subplot()
         for place, (name, seen) in enumerate(samples):

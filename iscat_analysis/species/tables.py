@@ -64,7 +64,8 @@ _RANGES = {
 }  # fmt: skip
 """The columns of numbers that are used, and how large their magnitudes can be."""
 
-_USED = (*_RANGES, "status")
+_REJECTED = "rejected_by_hand"  # true of events that somebody left out
+_USED = (*_RANGES, "status", _REJECTED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,6 +299,8 @@ def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
     checked = pd.DataFrame(columns, index=range(len(table)))
     if "status" in table:
         checked["status"] = table["status"].to_numpy()
+    if _REJECTED in table:
+        checked[_REJECTED] = table[_REJECTED].astype(str).str.lower().eq("true").to_numpy()
     return checked
 
 
@@ -313,13 +316,16 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         good = table[table["status"] == Status.OK.value]
         if good.empty:
             raise DataError(f"{name}: holds no event with status ok")
+    notes = []
+    if _REJECTED in good and (by_hand := int(good[_REJECTED].sum())):
+        good = good[~good[_REJECTED]]
+        notes.append(f"{name}: {count(by_hand, 'event')} that somebody rejected left out")
     mass, sigma, frame, x, y = (
         good[column].to_numpy() if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
     )
     if "tick" in good:  # the camera dropped frames, and time went on
         frame = _numbers(good, "tick", name)
-    notes = []
     errors_known = sigma_kda is not None or bool(np.isfinite(sigma[np.isfinite(mass)]).any())
     if sigma_kda is not None:
         sigma = np.full(mass.shape, sigma_kda)

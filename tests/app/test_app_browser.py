@@ -165,6 +165,12 @@ def test_from_a_movie_to_a_figure(page: Page, address: str, folder: Path) -> Non
 
     page.open("Set up")
     page.says("camera.pixel_size_nm [nm]")
+    page.type("optics.na", "-1")
+    page.says("input should be greater than 0")
+    page.type("optics.na", "1.42")
+    page.until("all is well again", lambda: "greater than 0" not in page.text())
+    page.tick("Show what the search finds with these values")
+    page.says("times the noise, in frames")
     page.click("Save iscat.toml")
     page.says("saved as")
     assert ia.load_config(folder / "iscat.toml").background.window_frames == 20
@@ -312,6 +318,36 @@ def test_species_are_fitted_again_from_where_somebody_drags_them(page: Page) -> 
     assert page.bokeh(f"return {handles}.data.x.length") == 2
     page.open("Export")
     page.says("iscat species", "--start 70,250")
+    page.open("Results")
+    page.type("Species begin at [kDa]", "60, 140, 260")  # the same by the keyboard
+    page.until("three diamonds", lambda: page.bokeh(f"return {handles}.data.x.length") == 3)
+    page.click("Fit again from the diamonds")
+    page.until("they moved", lambda: page.bokeh(f"return {handles}.data.x[0] !== 60"))
+    found = page.bokeh(f"return [...{handles}.data.x]")
+    assert sorted(found) == pytest.approx([66, 132, 264], rel=0.03)
+
+
+@pytest.mark.large
+def test_small_movies_are_dropped_one_after_the_other(
+    page: Page, folder: Path, tmp_path: Path
+) -> None:
+    for name in ("dropped.tif", "another.tif"):
+        shutil.copy(folder / "landing.tif", tmp_path / name)
+        place = page.until(
+            "files can be dropped",
+            lambda: page.script(
+                "return everywhere(document).find((n) => n.matches('input[type=file]'))"
+            ),
+        )
+        place.send_keys(str(tmp_path / name))
+        page.until(f"{name} is copied", (folder / name).is_file)
+        page.until(
+            f"{name} is chosen",
+            lambda name=name: page.script("return named('h2', arguments[0])", name),
+        )
+        page.says("240 of 64 × 64 pixels")
+        assert (folder / name).read_bytes() == (tmp_path / name).read_bytes()
+    assert "already" not in page.text()
 
 
 @pytest.mark.large

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -17,11 +20,15 @@ pytest.importorskip("panel", reason="needs the Python package panel")
 from iscat_app.calibrate import Calibrate
 from iscat_app.calibrations import beside, take
 from iscat_app.chosen import Chosen, table_of
-from iscat_app.files import listed
+from iscat_app.compare import Compare
+from iscat_app.export import Export
+from iscat_app.files import Files, listed
 from iscat_app.form import FIRST, Form, fields
 from iscat_app.rejections import Rejections
+from iscat_app.results import Results
 from iscat_app.runs import Job, Queue
 from iscat_app.setup_file import add_table, read_texts, write_texts
+from iscat_cli import main
 
 
 def test_the_form_has_every_key_of_the_configuration_once() -> None:
@@ -117,6 +124,19 @@ def test_frames_that_are_left_out_add_up_in_the_form(tmp_path: Path) -> None:
     assert ia.load_config(tmp_path / "iscat.toml").fit.excluded_frames == ((5, 9), (20, 40))
 
 
+def test_what_is_wrong_stands_below_its_field(tmp_path: Path) -> None:
+    chosen = Chosen()
+    chosen.choose(tmp_path / "movie.tif")
+    form = Form(chosen)
+    form.refresh()
+    form._widgets["optics.na"].value = "-1"
+    shown = {key for key, wrong in form._warned.items() if wrong.visible}
+    assert shown == {"optics.na"}
+    assert "greater than 0" in form._warned["optics.na"].object
+    form._widgets["optics.na"].value = "1.3"
+    assert not any(wrong.visible for wrong in form._warned.values())
+
+
 @pytest.fixture
 def standards(tmp_path: Path) -> Path:
     """Make a result whose peaks lie at 66, 132 and 264 kDa."""
@@ -137,6 +157,65 @@ def test_a_click_gives_a_peak_its_mass_and_takes_it_back(standards: Path) -> Non
     assert calibrate.assigned == {2: 264.0}
     calibrate._standards.value = "66"
     assert calibrate.assigned == {}
+
+
+def test_peaks_have_masses_by_the_keyboard_too(standards: Path) -> None:
+    calibrate = Calibrate(Chosen(result=standards), Queue())
+    calibrate.refresh()
+    calibrate._standards.value = "66, 264"
+    calibrate._peak.value = 0
+    calibrate._give(calibrate._peak.value)
+    calibrate._peak.value = 2
+    calibrate._give(calibrate._peak.value)
+    assert calibrate.assigned == {0: 66.0, 2: 264.0}
+    assert next(iter(calibrate._peak.options)).endswith(", 66 kDa")
+
+
+@pytest.mark.parametrize("rejects", [False, True])
+def test_the_command_that_is_exported_finds_the_species_of_the_window(
+    standards: Path, tmp_path: Path, capsys: Any, rejects: bool
+) -> None:
+    """Its search would have seen 20 kDa, and not only what is as heavy as its lightest event."""
+    summary = json.loads((standards / "summary.json").read_text())
+    summary["detection_threshold_snr"] = 3.0
+    (standards / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    chosen, queue = Chosen(result=standards), Queue()
+    results = Results(chosen)
+    export = Export(chosen, results, Compare(chosen, queue))
+    results.refresh()
+    if rejects:
+        assert results.rejections is not None
+        results.rejections.reject(results.table.iloc[[0, 1, 5]])
+        results._rejected_anew()
+    results.begin.value = "60; 130, 260"
+    assert results._means() == [60.0, 130.0, 260.0]
+    results.start = results._means()
+    inside = ia.find_species(results.events(), start_kda=results.start, draws=0)
+    line = export._commands().splitlines()[-1]
+    assert ("--limit 21:7" in line) == rejects
+    words = shlex.split(line)[1:]
+    if rejects:
+        words[1] = str(tmp_path / "standards.csv")
+        Path(words[1]).write_bytes(export._csv().getvalue())
+    assert main([*words, "--draws", "0", "--json"]) == 0
+    outside = pd.DataFrame(json.loads(capsys.readouterr().out)["species"])
+    for column in ("mass_kda", "count", "fraction", "efficiency"):
+        np.testing.assert_allclose(outside[column], inside.species[column], rtol=1e-6)
+    alone = ia.find_species(results._seen, start_kda=results.start, draws=0)  # without its folder
+    assert abs(alone.species["efficiency"].iloc[0] - inside.species["efficiency"].iloc[0]) > 1e-3
+
+
+def test_a_file_that_is_dropped_is_saved_once_and_replaces_nothing(tmp_path: Path) -> None:
+    files = Files(Chosen(), tmp_path)
+    files.refresh()
+    tifffile.imwrite(tmp_path / "a.tif", np.zeros((9, 8, 8), np.uint16))
+    movie = (tmp_path / "a.tif").read_bytes()
+    for name, said in (("b.tif", ""), ("../c.tif", ""), ("a.tif", "is in the folder already")):
+        files._drop.value[name] = movie
+        files._drop.param.trigger("value")
+        assert (said or "nothing") in (files._notice.text or "nothing")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.tif", "b.tif", "c.tif"]
+    assert (tmp_path / "c.tif").read_bytes() == movie
 
 
 @pytest.fixture
