@@ -7,7 +7,7 @@ import textwrap
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import DebugOption, ModeOption
+from iscat_cli.options import DebugOption, Mode, ModeOption
 
 WIDTH = 80
 
@@ -26,7 +26,10 @@ def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOptio
     with failures(Messages(context.command_path, debug=debug)):
         from iscat_analysis.config import config_to_toml, load_config
 
-        text = config_to_toml(load_config(None, [f"fit.mode={mode.value}"] if mode else ()))
+        changes = [f"fit.mode={mode.value}"] if mode else []
+        if mode is Mode.SIZE:  # which fits spheres alone
+            changes.append("particle.model=mie")
+        text = config_to_toml(load_config(None, changes))
         text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_of_each()}\n[bounds]", 1)
         print_result("\n".join(_folded(line) for line in text.splitlines()))
 

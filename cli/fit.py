@@ -23,6 +23,7 @@ from iscat_cli.options import (
     channel_of,
     command,
     frame_range,
+    setup_of,
 )
 
 if TYPE_CHECKING:
@@ -142,14 +143,9 @@ def fit(
 
         changes = _changes(settings, mode, frames, background, channels, posterior, workers)
 
-        from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside
-        from iscat_analysis.reading import is_file
+        from iscat_analysis.movie.addresses import MARK, path_beside
 
-        found_beside = setup_beside(stack)
-        if config is None and is_file(found_beside):
-            config = found_beside
-            messages.notify(f"the configuration is {config}, which lies beside the movie")
-        resolved = load_config(config, changes)
+        resolved = load_config(setup_of(stack, config, messages), changes)
 
         from iscat_analysis.executors import open_executor
 

@@ -140,6 +140,18 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
+def setup_of(movie: Path, config: Path | None, messages: Messages) -> Path | None:
+    """Give the configuration of a movie: the one that is named, else ``iscat.toml`` beside it."""
+    from iscat_analysis.movie.addresses import setup_beside
+    from iscat_analysis.reading import is_file
+
+    beside = setup_beside(movie)
+    if config is not None or not is_file(beside):
+        return config
+    messages.notify(f"the configuration is {beside}, which lies beside the movie")
+    return beside
+
+
 def frame_range(option: str, text: str) -> tuple[int, int]:
     """Read a half-open range of frames, ``"A:B"``; messages name the option."""
     from iscat_analysis.errors import ConfigError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -24,6 +25,7 @@ from iscat_cli.options import (
     SetOption,
     WorkersOption,
     command,
+    setup_of,
     with_workers,
 )
 from iscat_cli.tables import numbers
@@ -40,7 +42,8 @@ One movie that is still being recorded, a TIFF, HDF5 or Zarr that grows:
     iscat watch movie.tif --config setup.toml
 
 What is there is analysed as it grows, with a histogram of the masses; once it
-rests, the result is that of iscat fit, in movie.iscat or --out.
+rests, the result is that of iscat fit, in movie.iscat or --out. Without
+--config it takes iscat.toml beside the movie, as iscat fit does.
 
 Exit status, after Ctrl-C: 0 everything is analysed; 3 some movies or
 calibrations failed, which are listed; 130 a movie was interrupted, and the
@@ -89,6 +92,12 @@ def watch(
         from iscat_analysis.movie.folders import is_movie
 
         if is_movie(folder):
+            given = {
+                "--standards": standards, "--kd": kd, "--kd-masses": kd_masses,
+                "--scheduler": None if scheduler == "threads" else scheduler,
+                "--scheduler-file": scheduler_file,
+            }  # fmt: skip
+            _refuse_options_of_folders(folder, given)
             _watch_one(messages, folder, out, config, settings, workers, interval, as_json=as_json)
             return
         from iscat_analysis.day.watch import FOLDER
@@ -131,6 +140,18 @@ def watch(
             raise typer.Exit(INCOMPLETE)
 
 
+def _refuse_options_of_folders(movie: Path, given: Mapping[str, object]) -> None:
+    """Refuse options that one movie leaves without effect."""
+    from iscat_analysis.errors import ConfigError
+
+    for option, value in given.items():
+        if value is not None:
+            raise ConfigError(
+                f"{option} is for a folder of movies, and {movie} is one movie: leave it out, or "
+                "give the folder"
+            )
+
+
 def _watch_one(
     messages: Messages,
     movie: Path,
@@ -151,7 +172,7 @@ def _watch_one(
     with messages.progress() as progress:
         found = watch_movie(
             movie,
-            configure(config, settings=with_workers(settings, workers)),
+            configure(setup_of(movie, config, messages), settings=with_workers(settings, workers)),
             out=folder,
             interval_s=interval,
             progress=progress,

@@ -17,6 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
+from iscat_analysis.config.covariance import ABERRATIONS, MEASURABLE, OpticsCovariance
 from iscat_analysis.config.field import FIELD_TERMS, JUMPS, MOVES, MOVING, field_keys
 from iscat_analysis.config.files import (
     OpticsFile,
@@ -26,14 +27,11 @@ from iscat_analysis.config.files import (
     with_absolute_paths,
 )
 from iscat_analysis.config.instrument import (
-    ABERRATIONS,
     ASSUMED,
     AUTO,
     LARGEST_SD_NM,
-    MEASURABLE,
     CameraConfig,
     Optics,
-    OpticsCovariance,
     Particle,
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import math
+import cmath
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.field import (
-    FIELD_TERMS,
-    MOST_JUMPS,
-    MOVES,
-    FieldTerms,
-    Jump,
-    Share,
-    Size,
-)
+from iscat_analysis.config.covariance import ABERRATIONS, OpticsCovariance
+from iscat_analysis.config.field import MOST_JUMPS, FieldTerms, Jump, Share, Size
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -61,20 +54,6 @@ TYPICAL_SPHERE_NM = 100.0
 TYPICAL_PROTEIN_KDA = 150.0
 """Mass of a protein if none is given."""
 
-ABERRATIONS = tuple(f"z{j}" for j in range(5, 38))
-"""Zernike terms that can be set, by Noll's index."""
-
-MEASURABLE = (
-    "focus_nm",
-    "na",
-    "reference_phase_deg",
-    "mask_na",
-    "attenuation",
-    "polarization_deg",
-    *ABERRATIONS,
-)
-"""Parameters of the optics that can be learned from images, and that have a derivative."""
-
 
 def _noll_names(terms: dict[str, float]) -> dict[str, float]:
     for name in terms:
@@ -86,46 +65,6 @@ def _noll_names(terms: dict[str, float]) -> dict[str, float]:
                 "defocus is optics.focus_nm"
             )
     return terms
-
-
-class OpticsCovariance(Section):
-    """Errors of measured optics, section ``[covariance]`` of ``optics.toml``."""
-
-    names: tuple[str, ...] = Field(description="keys of [optics], each aberration by its own name")
-    matrix: tuple[tuple[Finite, ...], ...] = Field(description="covariance, in the order of names")
-
-    @property
-    def of_the_middle(self) -> OpticsCovariance:
-        """Errors of the optics in the middle of the field, without those of its terms."""
-        return self._without({*FIELD_TERMS, *MOVES})
-
-    @property
-    def at_rest(self) -> OpticsCovariance:
-        """Errors of the microscope, without those of how its focus moved in a movie."""
-        return self._without({*MOVES})
-
-    def _without(self, left_out: set[str]) -> OpticsCovariance:
-        kept = [k for k, name in enumerate(self.names) if name not in left_out]
-        matrix = tuple(tuple(self.matrix[i][k] for k in kept) for i in kept)
-        return OpticsCovariance(names=tuple(self.names[k] for k in kept), matrix=matrix)
-
-    @model_validator(mode="after")
-    def _symmetric(self) -> OpticsCovariance:
-        size = len(self.names)
-        known = (*MEASURABLE, *FIELD_TERMS, *MOVES)
-        unknown = [name for name in self.names if name not in known]
-        if unknown:
-            raise ValueError(f"names has {unknown[0]}, which is none of {', '.join(known)}")
-        if len(self.matrix) != size or any(len(row) != size for row in self.matrix):
-            raise ValueError(f"matrix needs {size} rows of {size} numbers, one for each of names")
-        for i, row in enumerate(self.matrix):
-            for j in range(i):
-                room = 1e-6 * math.sqrt(abs(row[i] * self.matrix[j][j]))
-                if abs(row[j] - self.matrix[j][i]) > room:
-                    raise ValueError(f"matrix is not symmetric in {self.names[i]}, {self.names[j]}")
-            if row[i] < 0:
-                raise ValueError(f"matrix gives {self.names[i]} a negative variance")
-        return self
 
 
 class Optics(FieldTerms):
@@ -457,6 +396,13 @@ class Particle(Section):
     def nominal_diameter_nm(self) -> float:
         """Diameter of a sphere of the nominal mass [nm]."""
         return sphere_diameter_nm(self.nominal_mass_kda, self.density)
+
+    @property
+    def given_index(self) -> complex | None:
+        """Refractive index that is given, else None: that of the kind depends on the wavelength."""
+        if self.permittivity is not None:
+            return cmath.sqrt(complex(*self.permittivity))
+        return None if self.index is None else complex(self.index)
 
     @property
     def is_sphere(self) -> bool:

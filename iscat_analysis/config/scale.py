@@ -6,7 +6,8 @@ from typing import Annotated
 
 from pydantic import Field, model_validator
 
-from iscat_analysis.config.instrument import Optics, OpticsCovariance
+from iscat_analysis.config.covariance import OpticsCovariance
+from iscat_analysis.config.instrument import Optics
 from iscat_analysis.config.values import LARGEST_NM, Finite, NonNegative, Positive, Section, length
 
 CONTRAST_PER_KDA = (1e-7, 0.01)

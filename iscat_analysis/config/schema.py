@@ -212,16 +212,11 @@ def sphere_refusal(config: Config) -> str:
             f"fit.diameter_range_nm = {list(fit.diameter_range_nm)} begins below twice "
             f"particle.shell_nm = {particle.shell_nm:g}, where the shell has no core"
         )
-    parts = {"particle.index": particle.index, "particle.shell_index": particle.shell_index}
-    known = {name: index for name, index in parts.items() if index is not None}
-    if (
-        known and (particle.index is not None or particle.model == "shell")
-        and all(abs(index / optics.n_sample - 1) < INVISIBLE for index in known.values())
-    ):  # fmt: skip
-        name, index = next(iter(known.items()))
+    indices = [particle.given_index, *([particle.shell_index] if particle.model == "shell" else [])]
+    if all(n is not None and abs(n / optics.n_sample - 1) < INVISIBLE for n in indices):
         return (
-            f"{name} = {index:g} is that of the sample, optics.n_sample = {optics.n_sample:g}: "
-            "such a particle scatters no light"
+            f"the refractive index of the particle is that of the sample, optics.n_sample = "
+            f"{optics.n_sample:g}: such a particle scatters no light"
         )
     lowest = particle.nominal_height_nm
     if lowest < diameter / 2 * (1 - 1e-9):

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, DataError, IscatError
+from iscat_analysis.errors import ConfigError, IscatError
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.folders import files_of
@@ -94,7 +94,7 @@ class _Growing:
                 table = analyse(seen, self._config).table
         except ConfigError:
             raise
-        except (DataError, IscatError) as error:
+        except IscatError as error:
             self._say(f"not yet: {error}")
             return
         self._analysed = frames

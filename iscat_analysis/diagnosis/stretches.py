@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.sliding import SHORTEST_MOVIE
@@ -123,7 +123,7 @@ def find_stretches(
         return _breaks_within(movie, span)
     between = _between(span, given)
     if between is None:
-        raise ConfigError(
+        raise DataError(
             f"{movie.name}: fit.excluded_frames leaves no {SHORTEST_MOVIE} frames together, which "
             "an analysis needs"
         )

@@ -8,14 +8,20 @@ time, and whatever the model gets wrong about it, drops out, and what is left is
 Parts of n frames each see the noise at that length and at shorter ones.  The longest that fits is
 half a window; noise that is slower shows in the estimate and not between its parts.  It is seen
 where there is no particle, see `iscat_analysis.search.empty`.
+
+Contrast that fluctuates while the particle is there shows on one side of the step only.  The cosine
+transform of the frames of one side has components that are independent and of unit variance if the
+noise is white; the first, the mean, is left out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import dct
 
 from iscat_analysis._kernels.noise import FLOOR
 from iscat_analysis._kernels.stepping import frame_scores, spreads
@@ -29,6 +35,13 @@ PARTS = 8
 
 LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100, 150, 200, 300, 500, 700, 1000)
 """Frames averaged, for the spread as a function of them."""
+
+
+MODES = (1, 2, 3, 4, 5, 7, 10, 14, 20, 28, 40, 56, 80, 112, 160, 320, 640, 1280, 2560)
+"""Edges of the bins of cosine components; number j has j half periods on one side of a step."""
+
+BLOCK_ROWS = 1 + len(LENGTHS)
+"""Rows of a record that compare parts; those of the spectra before and after follow."""
 
 
 @dataclass(frozen=True)
@@ -120,16 +133,49 @@ def series_of(
 
 
 def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
-    """Compare the estimates from the parts of all windows of one event.
+    """Compare the estimates from the parts of all windows of one event, and add their spectra.
 
-    Shapes: result (1 + len(LENGTHS).
+    The last window is the one after the step.
+
+    Shapes: result (BLOCK_ROWS + 2 (len(MODES) - 1), n + 1).
     """
-    out = np.zeros((1 + len(LENGTHS), len(windows[0].values) + 1))
-    for series in windows:
+    out = np.zeros((BLOCK_ROWS, len(windows[0].values) + 1))
+    spectra = np.zeros((2, len(MODES) - 1, out.shape[1]))
+    for side, series in zip((1, 0), reversed(windows), strict=False):
         frames = series.power.size
         edges = np.linspace(0, frames, min(PARTS, frames) + 1).round().astype(np.int64)
         spreads(
             series.values, series.power, series.shot, series.read, edges,
             np.array(LENGTHS, dtype=np.int64), out,
         )  # fmt: skip
+        spectra[side] = _spectrum(series)
+    return np.concatenate([out, *spectra])
+
+
+def spectra_of(repeats: FloatArray) -> FloatArray:
+    """Take the spectra before and after out of the records of events.
+
+    Shapes: `repeats` (events, rows, n + 1), result (events, 2, len(MODES) - 1, n + 1).
+    """
+    events, _, columns = repeats.shape
+    return repeats[:, BLOCK_ROWS:].reshape(events, 2, len(MODES) - 1, columns)
+
+
+def _spectrum(series: Series) -> FloatArray:
+    """Sum the squared cosine components over bins; the last column counts them.
+
+    Shapes: result (len(MODES) - 1, n + 1).
+    """
+    out = np.zeros((len(MODES) - 1, len(series.values) + 1))
+    power = series.power
+    if power.size < 2:
+        return out
+    light = series.shot[:, None] * power + series.read[:, None] * np.ones(power.size)
+    weight = power**2 / light
+    value = series.values / power
+    mean = np.sum(weight * value, axis=1) / np.sum(weight, axis=1)
+    squares = dct((value - mean[:, None]) * np.sqrt(weight), axis=1, norm="ortho") ** 2
+    for b, (first, stop) in enumerate(pairwise(MODES)):
+        part = squares[:, first:stop]
+        out[b, :-1], out[b, -1] = part.sum(axis=1), part.shape[1]
     return out

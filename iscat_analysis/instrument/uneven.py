@@ -306,9 +306,8 @@ class _Wishes:
         largest = zip(self.asked.names, changes.tolist(), strict=True)
         if all(change < LEAST_CHANGE.get(base, LEAST_TERM_NM) for base, change in largest):
             return None
-        clearness = significance - 2 * math.log(
-            trials
-        )  # the likeliest of many is so by chance, too
+        # the likeliest of many is so by chance, too
+        clearness = significance - 2 * math.log(trials)
         return Change(kind, terms, clearness, rise_nm(terms, self.view.frames))
 
 

@@ -105,9 +105,14 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
 
 
 def is_movie(address: Path) -> bool:
-    """Tell whether an address names a movie, and not a folder that may hold some."""
+    """Tell whether an address names a movie, and not a folder that may hold some.
+
+    What is not there yet is a movie if its name ends as that of one.
+    """
     path, part = split_address(address)
-    return bool(part) or not path.is_dir() or path.suffix.lower() == _ZARR
+    suffix = path.suffix.lower()
+    named = suffix == _ZARR or (suffix in SUFFIXES and not path.is_dir())
+    return bool(part) or named or path.is_file()
 
 
 def _is_movie(path: Path) -> bool:

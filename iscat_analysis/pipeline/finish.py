@@ -105,7 +105,8 @@ def make_analysis(
             run.warn(doubt)
     scaled = config.fit.sigma == "measured"
     if found.repeats:
-        had = ("mass_kda",) if rows.fluctuation is not None else ()  # by σ
+        seen = rows.fluctuation is not None and rows.fluctuation.is_seen
+        had = ("mass_kda",) if seen else ()  # by σ
         verdict = spread_verdict(
             {name: one for name, one in achieved.items() if name not in had}, found.summary,
             scaled=scaled, rejected=bool(rejection(table)),

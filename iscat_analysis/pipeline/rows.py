@@ -26,7 +26,7 @@ from iscat_analysis.records import (
     with_diameters,
 )
 from iscat_analysis.tracking.tracked_optics import mass_error
-from iscat_analysis.trust.budget import budget_of
+from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
@@ -71,13 +71,15 @@ def reported_rows(
     if extension is not None:
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
     changing_light = ""
+    shared_place = np.zeros(len(fits), dtype=bool)
     if found.heading == "landing":
-        resolution_nm = config.optics.wavelength_nm / config.optics.na
-        fits, changing_light = _with_changing(fits, evidence, resolution_nm)
+        shared_place = at_a_shared_place(fits, config.optics.wavelength_nm / config.optics.na)
+        fits = flagged(fits, Status.CHANGING, shared_place)
+        fits, changing_light = _with_changing(fits, evidence)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
-        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved)
+        fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved, shared_place)
     if fluctuation is not None:
         sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
         fits = fits.assign(sigma_mass_kda=sigma)
@@ -97,19 +99,15 @@ def reported_rows(
     table = make_rows(fits, columns)
     if mode == "size":
         table = with_diameters(table, config.particle.density)
+    unknown = SPHERES if mode == "size" else SCALE if config.calibration is None else None
     budget = budget_of(
-        table, shared, achieved,
-        calibrated=config.calibration is not None or mode == "size",
-        scaled=config.fit.sigma == "measured",
+        table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_changing(
-    fits: pd.DataFrame, evidence: Evidence | None, resolution_nm: float
-) -> tuple[pd.DataFrame, str]:
+def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
-    fits = flagged(fits, Status.CHANGING, at_a_shared_place(fits, resolution_nm))
     if evidence is None:
         return fits, ""
     unseen, frames = may_rise(fits, evidence)

@@ -322,7 +322,8 @@ class Extension(Closed):
 class Fluctuation(Closed):
     """Slow fluctuation of contrasts while particles are there, part of sigma_mass_kda."""
 
-    relative: NotNegative = key("Standard deviation over the contrast")
+    probability: Share = key("Probability that contrasts fluctuate")
+    relative: NotNegative = key("Standard deviation over the contrast, if they do")
     relative_se: NotNegative = key("Its standard error")
     frames: NotNegative = key("Correlation time [frames]")
 
@@ -447,7 +448,9 @@ class Summary(Document):
     )
     heights: Heights = maybe("Mode mass: mean and spread of the heights")
     extension: Extension = maybe("Mode mass: width of the images beyond that of the model")
-    fluctuation: Fluctuation = maybe("Mode mass: slow fluctuation of contrasts, if it is seen")
+    fluctuation: Fluctuation = maybe(
+        "Mode mass: slow fluctuation of contrasts, if the frames speak for one"
+    )
     repeats: Repeats = maybe("Whether the measured spread agrees with σ")
     lines: Lines = maybe(
         "If rows, columns or a smooth part of the light changed, and were corrected"

@@ -13,6 +13,12 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.trust.systematic import Contribution
 
+SCALE = "scale of the model", "measure standards (iscat calibrate mass)"
+"""What nobody knows of masses without standards, and what tells it."""
+
+SPHERES = "index and density of the spheres", "measure spheres of known diameter"
+"""The same of spheres, whose masses follow from their pictures with these."""
+
 _LEAST_WIDTH = 0.25  # of σ: a width beneath it is not worth a line
 _CLEAR_SIGMAS = 3.0  # standard errors by which noise is more than σ says
 
@@ -22,12 +28,13 @@ def budget_of(
     found: Sequence[Contribution],
     achieved: Mapping[str, EmpiricalSpread],
     *,
-    calibrated: bool,
+    unknown: tuple[str, str] | None,
     scaled: bool,
 ) -> list[dict[str, Any]]:
     """List what the error of a mass is made of: medians over the rows that are ok.
 
-    Sources that are common to all rows add up to ``systematic_mass_kda``.
+    Sources that are common to all rows add up to ``systematic_mass_kda``.  What is `unknown` has a
+    name and a remedy, and no size.
     """
     good = table["status"] == Status.OK.value
     rows = table[good] if good.any() else table
@@ -63,12 +70,13 @@ def budget_of(
         for source, errors in found
         if "mass_kda" in errors
     ]  # fmt: skip
-    if not calibrated:
+    if unknown is not None:
+        name, remedy = unknown
         common.append(
             {
-                "name": "scale of the model", "kind": "assumed", "common": True,
+                "name": name, "kind": "assumed", "common": True,
                 "sigma_mass_kda": None, "sigma_rel": None, "dof": None,
-                "remedy": "measure standards (iscat calibrate mass)",
+                "remedy": remedy,
             }
         )  # fmt: skip
     return budget + sorted(common, key=lambda one: -(one["sigma_mass_kda"] or math.inf))
@@ -113,8 +121,8 @@ def width_warning(across: Sequence[Mapping[str, Any]], *, calibrated: bool) -> s
     wide = []
     for one in across:
         low, width = one["width_low"], one["width_kda"]
-        if low is None or width is None or not math.isfinite(low):
-            continue
+        if low is None or width is None or not math.isfinite(low) or not one["mass_kda"]:
+            continue  # nothing is a share of no mass
         sigma = width / math.sqrt(max(one["spread_over_sigma"] ** 2 - 1, 1e-12))
         if low > max(one["explained_kda"], _LEAST_WIDTH * sigma):
             wide.append((one, width, low))

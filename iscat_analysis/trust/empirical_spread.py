@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
+from iscat_analysis.inference.split_frames import BLOCK_ROWS
 from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status
 from iscat_analysis.search.empty import EmptySpread
 
@@ -32,7 +33,7 @@ def measure_spread(
     ]
     if not kept:
         return {}
-    own = np.stack(kept)
+    own = np.stack(kept)[:, :BLOCK_ROWS]
     found: dict[str, EmpiricalSpread] = {}
     for k, name in enumerate(FREE_PARAMETERS[mode]):
         if empty is None:

@@ -83,6 +83,15 @@ class Response:
         moved: FloatArray = self.at(self.model.height_nm, np.array([self.faint_amplitude]))[0, 3]
         return moved
 
+    def to_contrast(self, z_nm: float, amplitude: float) -> float:
+        """Relative shift of the amplitude per share by which a picture is stronger."""
+        theta = self.theta(z_nm, amplitude)
+        signal, _ = self.model.amplitude_gradient(self.grid, *theta[:4].tolist())
+        whole = joint_information(self.expected(theta), theta, (), [signal])
+        chosen = np.concatenate([[0], 1 + self._kept])
+        moved = imitation(whole[np.ix_(chosen, chosen)], 1)
+        return -float(moved[self._row_of_mass, 0]) / amplitude
+
     @property
     def faint_amplitude(self) -> float:
         """Amplitude of a particle whose scattered light alone is negligible."""
@@ -108,8 +117,12 @@ class Response:
         )
         optics = (inverse @ (information[1:, 0] / size)) / size
         moved = imitation(whole, count)
-        row = int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
+        row = self._row_of_mass
         return float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics
+
+    @property
+    def _row_of_mass(self) -> int:
+        return int(np.flatnonzero(self._kept == PARAMETERS.index("mass_kda"))[0])
 
     @property
     def _kept(self) -> NDArray[np.intp]:

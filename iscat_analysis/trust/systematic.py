@@ -75,6 +75,8 @@ class Source:
     errors: Errors
     remedy: str
     dof: float | None = None
+    moves: bool = True
+    """Whether it can make anything wrong; else it is named in the budget alone."""
 
 
 def sources_of(
@@ -146,11 +148,13 @@ def contributions(
 def total(found: Sequence[Contribution], rows: int) -> dict[str, FloatArray]:
     """Add independent contributions in quadrature.
 
+    A source that moves nothing by its nature does not make the error known.
+
     Shapes: result (rows,) each.
     """
     squares: dict[str, FloatArray] = {}
-    for _, errors in found:
-        for name, sigma in errors.items():
+    for source, errors in found:
+        for name, sigma in errors.items() if source.moves else ():
             squares[name] = squares.get(name, np.zeros(rows)) + np.square(sigma)
     sums = {name: np.sqrt(squares[name]) for name in COMMON if name in squares}
     return {name: np.where(sigma > _NOTHING, sigma, 0.0) for name, sigma in sums.items()}
@@ -193,13 +197,26 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
                      "a calibration of the camera (iscat calibrate camera)")  # fmt: skip
     if camera.get("gain_e_per_adu") is not None:
         yield Source("gain of the camera", "measured", partial(_as_a_share, 0.0),
-                     "nothing: it changes sigma, and no mass")  # fmt: skip
+                     "nothing: it changes sigma, and no mass", moves=False)  # fmt: skip
 
 
 def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
-    """Give the same share of all masses."""
-    del config
-    return {"mass_kda": share * np.abs(table["mass_kda"].to_numpy(float))}
+    """Give what contrasts that are all wrong by a share do to masses.
+
+    Masses of dipoles are wrong by that share.  The contrast of a sphere is not in proportion to its
+    mass, and its picture changes with it.
+    """
+    mass = np.abs(table["mass_kda"].to_numpy(float))
+    if config.fit.mode != "size" or not share:
+        return {"mass_kda": share * mass}
+    known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
+    if not known.any():
+        return {}
+    respond = response_of(config, table, ())
+    places = table.loc[known, ["z_nm", "mass_kda"]].to_numpy(float).tolist()
+    out = np.full(mass.size, np.nan)
+    out[known] = [abs(share * respond.to_contrast(z, kda)) * kda for z, kda in places]
+    return {"mass_kda": out}
 
 
 def _of_the_selection(

@@ -371,11 +371,12 @@ def test_bounds_prints_tables_or_json(capsys) -> None:
     assert result["per_photon"]["crb_joint"]["z_nm"] is None
 
 
-def test_config_prints_a_file_that_reads_back(capsys, tmp_path) -> None:
-    assert main(["config", "--mode", "joint"]) == 0
+@pytest.mark.parametrize(("mode", "more"), [("joint", []), ("size", ["particle.model=mie"])])
+def test_config_prints_a_file_that_reads_back(mode: str, more: list[str], capsys, tmp_path) -> None:
+    assert main(["config", "--mode", mode]) == 0
     path = tmp_path / "setup.toml"
     path.write_text(capsys.readouterr().out)
-    assert load_config(path) == load_config(None, ["fit.mode=joint"])
+    assert load_config(path) == load_config(None, [f"fit.mode={mode}", *more])
 
 
 # ---- help ------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ import miepython
 import numpy as np
 import pandas as pd
 import pytest
+import scipy.optimize
 from numpy.polynomial import Legendre, Polynomial
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients
 from iscat_analysis.records import PARAMETERS
+from iscat_analysis.trust.response import response_of
 from iscat_analysis.units import sphere_mass_kda
 
 ComplexArray = NDArray[np.complex128]
@@ -272,6 +274,10 @@ BAD = [
     ({"particle": {"diameter_nm": 5000.0}}, "larger than the square"),
     ({"particle": {"height_nm": 20.0}}, "reach into the coverslip"),
     ({"particle": {"kind": "custom", "index": 1.33, "density_kg_m3": 1000.0}}, "scatters no light"),
+    ({"particle": {"kind": "custom", "permittivity": [1.33**2, 0.0], "density_kg_m3": 1000.0}},
+     "scatters no light"),
+    ({"particle": {"model": "shell", "kind": "custom", "index": 1.33, "shell_nm": 5.0,
+                   "shell_index": 1.33, "density_kg_m3": 1000.0}}, "scatters no light"),
     ({"particle": {"model": "shell", "shell_nm": 90.0, "shell_index": 1.48,
                    "density_kg_m3": 1000.0}}, "more than the radius"),
     ({"particle": {"model": "shell", "shell_nm": 5.0}}, "needs shell_index"),
@@ -289,6 +295,17 @@ def test_what_cannot_be_is_said(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(Exception, match=message) as caught:
         of("iscat", **changes)
     assert type(caught.value).__name__ == "ConfigError"
+
+
+def test_a_part_that_is_seen_is_enough() -> None:
+    """A shell of the sample's index around silica, and a vesicle full of the sample, are seen."""
+    shell = {"model": "shell", "shell_nm": 5.0, "density_kg_m3": 1500.0}
+    for more in (
+        {"kind": "silica", "shell_index": 1.33},
+        {"kind": "custom", "index": 1.33, "shell_index": 1.46},
+        {"kind": "custom", "permittivity": [1.33**2, 0.1], "shell_index": 1.33},
+    ):
+        assert of("iscat", particle=shell | more).particle.is_sphere
 
 
 def test_a_bubble_has_the_other_sign() -> None:
@@ -400,3 +417,29 @@ def test_a_shell_of_the_same_index_is_none() -> None:
     )  # fmt: skip
     assert np.abs(shell - solid).max() < 1e-8 * np.abs(solid).max()
     assert np.abs(vesicle).max() < 0.7 * np.abs(solid).max()
+
+
+def test_contrasts_that_are_all_wrong_make_masses_of_spheres_wrong_by_more() -> None:
+    """Against a least-squares fit of a picture that is one per cent stronger."""
+    config = of("iscat", particle={"diameter_nm": 180.0, "height_nm": "contact"})
+    respond = response_of(config, pd.DataFrame({"n_before": [1000], "n_after": [1000]}), ())
+    truth = respond.theta(90.0, sphere_mass_kda(180.0, config.particle.density))
+    scale = np.array([1.0, 1.0, 1.0, truth[3] / 100, 0.01])
+
+    def picture(steps: np.ndarray) -> np.ndarray:
+        x, y, z, mass, level = truth + steps * scale
+        return respond.model.amplitude_image(respond.grid, x, y, z, mass) + level
+
+    signal = picture(np.zeros(5))
+    weight = 1 / np.sqrt((1 + signal) * (2 + signal))  # noise of both windows
+    free = np.array([True, True, True, True, respond.level])
+
+    def left(some: np.ndarray) -> np.ndarray:
+        steps = np.zeros(5)
+        steps[free] = some
+        return ((picture(steps) - 1.01 * signal) * weight).ravel()
+
+    found = scipy.optimize.least_squares(left, np.zeros(free.sum()), x_scale=1.0).x[3]
+    told = respond.to_contrast(90.0, float(truth[3]))
+    assert told == pytest.approx(found, rel=0.02)
+    assert found > 1.2  # that of a dipole is 1

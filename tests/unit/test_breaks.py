@@ -140,7 +140,7 @@ def test_frames_are_left_out_where_somebody_says() -> None:
 
 def test_frames_are_left_out_of_landing_movies_only() -> None:
     movie = _counted(_light(1)[:60])
-    with pytest.raises(ConfigError, match="excluded_frames leaves no"):
+    with pytest.raises(DataError, match="excluded_frames leaves no"):
         ia.fit_movie(movie, config=_config(fit={"excluded_frames": [[4, 56]]}))
     fixed = {"method": "fixed", "frames": [0, 30], "window_frames": None}
     with pytest.raises(ConfigError, match="of landing movies only"):

@@ -305,7 +305,8 @@ def test_toml_reads_back_to_an_equal_configuration(config: Config, comments: boo
 
 @pytest.mark.parametrize("mode", get_args(Mode))
 def test_the_printed_configuration_is_complete_and_explained(mode: str) -> None:
-    config = load_config(None, [f"fit.mode={mode}"])
+    sphere = ["particle.model=mie"] if mode not in DIPOLE_MODES else []
+    config = load_config(None, [f"fit.mode={mode}", *sphere])
     text = config_to_toml(config)
     assert parse_config(tomllib.loads(text)) == config
     for name, field in Config.model_fields.items():
@@ -326,7 +327,7 @@ def test_the_printed_configuration_is_complete_and_explained(mode: str) -> None:
 
 
 def test_the_sample_configurations_are_one_per_mode(sample_configs: dict[str, Path]) -> None:
-    for mode in ("mass", "localize", "joint"):
+    for mode in ("mass", "localize", "joint", "size"):
         assert load_config(sample_configs[mode]).fit.mode == mode
 
 

@@ -140,6 +140,19 @@ def test_what_is_wrong_with_the_setup_is_not_waited_for(
         watch_movie(tmp_path / "movie.npy", wrong, out=tmp_path / "out", interval_s=0.01)
 
 
+def test_frames_beyond_those_that_are_left_out_are_waited_for(
+    config: Config, counts: np.ndarray, tmp_path: Path
+) -> None:
+    """What is wrong with the frames that are there may be right with those that come."""
+    np.save(tmp_path / "movie.npy", counts[:80])
+    excluded = configure(config, settings={"fit.excluded_frames": [[0, 75]]})
+    said: list[str] = []
+    growing._Growing(tmp_path / "movie.npy", excluded, said.append).analyse_what_is_there()
+    (line,) = said
+    assert line.startswith("not yet: ")
+    assert "fit.excluded_frames leaves no" in line
+
+
 def test_it_waits_for_a_file_that_is_not_there_yet(config: Config, tmp_path: Path) -> None:
     said: list[str] = []
     stop = threading.Event()

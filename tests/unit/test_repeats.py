@@ -107,7 +107,7 @@ def test_squares_come_to_their_number_times_the_excess(factor: float) -> None:
     power = rng.uniform(0.8, 1.2, 320)
     shot, read = np.array([3.0, 0.5]), np.array([1.0, 0.2])
     spread = np.sqrt(factor * (shot[:, None] * power + read[:, None]))
-    found = np.zeros((1 + len(LENGTHS), 3))
+    found = np.zeros_like(repeats_of((Series(np.zeros((2, 0)), np.zeros(0), shot, read),)))
     for _ in range(300):
         values = 7.0 * power + spread * rng.standard_normal((2, power.size))
         found += repeats_of((Series(values, power, shot, read),))

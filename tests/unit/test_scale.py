@@ -252,7 +252,7 @@ def test_the_budget_adds_up_to_the_column() -> None:
     )  # fmt: skip
     table = _event()
     found = contributions(config, table)
-    budget = budget_of(table, found, {}, calibrated=True, scaled=False)
+    budget = budget_of(table, found, {}, unknown=None, scaled=False)
     shared = [one for one in budget if one["common"]]
     whole = float(np.sqrt(sum(one["sigma_mass_kda"] ** 2 for one in shared)))
     assert whole == pytest.approx(total(found, 1)["mass_kda"][0], rel=1e-9)
@@ -296,9 +296,11 @@ def test_the_budget_has_the_camera(
 ) -> None:
     camera = {**MEASURED, "offset_adu": MEASURED["offset_adu"] | offset}
     found = contributions(_config(), _event(), camera=camera)
-    budget = budget_of(_event(), found, {}, calibrated=True, scaled=False)
+    budget = budget_of(_event(), found, {}, unknown=None, scaled=False)
     lines = {one["name"].split(",")[0]: one for one in budget if "camera" in one["name"]}
     assert lines.pop("gain of the camera")["sigma_rel"] == 0  # it changes sigma alone
+    gain = [(source, errors) for source, errors in found if source.name == "gain of the camera"]
+    assert total(gain, 1) == {}  # and nothing is said to be known
     said = {name.removesuffix(" of the camera") if "lin" in name else name: one
             for name, one in lines.items()}  # fmt: skip
     assert {name: (one["sigma_rel"], one["kind"]) for name, one in said.items()} == {

@@ -192,3 +192,7 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
         chunks_module.choose_tiles(reader, small, 100, 25, 10_000)
+    longer = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64000"])
+    with pytest.raises(DataError, match=r"4 GB hold 868 of 1920 x 1200 pixels: lower"):
+        chunks_module.choose_tiles(reader, longer, 400, 100, 10_000)  # no memory is enough
+    chunks_module.choose_tiles(reader, longer, 150, 37, 10_000)  # control

@@ -321,6 +321,11 @@ def test_what_cannot_be_watched_is_refused_at_once(folder: Path, capsys) -> None
     ):
         assert main(["watch", *options]) == 2, said
         assert said in capsys.readouterr().err
+    (folder / "one.npy").write_bytes(b"")
+    for option, value in (("--standards", "66"), ("--kd-masses", "66,132"), ("--scheduler", "x:1")):
+        assert main(["watch", str(folder / "one.npy"), option, value]) == 2
+        assert f"{option} is for a folder of movies" in capsys.readouterr().err
+    (folder / "one.npy").unlink()
     (folder / "samples.csv").write_text("path,role\n")
     (folder / "samples.toml").write_text("")
     with pytest.raises(ConfigError, match=r"samples.csv and samples.toml"):

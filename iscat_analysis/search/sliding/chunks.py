@@ -422,8 +422,15 @@ def choose_tiles(
             if best is None or work < best[0]:
                 best = work, (high, wide), core
     if best is None:
+        needed = min(2 * halo + stride, frames)
+        if needed > longest:
+            raise DataError(
+                f"{reader.name}: windows of {window} frames need {needed} frames at a time, and "
+                f"{_SPAN_BYTES / 1e9:g} GB hold {longest} of {columns} x {rows} pixels: lower "
+                "background.window_frames, or cut the field"
+            )
         pixels = (smallest + 2 * side) ** 2
-        least = pixels * (_TILE_BYTES + per_frame * (2 * halo + stride)) / MEMORY_SHARE / 1e6
+        least = pixels * (_TILE_BYTES + per_frame * needed) / MEMORY_SHARE / 1e6
         raise DataError(
             f"{reader.name}: windows of {window} frames of {columns} x {rows} pixels need "
             f"compute.memory_limit_mb = {math.ceil(least)}; raise it, or lower "
