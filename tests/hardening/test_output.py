@@ -74,8 +74,9 @@ class Runner:
     answer is ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, kernels: Path) -> None:
         self.bench = folder
+        self.kernels = kernels
 
     @cached_property
     def duration(self) -> float:
@@ -110,7 +111,10 @@ class Runner:
             process = subprocess.Popen(
                 [sys.executable, str(script), told], cwd=order["cwd"], pass_fds=[ready],
                 stdout=subprocess.DEVNULL, stderr=err,
-                env={**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"},
+                env={
+                    **os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1",
+                    "NUMBA_CACHE_DIR": str(self.kernels),
+                },
             )  # fmt: skip
             os.close(ready)
             os.read(begun, 1)
@@ -134,7 +138,10 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     bench = tmp_path_factory.mktemp("bench")
     (bench / "setup.toml").write_text(SETUP)
     write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
-    runner = Runner(bench)
+    # Kernels of their own, which no other test compiles again while files may not grow.
+    kernels = tmp_path_factory.mktemp("kernels")
+    shutil.copytree(os.environ["NUMBA_CACHE_DIR"], kernels, dirs_exist_ok=True)
+    runner = Runner(bench, kernels)
     # In a process of its own, at whose end all that it compiled is kept for those that are killed.
     (first,) = runner.run({"run": FIT, "cwd": str(bench)})
     assert first["status"] == 0, first["err"]

@@ -301,7 +301,7 @@ def test_fields_of_movers_add_before_they_are_squared(samples: int) -> None:
     movie = Movie(config, 5)
     frames = list(movie.expected_frames())
     model, grid = movie._model, movie._grid
-    stands = movie._field_of(movie.particles[0])
+    stands = movie._field_of(movie.particles[0], 0)
     for t in range(3):
         total = np.zeros(grid.shape)
         pairs = [(a, b) for a in movie.movers[0].points_nm[t] for b in movie.movers[1].points_nm[t]]

@@ -31,7 +31,7 @@ SIGMAS = 4.0
 FAR = 5.0
 BOUND_REACHED = 0.05
 HEAVY = ("systematic_mass_kda",)
-"""Of 1.7 MDa, where the square of the scattered light is more than half an error of the mass."""
+"""The light that does not interfere, of 1.7 MDa, is more than half an error of the mass."""
 
 SMALL = {
     "background": {"frames": [0, 30]},
@@ -412,7 +412,7 @@ def test_saturation_beside_a_particle_is_flagged(tmp_path: Path) -> None:
 def test_nothing_is_found_where_nothing_is(tmp_path: Path) -> None:
     analysis, _ = _run(_small(simulation={"events": []}), tmp_path)
     assert analysis.table.empty
-    assert tuple(analysis.table.columns) == EVENT_COLUMNS
+    assert tuple(analysis.table.columns) == (*EVENT_COLUMNS, *HEAVY)
     assert (tmp_path / "movie.iscat" / "report.html").is_file()
 
 
