@@ -56,7 +56,7 @@ _BUSY_S = 1.0  # that a job waits where its worker is busy, before it goes to an
 _MOST_AT_ONCE = 1000
 _BASE_MB = 400  # of a process, beside the pixels
 _LIBRARIES = "iscat-analysis[dask]"
-_LARGE_BYTES = 20e6  # of a movie whose job is worth the start of a process
+_LARGE_BYTES = 60e6  # of a movie whose job is worth the start of a process
 _IMPORTED = ("iscat_analysis.report.page", "iscat_analysis.landing.chunk_work")
 _LOST = (
     "the second process was ended from outside, most likely because memory ran out; its part is "
