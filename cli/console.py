@@ -204,7 +204,7 @@ def failures(messages: Messages) -> Iterator[None]:
             messages.error(f"interrupted: {text}" if text else "interrupted")
             raise typer.Exit(INTERRUPTED) from None
         except Exception as error:
-            if watched is not None and watched.lost:  # and this is what the compiler made of it
+            if watched is not None and watched.answer_lost():  # the compiler made this of it
                 messages.error("interrupted")
                 raise typer.Exit(INTERRUPTED) from None
             if debug:

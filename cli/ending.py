@@ -72,6 +72,11 @@ class Interrupts:
         else:
             sys.__unraisablehook__(unraisable)
 
+    def answer_lost(self) -> bool:
+        """Tell whether an interrupt was lost; the caller answers it, and it is not raised again."""
+        self._swallowed = False
+        return self.lost
+
     def _watch(self) -> None:
         number = signal.Signals(signal.sigwait(self._numbers | {signal.SIGUSR1}))
         if number == signal.SIGUSR1:  # from `stop`
