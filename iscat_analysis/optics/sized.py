@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ class SizedModel(ForwardModel):
 
     @cached_property
     def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        given = {each.name: getattr(self, each.name) for each in fields(ForwardModel)}
+        given = _parts_of(self)
 
         def make(sphere: Sphere) -> ForwardModel:
             pupil = self.aperture.pupil
@@ -152,6 +153,10 @@ class SizedModel(ForwardModel):
 
 def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:
     """Make the model of spheres of all masses from that of one, with the diameters to search."""
-    given = {each.name: getattr(model, each.name) for each in fields(ForwardModel)}
     low, high = (sphere_mass_kda(diameter, sphere.density_kg_m3) for diameter in diameters_nm)
-    return SizedModel(**given, sphere=sphere, mass_range_kda=(low, high))
+    return SizedModel(**_parts_of(model), sphere=sphere, mass_range_kda=(low, high))
+
+
+def _parts_of(model: ForwardModel) -> dict[str, Any]:
+    """Name the parts of which a linear model is made."""
+    return {each.name: getattr(model, each.name) for each in fields(ForwardModel)}

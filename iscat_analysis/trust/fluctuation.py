@@ -105,13 +105,13 @@ class Fluctuation:
         evidence = _Evidence.of(
             squares, counts, there[good], (mass**2 / one)[good], taus, pooled, window
         )
+        if evidence.factor <= 1:
+            return None
         posterior = evidence.posterior
         variance = _RELATIVE[:, None] ** 2
         numbers, which = np.unique(there.astype(np.int64), return_inverse=True)
         left = np.array([[_of_mean(n, tau) for tau in taus] for n in numbers.tolist()])
         added = mass**2 * (left @ np.sum(posterior * variance, axis=0))[which]
-        if evidence.factor <= 1:
-            return None
         given = posterior / posterior.sum()
         mean = float(np.sum(given * _RELATIVE[:, None]))
         step = mean * math.log(_RELATIVE[1] / _RELATIVE[0])
