@@ -44,6 +44,16 @@ _SPIKE_SIGMAS = 6.0  # robust standard deviations of a pixel from the median of 
 _LEAST_PEAK_RATIO = 8.0  # least peak of a phase correlation over the noise of one of random phases
 
 
+def middle_of(shape: tuple[int, ...], most_px: int) -> tuple[slice, slice]:
+    """Index the middle of a large field, at most so many pixels wide: it moves as all of it does.
+
+    Shapes: the last two axes of `shape` are (y, x).
+    """
+    held = ((size, min(size, most_px)) for size in shape[-2:])
+    rows, columns = (slice((size - kept) // 2, (size + kept) // 2) for size, kept in held)
+    return rows, columns
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Shift of the fixed pattern with time."""

@@ -17,6 +17,7 @@ import numpy as np
 from scipy import fft
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import middle_of
 from iscat_analysis.records import BoolArray, FloatArray, FrameSource
 
 _PAIRS = 48  # of neighbouring frames, all over the movie
@@ -82,7 +83,7 @@ def find_processing(
 
     Where particles move, coarser patterns are of them, and do not tell what was smoothed.
     """
-    rows, columns = (_middle(length) for length in movie.shape[1:])
+    rows, columns = middle_of(movie.shape, _SIDE_PX)
     fine, coarse = _bands(rows.stop - rows.start, columns.stop - columns.start)
     found = []
     starts = np.unique(np.linspace(span[0], span[1] - 2, _PAIRS).astype(int))
@@ -119,12 +120,6 @@ def _uneven(values: FloatArray, chance: float) -> float:
     excess = scatter**2 - chance
     significant = excess > _LEAST_SIGMAS * chance * _MEDIAN_ERROR / math.sqrt(len(values))
     return math.sqrt(excess) if significant else 0.0
-
-
-def _middle(length: int) -> slice:
-    size = min(length, _SIDE_PX)
-    start = (length - size) // 2
-    return slice(start, start + size)
 
 
 def _bands(rows: int, columns: int) -> tuple[BoolArray, BoolArray]:

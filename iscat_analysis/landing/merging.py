@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.drift import Trajectory, measure_drift
+from iscat_analysis.camera.drift import Trajectory, measure_drift, middle_of
 from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
@@ -218,8 +218,9 @@ class MergedChunks:
             return [float(d) for d in way.shift_px[-1]]
         first = [done for k, done in enumerate(self._done) if self._opens(k)]
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
+        middle = middle_of(first[0].ends_e.shape, _DRIFT_PX)
         moved = [
-            measure_drift(_middle(a.ends_e[0]), _middle(b.ends_e[1]))
+            measure_drift(a.ends_e[0][middle], b.ends_e[1][middle])
             for a, b in zip(first, last, strict=True)
         ]
         dy, dx = np.sum(moved, axis=0).tolist()
@@ -234,15 +235,6 @@ class MergedChunks:
         """Defective and saturated pixels."""
         defective = self._masked & ~self._saturated
         return int(defective.sum()), int(self._saturated.sum())
-
-
-def _middle(image: FloatArray) -> FloatArray:
-    """Cut the middle out of a large image: its pattern moves as all of it does.
-
-    Shapes: `image` (y, x).
-    """
-    sides = (slice((n - min(n, _DRIFT_PX)) // 2, (n + min(n, _DRIFT_PX)) // 2) for n in image.shape)
-    return image[tuple(sides)]
 
 
 def is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Pattern, pattern_of
+from iscat_analysis.camera.drift import Pattern, middle_of, pattern_of
 from iscat_analysis.config import MOVES, Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
@@ -96,7 +96,7 @@ def _look(movie: Stack, camera: Camera, start: int, stop: int) -> _Seen:
     if used.any():
         steps = np.mean(np.diff(electrons, axis=0) ** 2, axis=0)
         noise = float(steps[used].sum() / (2 * expected[used].sum()))
-    return _Seen(float(power.mean()), noise, _middle(mean).copy())
+    return _Seen(float(power.mean()), noise, mean[middle_of(mean.shape, _PATTERN_PX)].copy())
 
 
 def _drift(
@@ -117,15 +117,6 @@ def _drift(
         if np.isfinite(shift).all():
             moved[number] = latest = origin + shift
     return _numbers(moved[:, 0]), _numbers(moved[:, 1])
-
-
-def _middle(image: FloatArray) -> FloatArray:
-    """Cut the middle of a large field out.
-
-    Shapes: `image` (y, x), result (y, x).
-    """
-    top, left = (max(side - _PATTERN_PX, 0) // 2 for side in image.shape)
-    return image[top : top + _PATTERN_PX, left : left + _PATTERN_PX]
 
 
 def _focus(config: Config, starts: Sequence[int]) -> list[float | None]:

@@ -276,19 +276,12 @@ def make_chunk(
 
     Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
-    rows, columns = counts.shape[1:]
     edges, blocks, highest = _sum_blocks(counts, good, camera, stride, check, mapper)
-    saturated = camera.saturated(highest.max(axis=0))
-    power = np.where(good, light_e, 0.0)
-    power /= power[good].mean()
-    total = blocks.sum(axis=0)
-    variance = camera.read_variance_e2((rows, columns))
-    usable = ~(saturated | defects(total, np.count_nonzero(good) * variance)) & (total > 0)
-    mean = total / power.sum()
-    return Chunk(
-        first, counts, good, power, camera, mean, usable, saturated, edges, blocks, check,
-        _nothing, float(mean.mean()),
+    sums = _judged(
+        (first, first + len(counts)), good, light_e, blocks.sum(axis=0), highest.max(axis=0),
+        camera, defects,
     )  # fmt: skip
+    return _chunk(counts, sums, camera, edges, blocks, check, _nothing)
 
 
 def sums_of(
@@ -300,17 +293,34 @@ def sums_of(
     camera: Camera,
     defects: Callable[[FloatArray, FloatArray], BoolArray],
 ) -> FieldSums:
-    """Say which light and which pixels some frames have, as `make_chunk` does.
+    """Say which light and which pixels some frames have.
 
     Shapes: `good, light_e` (t,), `total, highest` (y, x), in counts.
     """
-    frames = np.count_nonzero(good)
-    electrons = camera.gain_e_per_adu * (total - frames * np.asarray(camera.offset_adu))
+    dark = np.count_nonzero(good) * np.asarray(camera.offset_adu)
+    electrons = camera.gain_e_per_adu * (total - dark)
+    return _judged(span, good, light_e, electrons, highest, camera, defects)
+
+
+def _judged(
+    span: tuple[int, int],
+    good: BoolArray,
+    light_e: FloatArray,
+    electrons: FloatArray,
+    highest: NDArray[Any],
+    camera: Camera,
+    defects: Callable[[FloatArray, FloatArray], BoolArray],
+) -> FieldSums:
+    """Say which light frames have, and which pixels of their sum can be used.
+
+    Shapes: `good, light_e` (t,), `electrons, highest` (y, x).
+    """
     power = np.where(good, light_e, 0.0)
     power /= power[good].mean()
     saturated = camera.saturated(highest)
-    variance = camera.read_variance_e2((total.shape[0], total.shape[1]))
-    usable = ~(saturated | defects(electrons, frames * variance)) & (electrons > 0)
+    variance = camera.read_variance_e2((electrons.shape[0], electrons.shape[1]))
+    defective = defects(electrons, np.count_nonzero(good) * variance)
+    usable = ~(saturated | defective) & (electrons > 0)
     mean = electrons / power.sum()
     return FieldSums(span, good, power, float(mean.mean()), mean, usable, saturated)
 
@@ -336,6 +346,19 @@ def make_tile_chunk(
 
     edges, blocks, _ = _sum_blocks(counts, sums.good, camera, stride, check_and_let_go, mapper)
     let_go()
+    return _chunk(counts, sums, camera, edges, blocks, check, let_go)
+
+
+def _chunk(
+    counts: NDArray[Any],
+    sums: FieldSums,
+    camera: Camera,
+    edges: NDArray[np.int64],
+    blocks: FloatArray,
+    check: Callable[[], None],
+    let_go: Callable[[], None],
+) -> Chunk:
+    """Put frames, their blocks and what is known of them together."""
     return Chunk(
         sums.span[0], counts, sums.good, sums.power, camera, sums.mean_e, sums.usable,
         sums.saturated, edges, blocks, check, let_go, sums.level_e,
