@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from textwrap import fill
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -25,6 +26,7 @@ COLUMNS = [
 
 _COLORS = {"measured": BLUE, "learned": VERMILLION, "assumed": GREY}
 _SHORTEST = 1e-3  # of the longest bar; shorter ones are not drawn
+_LINE = 34  # letters of a name, beyond which it goes on below
 
 
 def _sized(analysis: Analysis) -> list[Mapping[str, Any]]:
@@ -69,7 +71,7 @@ def budget_figure(analysis: Analysis) -> Figure | None:
     known = [one for one in known if one["sigma_rel"] > _SHORTEST * known[0]["sigma_rel"]]
     if not known:
         return None
-    figure = new_figure(6.5, 0.7 + 0.28 * len(known))
+    figure = new_figure(6.5, 0.7 + 0.3 * len(known))
     axes = figure.add_subplot()
     for place, one in enumerate(known):
         axes.barh(
@@ -80,8 +82,8 @@ def budget_figure(analysis: Analysis) -> Figure | None:
             f" {one['kind']}{'' if one['common'] else ', each row its own'}",
             (100 * one["sigma_rel"], place), va="center", fontsize=8, color=INK,
         )  # fmt: skip
-    axes.set_yticks(range(len(known)), [one["name"] for one in known])
+    axes.set_yticks(range(len(known)), [fill(one["name"], _LINE) for one in known])
     axes.invert_yaxis()
-    axes.set_xlim(0, 135 * known[0]["sigma_rel"])
+    axes.set_xlim(0, 170 * known[0]["sigma_rel"])
     axes.set_xlabel("standard deviation over the mass [%]")
     return figure
