@@ -220,6 +220,11 @@ def breath_of_heavy(strength: float, seed: int) -> Case:
     return usual(alike(), seed, course=breathing(strength), masses=(430.0,))
 
 
+def slow_breath(strength: float, seed: int) -> Case:
+    """Let contrasts fluctuate by 5 %, with a memory of so many frames."""
+    return usual(alike(), seed, course=breathing(0.05, strength))
+
+
 def among(draw: Draw, kda: float, number: int, seed: int) -> Case:
     """Let bright ones land among proteins."""
     every = draw_landings(SHAPE, COUNT + number, seed=seed, masses=(1.0,), apart_px=APART_PX)
@@ -358,6 +363,9 @@ ROWS: Mapping[str, Row] = {
     "breathing": Row(breath, (0.05, 0.03, 0.1), "", "fluctuate|goes on changing"),
     "breathing of heavy ones": Row(
         breath_of_heavy, (0.05, 0.03, 0.1), "", "fluctuate|goes on changing"
+    ),
+    "slow fluctuation": Row(
+        slow_breath, (100.0, 20.0, 400.0), "frames", "fluctuate|goes on changing"
     ),
     "cone of illumination": Row(cone, (0.1, 0.05, 0.15), "rad", _MODEL),
     "two halves": Row(halves, (100.0, 50.0, 200.0), "nm", "wider|extended|apart"),

@@ -5,10 +5,10 @@
 
 Every row of the table (``_hazard_rows.py``) is one kind of harm at some strengths.  Over all movies
 of a row and strength it is told: how many particles have a row, and an ``ok`` one; the mean of
-value over truth of the ``ok`` rows, weighted by their σ, with its standard error from their
-scatter; the systematic error that they state; the bias over both together; the largest error of an
-``ok`` row over its own σ and systematic error; ``ok`` rows that are of no particle; the flags and
-the lines that name the cause.
+value over truth of the ``ok`` rows, weighted by the median σ of all of their mass, with its
+standard error from their scatter; the systematic error that they state; the bias over both
+together; the largest error of an ``ok`` row over its own σ and systematic error; ``ok`` rows that
+are of no particle; the flags and the lines that name the cause.
 
 A row keeps its promise where the bias of its ``ok`` rows lies within `SIGMAS` of both errors
 together, no more than one of 500 is beyond `BEYOND`, and no more are of no particle than false
@@ -124,7 +124,9 @@ def judge(name: str, row: Row, strength: float, seeds: range) -> dict[str, Any]:
     count = len(used)
     bias, error, stated = None, None, None
     if count > 1:
-        weight = np.square(used["true"] / used["sigma"])
+        # an error that grows with the mass would give weights that know how wrong a mass is
+        usual = used.groupby("true")["sigma"].transform("median")
+        weight = np.square(used["true"] / usual)
         weight /= weight.sum()
         bias = float(weight @ (relative - 1))
         spread = np.square(weight * (relative - 1 - bias)).sum() * count / (count - 1)

@@ -132,23 +132,25 @@ def series_of(
     )  # fmt: skip
 
 
-def repeats_of(windows: tuple[Series, ...]) -> FloatArray:
+def repeats_of(windows: tuple[Series, ...], longer: tuple[Series, ...] | None = None) -> FloatArray:
     """Compare the estimates from the parts of all windows of one event, and add their spectra.
 
-    The last window is the one after the step.
+    The last window is the one after the step.  Spectra are those of `longer` windows if there are
+    any, since a slow fluctuation shows in them alone.
 
     Shapes: result (BLOCK_ROWS + 2 (len(MODES) - 1), n + 1).
     """
     out = np.zeros((BLOCK_ROWS, len(windows[0].values) + 1))
     spectra = np.zeros((2, len(MODES) - 1, out.shape[1]))
-    for side, series in zip((1, 0), reversed(windows), strict=False):
+    for side, series in zip((1, 0), reversed(longer or windows), strict=False):
+        spectra[side] = _spectrum(series)
+    for series in windows:
         frames = series.power.size
         edges = np.linspace(0, frames, min(PARTS, frames) + 1).round().astype(np.int64)
         spreads(
             series.values, series.power, series.shot, series.read, edges,
             np.array(LENGTHS, dtype=np.int64), out,
         )  # fmt: skip
-        spectra[side] = _spectrum(series)
     return np.concatenate([out, *spectra])
 
 

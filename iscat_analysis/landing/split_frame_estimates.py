@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -29,7 +29,7 @@ from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import Chunk, Patch
+from iscat_analysis.search.sliding import Chunk
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
 
@@ -54,7 +54,7 @@ def nothing_repeated(mode: str) -> FloatArray:
 
 def step_repeats(
     chunk: Chunk,
-    patch: Patch,
+    spans: tuple[tuple[int, int], tuple[int, int]],
     event: Event,
     step: Step,
     others: Sequence[Step],
@@ -62,20 +62,26 @@ def step_repeats(
     pattern: MovingPattern | None,
     mode: str,
 ) -> FloatArray:
-    """Compare the estimates from parts of the frames of one landing or leaving."""
+    """Compare the estimates from parts of the frames of one landing or leaving.
+
+    `spans` are frames without and with its particle; they contain its windows and may be longer.
+    """
     region, windows = event.region, event.windows
     response = _response(event)
     if response is None:
         return nothing_repeated(mode)
     local = pattern.local(region, step.at.frame) if pattern else None
-    light = patch.mean_e
-    read = np.square(patch.read_noise_e) * np.ones(region.shape)
-    series = []
-    for span, weights in (
-        (windows.frames_before, response.before),
-        (windows.frames_after, response.after),
+    whole = chunk.patch(min(spans)[0], max(spans)[1], region.rows, region.columns)
+    light = whole.mean_e
+    read = np.square(whole.read_noise_e) * np.ones(region.shape)
+    own, longer = [], []
+    for span, window, weights in zip(
+        spans,
+        (windows.frames_before, windows.frames_after),
+        (response.before, response.after),
+        strict=True,
     ):
-        part = patch.frames(*span)
+        part = whole.frames(*span)
         one = series_of(
             part.counts, weights, part.power,
             gain=part.gain, offset=part.offset, mean_e=light, read_variance_e2=read,
@@ -94,8 +100,11 @@ def step_repeats(
             known += np.outer(other.sign * height, there)
         if pattern and local:
             known += _moved(chunk, step, region, weights, light, frames, pattern, local, neighbours)
-        series.append(Series(one.values - known * one.power, one.power, one.shot, one.read))
-    return repeats_of(tuple(series))
+        left = replace(one, values=one.values - known * one.power)
+        inside = (frames >= window[0]) & (frames < window[1])
+        own.append(replace(left, values=left.values[:, inside], power=left.power[inside]))
+        longer.append(left)
+    return repeats_of(tuple(own), tuple(longer))
 
 
 def _moved(

@@ -43,6 +43,7 @@ from iscat_analysis.search.sliding import (
     MapArray,
     Peak,
     StepFrame,
+    common_rise,
     find_steps,
     make_filter,
 )
@@ -141,6 +142,10 @@ class ChunkFitter:
                 chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
                     break
+            rise = common_rise([s.at.rise_profile for s in steps])
+            if rise != self._tasks.rise:
+                self._tasks.rise = rise
+                steps = self._improve(steps, set(range(len(steps))), seen)
             if "z_nm" in FREE_PARAMETERS[self._context.mode]:
                 steps = self._lifted(steps, set(range(known, len(steps))), seen)
             credible = self._credible(steps)
@@ -343,10 +348,10 @@ class ChunkFitter:
             near[index] if context.lines is None else [i for i in range(len(steps)) if i != index]
         )
         others = tuple(steps[i] for i in seen)
+        spans, lighting = self._tasks.trace_spans(step, task.windows, others)
         repeats = step_repeats(
-            self._chunk, task.patch, event, step, others, self._neighbours, self._pattern,
-            context.mode,
-        )  # fmt: skip
+            self._chunk, spans, event, step, lighting, self._neighbours, self._pattern, context.mode
+        )
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:

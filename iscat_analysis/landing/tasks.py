@@ -24,6 +24,9 @@ from iscat_analysis.search.sliding import Chunk, Patch, StepFrame, crosstalk, lo
 FEWEST_FRAMES = 10
 """A neighbour that would leave fewer is fitted beside the step, and both are flagged."""
 
+_TRACE_WINDOWS = 3  # on either side of a step, whose neighbours are known as far
+_LEAST_MASS_RATIO = 3.0  # of a particle over a step that may be a change of its light
+
 
 @dataclass(frozen=True)
 class Task:
@@ -59,6 +62,7 @@ class TaskBuilder:
         self._roi_px = context.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
+        self.rise = 0  # frames over which most steps of the chunk rise
 
     def build(
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
@@ -143,6 +147,32 @@ class TaskBuilder:
         )
         return Task(likelihood, region, patch, windows, at, n_before, n_after, crowded, offset)
 
+    def trace_spans(
+        self, step: Step, windows: Windows, others: Sequence[Step]
+    ) -> tuple[tuple[tuple[int, int], tuple[int, int]], tuple[Step, ...]]:
+        """Give the frames without and with a particle that tell how steady its light is.
+
+        They go on through small steps at its place, which may be changes of its light, and end at
+        others that are close.  The steps that add light of their own are given as well.
+        """
+        limit_px = self._context.config.detection.min_separation_nm / self._context.pixel_nm
+        close = {id(s) for s in others if distance_px(s, step) < limit_px}
+        least = step.start.mass_kda / _LEAST_MASS_RATIO
+        own = tuple(s for s in others if id(s) not in close or s.start.mass_kda > least)
+        (begin, first), (second, end) = sorted((windows.frames_before, windows.frames_after))
+        reach = _TRACE_WINDOWS * self._window
+        low = max(step.at.frame - reach, self._chunk.first)
+        high = min(step.at.frame + reach, self._chunk.stop)
+        for other in own:
+            if id(other) in close:
+                gap = other.at.kept_out(self._window)
+                if other.at.frame < step.at.frame:
+                    low = max(low, other.at.frame + gap)
+                else:
+                    high = min(high, other.at.frame - gap)
+        spans = (min(low, begin), first), (second, max(high, end))
+        return (spans if step.sign > 0 else spans[::-1]), own
+
     def _present(self, steps: Sequence[Step], span: tuple[int, int], cut: slice) -> FloatArray:
         """Contrast over the field, in some frames, of what lands or leaves in a span of them."""
         total = np.zeros(self._chunk.shape)
@@ -185,7 +215,9 @@ class TaskBuilder:
         known = self._added(step, neighbours, region, patch, pattern, image)
         reach = self._stride + self._stride // 2 + 1
         search = (step.at.frame - reach, step.at.frame + reach + 1)
-        return locate_step(patch, step.sign * image, search, known=step.sign * known)
+        return locate_step(
+            patch, step.sign * image, search, known=step.sign * known, expected_rise=self.rise
+        )
 
     def added(
         self,

@@ -9,9 +9,10 @@ approximation, with the variance
 
 λ_i the squared signal-to-noise ratio of one frame, S_j the variance of component j of an ε of unit
 variance, and ℓ_j that of the noise, which is 1 if the noise is white and is measured where there is
-no particle.  The squares of all components are χ², so that their likelihood is known
-(P. Whittle, J. R. Stat. Soc. B 15, 125 (1953)), and nothing has to be assumed of how estimates from
-blocks of different lengths go together.
+no particle.  The frames are those of up to three windows, in which slow fluctuations show.  The
+squares of all components are χ², so that their likelihood is known (P. Whittle, J. R. Stat. Soc. B
+15, 125 (1953)), and nothing has to be assumed of how estimates from blocks of different lengths go
+together.
 
 Whether a movie fluctuates, and how, follows by Bayes' theorem from a grid of s and τ.  An event may
 also change on its own, by a fluctuation that others do not have, which is why no single event
@@ -38,10 +39,11 @@ from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Statu
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
 _ALONE = 0.05  # probability that an event changes on its own
-_SEEN = 0.7  # probability from which it is told; one event alone gives no more than 0.69
+_SEEN = 0.75  # probability from which it is told; one event alone gives 0.69
 _RELATIVE = np.geomspace(0.01, 0.3, 60)
 _CORRELATIONS = np.geomspace(2.0, 600.0, 18)  # frames
-_SLOWEST = 2.0  # correlation time over a window; what is slower is a course, not a fluctuation
+_SLOWEST = 2.0  # correlation time over the frames that show it; slower is a course
+_KNOWN = 16.0  # components that the noise of half a window counts for in that of longer ones
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})
 
 
@@ -98,12 +100,16 @@ class Fluctuation:
         if not good.any():
             return None
         spectra = spectra_of(np.stack(repeats)[good])
-        own = spectra[np.arange(len(spectra)), (mass[good] > 0).astype(int)]
-        squares, counts = own[:, :, FREE_PARAMETERS[mode].index("mass_kda")], own[:, :, -1]
+        squares = spectra[..., FREE_PARAMETERS[mode].index("mass_kda")]
+        counts = spectra[..., -1]
+        frames = (counts.sum(axis=2) + 1).astype(np.int64)  # without, with a particle
+        frames[:, 1] = np.maximum(frames[:, 1], there[good])  # of which not all are in bins
+        longest = _SLOWEST * float(np.median(frames[:, 1]))
+        taus = _CORRELATIONS[max(longest, _CORRELATIONS[0]) >= _CORRELATIONS]
         window = float(np.median(there[good]))
-        taus = _CORRELATIONS[max(_SLOWEST * window, _CORRELATIONS[0]) >= _CORRELATIONS]
+        noise = _Noise.of(pooled, window, squares[:, 0], counts[:, 0], frames[:, 0])
         evidence = _Evidence.of(
-            squares, counts, there[good], (mass**2 / one)[good], taus, pooled, window
+            squares[:, 1], counts[:, 1], frames[:, 1], (mass**2 / one)[good], taus, noise
         )
         if evidence.factor <= 1:
             return None
@@ -145,6 +151,56 @@ class Fluctuation:
 
 
 @dataclass(frozen=True)
+class _Noise:
+    """Mean square of the components where there is no particle.
+
+    Up to half a window it is that between blocks of frames at empty places.  Slower noise is that
+    of the events' own places before they land or after they leave.
+    """
+
+    lengths: FloatArray
+    levels: FloatArray
+    slow: float = 1.0
+
+    @classmethod
+    def of(
+        cls,
+        pooled: EmpiricalSpread,
+        window: float,
+        squares: FloatArray,
+        counts: FloatArray,
+        frames: NDArray[np.int64],
+    ) -> _Noise:
+        """Measure it.
+
+        Shapes: `squares, counts` (events, bins), `frames` (events,).
+        """
+        levels = np.square(pooled.empty[1:-1] or pooled.empty[:1])
+        fast = cls(np.ldexp(window / 8, np.arange(levels.size)), levels)
+        excess = number = _KNOWN
+        for square, count, n in zip(squares, counts, frames.tolist(), strict=True):
+            bins = int((count > 0).sum())
+            if not bins:
+                continue
+            slow = n / (2 * np.array(MODES[:bins])) > window / 2
+            expected = fast.in_bins(n, bins)
+            excess += float(np.sum((square[:bins] / expected)[slow]))
+            number += float(count[:bins][slow].sum())
+        return cls(fast.lengths, levels, excess / number)
+
+    def in_bins(self, frames: int, bins: int) -> FloatArray:
+        """Give it for every bin of so many frames.
+
+        Shapes: result (bins,).
+        """
+        modes, starts = _modes(frames, bins)
+        lengths = frames / (2 * modes)
+        level = np.interp(lengths, self.lengths, self.levels)
+        level = np.where(lengths > 4 * self.lengths[0], level * self.slow, level)
+        return np.asarray(np.add.reduceat(level, starts) / _held(modes, starts))
+
+
+@dataclass(frozen=True)
 class _Evidence:
     """Likelihoods of s and τ over that of no fluctuation, from all events.
 
@@ -158,28 +214,27 @@ class _Evidence:
         cls,
         squares: FloatArray,
         counts: FloatArray,
-        there: FloatArray,
+        frames: NDArray[np.int64],
         strength: FloatArray,
         taus: FloatArray,
-        pooled: EmpiricalSpread,
-        window: float,
+        noise: _Noise,
     ) -> _Evidence:
         """Compare the spectra with the noise and with every fluctuation.
 
-        Shapes: `squares, counts` (events, bins), `there, strength` (events,), `taus` (τ,).
+        Shapes: `squares, counts` (events, bins), `frames, strength` (events,), `taus` (τ,).
         """
         total = np.zeros((_RELATIVE.size, taus.size))
         expected: dict[tuple[int, int], tuple[FloatArray, FloatArray]] = {}
-        for square, count, n, snr2 in zip(squares, counts, there, strength, strict=True):
+        for square, count, n, snr2 in zip(squares, counts, frames.tolist(), strength, strict=True):
             held = count > 0
             if not held.any():
                 continue
-            key = max(int(count.sum()) + 1, int(n)), int(held.sum())
+            key = n, int(held.sum())
             if key not in expected:
-                expected[key] = _expected(*key, taus, pooled, window)
-            noise, shape = expected[key]
-            signal = snr2 * _RELATIVE[:, None, None] ** 2 * shape / noise
-            gain = square[held] / noise * signal / (1 + signal) - count[held] * np.log1p(signal)
+                expected[key] = noise.in_bins(*key), _of_unit(*key, taus)
+            level, shape = expected[key]
+            signal = snr2 * _RELATIVE[:, None, None] ** 2 * shape / level
+            gain = square[held] / level * signal / (1 + signal) - count[held] * np.log1p(signal)
             ratio = 0.5 * gain.sum(axis=2)
             alone = logsumexp(ratio) - math.log(ratio.size)
             own = math.log(_ALONE) + alone
@@ -203,19 +258,27 @@ class _Evidence:
         return np.asarray(np.exp(weight - whole))
 
 
-def _expected(
-    frames: int, bins: int, taus: FloatArray, pooled: EmpiricalSpread, window: float
-) -> tuple[FloatArray, FloatArray]:
-    """Mean square of the components in every bin: of noise, and of an ε of unit variance.
+def _modes(frames: int, bins: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Give the numbers of the components of so many frames, and where each bin of them begins.
 
-    Shapes: `taus` (τ,), result (bins,), (τ, bins).
+    Shapes: results (modes,), (bins,).
     """
-    modes = np.arange(1, min(frames, MODES[bins]))
-    starts = np.array(MODES[:bins]) - 1
-    held = np.diff(np.append(starts, modes.size))
-    noise = _without(pooled, frames / (2 * modes), window)
+    return np.arange(1, min(frames, MODES[bins])), np.array(MODES[:bins]) - 1
+
+
+def _held(modes: NDArray[np.int64], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Count the components of every bin."""
+    return np.diff(np.append(starts, modes.size))
+
+
+def _of_unit(frames: int, bins: int, taus: FloatArray) -> FloatArray:
+    """Mean square of the components in every bin of an ε of unit variance.
+
+    Shapes: `taus` (τ,), result (τ, bins).
+    """
+    modes, starts = _modes(frames, bins)
     shape = np.stack([_components(modes, frames, tau) for tau in taus])
-    return np.add.reduceat(noise, starts) / held, np.add.reduceat(shape, starts, axis=1) / held
+    return np.asarray(np.add.reduceat(shape, starts, axis=1) / _held(modes, starts))
 
 
 def _components(modes: NDArray[np.int64], frames: int, tau: float) -> FloatArray:
@@ -233,16 +296,6 @@ def _components(modes: NDArray[np.int64], frames: int, tau: float) -> FloatArray
     linear = (z - frames * last + (frames - 1) * last * z) / (1 - z) ** 2
     whole = (plain - linear / frames).real - plain.imag / (frames * np.sin(theta))
     return np.asarray(1 + 2 * whole)
-
-
-def _without(pooled: EmpiricalSpread, lengths: FloatArray, window: float) -> FloatArray:
-    """Mean square between blocks of so many frames where there is no particle.
-
-    Shapes: `lengths` (n,), result (n,).
-    """
-    levels = np.square(pooled.empty[1:-1] or pooled.empty[:1])
-    parts = window / 8 * 2.0 ** np.arange(levels.size)
-    return np.asarray(np.interp(lengths, parts, levels))
 
 
 def _of_mean(frames: int, tau: float) -> float:

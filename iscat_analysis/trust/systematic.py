@@ -54,7 +54,7 @@ _MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
 # Of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _LEAST_NONLINEAR_SHARE = 0.02
 _NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
-_LEAST_SIGMAS = 0.5  # of σ, beyond which it is told of every row
+_LEAST_SIGMAS = 0.5  # of σ, beyond which it is told
 _LEAST_SELECTED = 0.01  # of σ, below which a threshold does nothing
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 _NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
@@ -287,11 +287,14 @@ def _of_what_is_left_over(
 def _of_heavy_particles(
     scale: MassScale, config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
-    """Give what a line of faint standards makes of particles that are not, where it matters."""
+    """Give what a line of faint standards makes of particles that are not.
+
+    It moves all masses the same way, and is given where all together would show it.
+    """
     if not _fits_masses(config):
         return {}
     off, sigma = _off_the_line(scale, table)
-    return {"mass_kda": off} if (off > _LEAST_SIGMAS * sigma).any() else {}
+    return {"mass_kda": off} if np.nansum((off / sigma) ** 2) > _LEAST_SIGMAS**2 else {}
 
 
 def is_bent(scale: MassScale, table: pd.DataFrame) -> NDArray[np.bool_]:

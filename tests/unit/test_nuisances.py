@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.signal import lfilter
 
 from iscat_analysis.config import load_config
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
@@ -19,7 +20,7 @@ from iscat_analysis.inference.nuisances import Evidence, evidence_of
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
-from iscat_analysis.search.sliding import Patch, locate_step
+from iscat_analysis.search.sliding import Patch, StepFrame, common_rise, locate_step
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
@@ -170,23 +171,24 @@ def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
 def breathing(
     relative: float, tau: float, masses: Sequence[float] = (MASS_KDA,) * 60, seed: int = 4
 ) -> tuple:
-    """Blocks of frames of many events, and the errors of their means over those frames."""
-    rng, frames, one = np.random.default_rng(seed), 80, 3.0 * math.sqrt(40)
+    """Frames of many events, and the errors of their means over the first 80, which are fitted."""
+    rng, frames, one = np.random.default_rng(seed), 240, 3.0 * math.sqrt(40)
     repeats, errors = [], []
     for mass in masses:
         noise = rng.normal(size=(2, frames)) * one
-        slow = np.empty(frames)
-        slow[0] = rng.normal()
-        for k in range(1, frames):
-            keep = math.exp(-1 / tau)
-            slow[k] = keep * slow[k - 1] + math.sqrt(1 - keep**2) * rng.normal()
-        noise[1] += mass * relative * slow
-        errors.append(noise[1].mean() - noise[0].mean())
-        sides = (
-            Series(np.tile(side, (3, 1)), np.ones(frames), np.full(3, one**2), np.zeros(3))
-            for side in noise
+        keep = math.exp(-1 / tau)
+        drive = rng.normal(size=frames) * np.append(1.0, np.full(frames - 1, (1 - keep**2) ** 0.5))
+        noise[1] += mass * relative * lfilter([1.0], [1.0, -keep], drive)
+        fitted = noise[:, :80]
+        errors.append(fitted[1].mean() - fitted[0].mean())
+        series = (
+            tuple(
+                Series(np.tile(side, (3, 1)), np.ones(side.size), np.full(3, one**2), np.zeros(3))
+                for side in sides
+            )
+            for sides in (fitted, noise)
         )
-        repeats.append(repeats_of(tuple(sides)))
+        repeats.append(repeats_of(*series))
     own = np.stack(repeats)[:, :BLOCK_ROWS, [2, -1]]
     tiles = np.full((5, 40), 400.0)
     achieved = {"mass_kda": pooled(own, tiles.copy(), tiles)}
@@ -215,18 +217,31 @@ def test_few_heavy_particles_among_light_ones_show_it() -> None:
 
 
 def test_a_fluctuation_that_is_not_certain_is_in_the_error_all_the_same() -> None:
-    """Few heavy events among many: where it is not seen, the posterior still has a part of it."""
-    masses, silent = (205.0,) * 3 + (40.0,) * 12, 0
+    """One heavy event among light ones: where it is not seen, the posterior still has a part."""
+    masses, silent = (205.0,) + (40.0,) * 14, 0
     pulls, without = [], []
     for seed in range(40):
-        found, errors = breathing(0.04, 20.0, masses, seed)
+        found, errors = breathing(0.05, 20.0, masses, seed)
         silent += found is None or not found.is_seen
         added = 0.0 if found is None else found.variance_kda2
-        pulls.extend((errors / np.sqrt(9.0 + added))[:3])
-        without.extend(errors[:3] / 3.0)
+        pulls.append((errors / np.sqrt(9.0 + added))[0])
+        without.append(errors[0] / 3.0)
     assert silent > 0
     assert np.std(without) > 2.0  # the control
     assert np.std(pulls) < 0.75 * np.std(without)
+
+
+@pytest.mark.parametrize("tau", [100.0, 400.0])
+def test_a_fluctuation_slower_than_windows_shows_in_the_frames_after_them(tau: float) -> None:
+    pulls, without = [], []
+    for seed in range(12):
+        found, errors = breathing(0.05, tau, (MASS_KDA,) * 16, seed)
+        assert found.is_seen
+        pulls.extend(errors / np.sqrt(9.0 + found.variance_kda2))
+        without.extend(errors / 3.0)
+    assert np.std(without) > 2.5  # the control
+    assert np.std(pulls) < 1.5
+    assert np.max(np.abs(pulls)) < 5
 
 
 def test_steady_light_does_not_fluctuate() -> None:
@@ -250,17 +265,19 @@ def test_one_event_that_changes_says_nothing_of_the_others() -> None:
 # ---- steps that take their time --------------------------------------------------------------
 
 
-def dated(course: np.ndarray, seed: int = 6) -> object:
+def dated(
+    course: np.ndarray, seed: int = 6, *, height: float = 0.05, expected: int = 0
+) -> StepFrame:
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:13, :13]
-    image = -0.05 * np.exp(-((x - 6) ** 2 + (y - 6) ** 2) / 8)
+    image = -height * np.exp(-((x - 6) ** 2 + (y - 6) ** 2) / 8)
     background = 1e4 * rng.uniform(0.8, 1.2, image.shape)
     counts = rng.poisson(background * (1 + course[:, None, None] * image)).astype("u2")
     every = np.ones(course.size)
     patch = Patch(
         0, counts, every > 0, every, 1.0, 0.0, 0.0, background, np.ones(image.shape, dtype=bool)
     )
-    return locate_step(patch, image, (50, 110))
+    return locate_step(patch, image, (50, 110), expected_rise=expected)
 
 
 @pytest.mark.parametrize("rise", [12, 40])
@@ -272,6 +289,26 @@ def test_a_rise_is_found_and_its_frames_stay_out(rise: int) -> None:
     assert found.kept_out(80) >= found.rise / 2
     assert found.height == pytest.approx(1.0, abs=0.06)
     assert found.p_constant > 1e-3
+
+
+def test_faint_steps_tell_together_how_they_rise() -> None:
+    """Each of them hides its rise in noise, and is dated with that of all."""
+    course = np.clip((np.arange(160) - 80) / 18 + 0.5, 0, 1)
+    faint = [dated(course, seed, height=0.009) for seed in range(30)]
+    assert sum(one.rise > 0 for one in faint) < 10
+    rise = common_rise([one.rise_profile for one in faint])
+    assert 12 <= rise <= 27
+    again = [dated(course, seed, height=0.009, expected=rise) for seed in range(30)]
+    assert all(one.rise == rise for one in again)
+    masses = np.array([one.height for one in again])
+    assert abs(masses.mean() - 1) < 4 * masses.std() / 30**0.5
+    step = (np.arange(160) >= 80).astype(float)
+    sudden = [dated(step, seed, height=0.009) for seed in range(30)]
+    assert common_rise([one.rise_profile for one in sudden]) == 0
+    mixed = [one.rise_profile for one in [*sudden, *(dated(course, seed) for seed in range(3))]]
+    assert common_rise(mixed) == 0  # a few that rise say nothing of the others
+    assert dated(step, expected=18).rise == 0  # nor do others of one that is bright
+    assert dated(step, 6).rise == 0
 
 
 def test_a_step_does_not_rise_and_two_steps_are_no_line() -> None:

@@ -39,6 +39,7 @@ from iscat_analysis.search.sliding.noise import (
     measure_motion,
     measure_noise,
 )
+from iscat_analysis.search.sliding.rises import common_rise
 from iscat_analysis.search.sliding.search import (
     CORRELATION,
     STRIDES,
@@ -74,6 +75,7 @@ __all__ = [
     "Tile",
     "boundaries",
     "choose_window",
+    "common_rise",
     "crosstalk",
     "cut_off",
     "find_steps",

@@ -35,6 +35,7 @@ class StepFrame:
     per_frame_snr: float
     p_constant: float
     rise: int = 0
+    rise_profile: tuple[float, ...] = ()
 
     @property
     def gap(self) -> int:
@@ -85,6 +86,7 @@ def locate_step(
     search: tuple[int, int],
     *,
     known: FloatArray | None = None,
+    expected_rise: int = 0,
 ) -> StepFrame:
     """Find the frame of a step by the likelihood of the frames around it.
 
@@ -111,7 +113,7 @@ def locate_step(
     height = float(jump[best])
     snr = abs(height) * math.sqrt(scale)
     turn, gap = best + 1, _gap(snr)
-    rise = find_rise(heights, weight, turn, float(log[best]))
+    rise, profile = find_rise(heights, weight, turn, float(log[best]), expected_rise)
     if rise is None:
         sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
         p = min(_p_constant(heights[side], weight[side]) for side in sides)
@@ -124,7 +126,7 @@ def locate_step(
         half_width = max(half_width, rise.frames // 2)
     p = 1 - (1 - p) ** 2
     frames_of_rise = 0 if rise is None else rise.frames
-    return StepFrame(patch.first + turn, half_width, height, snr, p, frames_of_rise)
+    return StepFrame(patch.first + turn, half_width, height, snr, p, frames_of_rise, profile)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:

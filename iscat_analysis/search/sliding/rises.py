@@ -3,21 +3,27 @@
 A line from one level to the other, between two frames, is set against a step.  The frames of the
 line are left out of fits, whatever the course in them; but light that settles exponentially goes on
 rising after any line, and an exponential that describes the frames better than the line tells so.
+
+Particles of one kind rise alike, and the noise of a faint one may hide its rise or feign one.  All
+steps together tell over how many frames they rise; one that does not must show that itself.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import erfc
+from scipy.special import erfc, logsumexp
 
 from iscat_analysis.records import FloatArray
 
 IntArray = NDArray[np.int64]
 
-_LEAST_GAIN = 6.0  # log-likelihood by which a line describes the frames better than a step
+_LEAST_GAIN = 6.0  # log-likelihood by which another course is better than the expected one
+_ALONE = 0.1  # probability that a step has a course of its own
 _RISE_FRAMES = (3, 5, 8, 12, 18, 27, 40, 60, 90)  # tried first, then others near the best
 _DECAY_SHARES = (0.15, 0.25, 0.35, 0.5, 0.7)  # over the frames of the line
 
@@ -42,43 +48,64 @@ class Rise:
     p_line: float
 
 
-def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -> Rise | None:
+def find_rise(
+    heights: FloatArray, weight: FloatArray, turn: int, step: float, expected: int = 0
+) -> tuple[Rise | None, tuple[float, ...]]:
     """Find a rise around the best step, whose log-likelihood is given; None where it is a step.
+
+    A course other than the expected one, which is a step if no frames of a rise are expected, must
+    be clearly better.  The gains of all lines over the step are what `common_rise` asks for.
 
     Shapes: `heights` (t,), `weight` (t,).
     """
-    if step < _LEAST_GAIN:
-        return None
     lit = np.flatnonzero(weight > 0)
     w = weight[lit]
     y = heights[lit] - np.average(heights[lit], weights=w)
-    best, found = step + _LEAST_GAIN, (0, turn)
 
-    def tried(rise: int, centres: IntArray) -> None:
-        nonlocal best, found
+    def tried(rise: int, reach: int, every: int = 1, about: int = turn) -> tuple[float, int, int]:
+        centres = np.arange(about - reach, about + reach + 1, every)
         centres = centres[(centres > rise // 2) & (centres < heights.size - rise // 2)]
-        if centres.size:
-            gains = _gains(line(lit, rise, centres[:, None]), w, y)
-            top = int(np.argmax(gains))
-            if gains[top] > best:
-                best, found = float(gains[top]), (rise, int(centres[top]))
+        if not centres.size or 2 * rise >= heights.size:
+            return 0.0, rise, turn
+        gains = _gains(line(lit, rise, centres[:, None]), w, y)
+        top = int(np.argmax(gains))
+        return float(gains[top]), rise, int(centres[top])
 
-    for rise in _RISE_FRAMES:
-        if 2 * rise < heights.size:
-            half = rise // 2
-            tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
-    roughly, centre = found
-    if not roughly:
-        return None
-    reach = max(roughly // 5, 2)
-    for rise in range(round(0.7 * roughly), round(1.4 * roughly) + 1, max(roughly // 12, 1)):
-        tried(max(rise, 2), np.arange(centre - reach, centre + reach + 1))
-    rise, centre = found
+    def judged(course: tuple[float, int, int]) -> float:
+        return course[0] + _LEAST_GAIN * (course[1] == expected)
+
+    lines = [tried(rise, rise // 2, max(rise // 8, 1)) for rise in _RISE_FRAMES]
+    profile = tuple(gain - step for gain, *_ in lines)
+    usual = [tried(expected, expected)] if expected else []
+    best = max([(step, 0, turn), *lines, *usual], key=judged)
+    _, rise, centre = best
+    if rise not in (0, expected):
+        finer = range(round(0.7 * rise), round(1.4 * rise) + 1, max(rise // 12, 1))
+        near = [tried(max(other, 2), max(rise // 5, 2), about=centre) for other in finer]
+        best = max([best, *near])
+    gain, rise, centre = best
+    if not rise:
+        return None, profile
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
     curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
-    better = float(_gains(np.concatenate(curves), w, y).max()) - best
+    better = float(_gains(np.concatenate(curves), w, y).max()) - gain
     p_line = float(erfc(np.sqrt(max(better, 0.0))))  # of χ² with one degree of freedom
-    return Rise(rise, centre, _gain_beyond(heights, weight, centre, rise // 2 + 1), p_line)
+    height = _gain_beyond(heights, weight, centre, rise // 2 + 1)
+    return Rise(rise, centre, height, p_line), profile
+
+
+def common_rise(profiles: Sequence[tuple[float, ...]]) -> int:
+    """Give the frames over which the light of most steps rises; 0 if they are steps.
+
+    The likelihood of a step has its own course with a small probability, whatever the others do.
+    """
+    each = np.array([(0.0, *profile) for profile in profiles if profile])
+    if not each.size:
+        return 0
+    own = math.log(_ALONE / each.shape[1]) + logsumexp(each, axis=1, keepdims=True)
+    total = np.logaddexp(math.log1p(-_ALONE) + each, own).sum(axis=0)
+    best = int(np.argmax(total))
+    return _RISE_FRAMES[best - 1] if total[best] > total[0] + _LEAST_GAIN else 0
 
 
 def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
