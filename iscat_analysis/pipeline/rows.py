@@ -19,6 +19,7 @@ from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.records import (
     FREE_PARAMETERS,
+    BoolArray,
     FloatArray,
     Status,
     flagged,
@@ -72,15 +73,19 @@ def reported_rows(
         fits = flagged(fits, Status.EXTENDED, extension.flagged)
     changing_light = ""
     shared_place = np.zeros(len(fits), dtype=bool)
+    resolution_nm = config.optics.wavelength_nm / config.optics.na
     if found.heading == "landing":
-        shared_place = at_a_shared_place(fits, config.optics.wavelength_nm / config.optics.na)
+        shared_place = at_a_shared_place(fits, resolution_nm)
         fits = flagged(fits, Status.CHANGING, shared_place)
-        fits, changing_light = _with_changing(fits, evidence)
+        fits, changing_light = _with_changing(fits, evidence, shared_place)
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
         fluctuation = Fluctuation.of(mode, found.fits, found.repeats, achieved, shared_place)
     if fluctuation is not None:
+        if found.heading == "landing" and fluctuation.is_seen:
+            wide = at_a_shared_place(fits, resolution_nm, fluctuation.relative)
+            fits = flagged(fits, Status.CHANGING, wide)
         sigma = np.sqrt(fits["sigma_mass_kda"] ** 2 + fluctuation.variance_kda2)
         fits = fits.assign(sigma_mass_kda=sigma)
     columns: dict[str, pd.Series | FloatArray] = {
@@ -106,11 +111,13 @@ def reported_rows(
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 
-def _with_changing(fits: pd.DataFrame, evidence: Evidence | None) -> tuple[pd.DataFrame, str]:
+def _with_changing(
+    fits: pd.DataFrame, evidence: Evidence | None, shared_place: BoolArray
+) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
     if evidence is None:
         return fits, ""
-    unseen, frames = may_rise(fits, evidence)
-    rising = int(np.nan_to_num(evidence.rise_frames).astype(bool).sum())
+    unseen, frames = may_rise(fits, evidence, shared_place)
+    rising = int((~shared_place & (np.nan_to_num(evidence.rise_frames) > 0)).sum())
     text = rise_message(frames, int(unseen.sum()), rising, len(fits))
     return flagged(fits, Status.CHANGING, unseen), text

@@ -6,8 +6,9 @@ from that.  A particle that moves by a few nanometres, or wiggles, leaves a fain
 within the distance that the microscope resolves.
 
 If particles take several frames to land, the rise of a faint one drowns in the noise of single
-frames.  It is then fitted as a step, and its mass is too small.  Bright ones show that this
-happens.
+frames.  The steps of a chunk of the movie tell together how they rise, and all are fitted with that
+rise.  Where they do not agree, a faint one may be fitted as a step, and its mass is too small.
+Bright ones show that this happens.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ SAME_NM = 150.0
 
 # Mass of a particle over that of a step, from which on the step may be a change of its light.
 _LEAST_MASS_RATIO = 3.0
+# Change of a mean over a window, in standard deviations of the fluctuation of a frame, that hardly
+# ever is exceeded: four of a difference of two.
+_LARGEST_CHANGE = 4 * math.sqrt(2)
 # Mass of a particle over that of a step beside it, from which on it may have moved: 20 nm change a
 # picture by a fifth.
 _LEAST_MASS_RATIO_BESIDE = 5.0
@@ -42,12 +46,14 @@ _LEAST_SHARE_CONTINUING = 0.1
 _NO_STEP = (Status.SIDELOBE.value, Status.NOT_CONVERGED.value)
 
 
-def at_a_shared_place(table: pd.DataFrame, resolution_nm: float = 0.0) -> BoolArray:
+def at_a_shared_place(
+    table: pd.DataFrame, resolution_nm: float = 0.0, relative: float = 0.0
+) -> BoolArray:
     """Flag steps that may be changes of the light of a particle that is there already.
 
     These are steps much smaller than that particle, at its place or, smaller still, beside it.  Of
     two steps of the same sign, mass and place within one window, both are flagged.  A resolution
-    is λ/NA.
+    is λ/NA; contrasts fluctuate by a relative standard deviation.
 
     Shapes: result (rows,).
     """
@@ -62,6 +68,7 @@ def at_a_shared_place(table: pd.DataFrame, resolution_nm: float = 0.0) -> BoolAr
     error = table["sigma_mass_kda"].to_numpy(float)[real]
     window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[real]
     farthest = max(SAME_NM, _BESIDE * resolution_nm)
+    least_here = 1 / max(1 / _LEAST_MASS_RATIO, _LARGEST_CHANGE * relative)
     for i, j in scipy.spatial.cKDTree(place).query_pairs(farthest):
         if abs(mass[i]) < abs(mass[j]):
             i, j = j, i  # i is the larger
@@ -70,7 +77,7 @@ def at_a_shared_place(table: pd.DataFrame, resolution_nm: float = 0.0) -> BoolAr
         there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
         gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
         same = math.dist(place[i], place[j]) < SAME_NM
-        least = _LEAST_MASS_RATIO if same else _LEAST_MASS_RATIO_BESIDE
+        least = least_here if same else _LEAST_MASS_RATIO_BESIDE
         if (there or near) and not gone and abs(mass[i]) > least * abs(mass[j]):
             flagged[real[j]] = True
         elif (
@@ -83,17 +90,20 @@ def at_a_shared_place(table: pd.DataFrame, resolution_nm: float = 0.0) -> BoolAr
     return flagged
 
 
-def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]:
+def may_rise(
+    table: pd.DataFrame, evidence: Evidence, shared_place: BoolArray
+) -> tuple[BoolArray, float]:
     """Flag steps that may rise slowly without showing it, and give the duration of rises.
 
-    If many of the visible rises go on rising after the end of their lines, all steps may.  A line
-    over r frames and the nearest step differ by r/12 times the squared signal-to-noise ratio of one
-    frame, half of which is the gain in log-likelihood.
+    Steps at the place of a particle that is there tell nothing of landings.  If many of the visible
+    rises go on rising after the end of their lines, all steps may.  A line over r frames and the
+    nearest step differ by r/12 times the squared signal-to-noise ratio of one frame, half of which
+    is the gain in log-likelihood.
 
-    Shapes: result (rows,).
+    Shapes: `shared_place` (rows,), result (rows,).
     """
     nothing = np.zeros(len(table), dtype=bool), 0.0
-    rise = np.nan_to_num(evidence.rise_frames)
+    rise = np.where(shared_place, 0.0, np.nan_to_num(evidence.rise_frames))
     rising = rise > 0
     if rising.sum() < _FEWEST:
         return nothing
@@ -102,7 +112,7 @@ def may_rise(table: pd.DataFrame, evidence: Evidence) -> tuple[BoolArray, float]
     before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
     one2 = (mass / crb) ** 2 * (before + after) / (before * after)
     gain = np.nan_to_num(one2) * frames / 24
-    seen = gain > _LEAST_GAIN_SEEN
+    seen = (gain > _LEAST_GAIN_SEEN) & ~shared_place
     if (rising & seen).sum() < max(_FEWEST, _SHARE * seen.sum()):
         return nothing
     goes_on = table["flags"].fillna("").astype(str).str.contains(Status.CHANGING.value).to_numpy()

@@ -345,6 +345,9 @@ def test_steps_of_a_particle_that_is_there_are_told_from_others() -> None:
     assert not at_a_shared_place(table, 300.0)[1]
     table.loc[1, "mass_kda"] = -50.0  # which no small move makes
     assert not at_a_shared_place(table, 370.0)[1]
+    table.loc[1, ["x_nm", "mass_kda"]] = 40.0, -90.0  # by more than a third
+    assert not at_a_shared_place(table)[1]
+    assert at_a_shared_place(table, relative=0.1)[1]  # unless contrasts fluctuate by 10 %
     table.loc[1, ["x_nm", "mass_kda"]] = 40.0, -12.0
     table.loc[1, "frame"] = 10  # before the particle came: another one
     assert not at_a_shared_place(table)[1]
@@ -356,10 +359,12 @@ def test_faint_steps_may_rise_as_the_bright_ones_do() -> None:
     rise = np.where(np.arange(30) < 15, 40.0, 0.0)
     told = Evidence(*np.zeros((10, 30)), rise)
     table["flags"] = ""
-    unseen, frames = may_rise(table, told)
+    alone = np.zeros(30, dtype=bool)
+    unseen, frames = may_rise(table, told, alone)
     assert frames == 40
     assert unseen.tolist() == [False] * 20 + [True] * 10
     table.loc[20:, "mass_kda"] = 60.0  # of which some show it, and some do not
-    assert may_rise(table, told)[0].tolist() == [False] * 20 + [True] * 10
+    assert may_rise(table, told, alone)[0].tolist() == [False] * 20 + [True] * 10
     few = Evidence(*np.zeros((10, 30)), np.where(np.arange(30) < 2, 40.0, 0.0))
-    assert not may_rise(table, few)[0].any()
+    assert not may_rise(table, few, alone)[0].any()
+    assert not may_rise(table, told, np.arange(30) < 15)[0].any()  # changes of particles
