@@ -45,6 +45,7 @@ from iscat_analysis.search.sliding import (
     StepFrame,
     common_rise,
     find_steps,
+    go_on_rising,
     make_filter,
 )
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
@@ -142,7 +143,10 @@ class ChunkFitter:
                 chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
                 if not chosen:
                     break
-            rise = common_rise([s.at.rise_profile for s in steps])
+            rise = {
+                sign: common_rise([s.at.rise_profile for s in steps if s.sign == sign])
+                for sign in self._tasks.rise
+            }
             if rise != self._tasks.rise:
                 self._tasks.rise = rise
                 steps = self._improve(steps, set(range(len(steps))), seen)
@@ -357,6 +361,10 @@ class ChunkFitter:
     def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
         """Judge all steps, including side lobes and steps that explain less than they leave."""
         steps = [own.fitted.step for own in finished]
+        settling = {
+            sign: go_on_rising([step.at.settling for step in steps if step.sign == sign])
+            for sign in (1, -1)
+        }
         described = [own.fitted.event.described for own in finished]
         frame = np.array([step.at.frame for step in steps])
         x_px, y_px = _places(steps)
@@ -371,6 +379,7 @@ class ChunkFitter:
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
                 changing=steps[number].at.p_constant < POOR_FIT_P
+                or (settling[steps[number].sign] and steps[number].at.rise > 0)
                 or any(
                     away[i] < self._roi_px / 2 and _outshines(steps[i], steps[number]) for i in near
                 ),

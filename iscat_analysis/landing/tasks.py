@@ -62,7 +62,7 @@ class TaskBuilder:
         self._roi_px = context.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
-        self.rise = 0  # frames over which most steps of the chunk rise
+        self.rise = {1: 0, -1: 0}  # frames over which most landings, and leavings, take place
 
     def build(
         self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]]
@@ -216,8 +216,9 @@ class TaskBuilder:
         reach = self._stride + self._stride // 2 + 1
         search = (step.at.frame - reach, step.at.frame + reach + 1)
         return locate_step(
-            patch, step.sign * image, search, known=step.sign * known, expected_rise=self.rise
-        )
+            patch, step.sign * image, search,
+            known=step.sign * known, expected_rise=self.rise[step.sign],
+        )  # fmt: skip
 
     def added(
         self,

@@ -28,7 +28,7 @@ from iscat_analysis.records import (
 )
 from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of
-from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
+from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
@@ -77,7 +77,11 @@ def reported_rows(
     if found.heading == "landing":
         shared_place = at_a_shared_place(fits, resolution_nm)
         fits = flagged(fits, Status.CHANGING, shared_place)
-        fits, changing_light = _with_changing(fits, evidence, shared_place)
+        if evidence is not None:
+            parts = in_parts(fits, evidence.rise_frames)
+            fits = flagged(fits, Status.CHANGING, parts)
+            fits, changing_light = _with_changing(fits, evidence, shared_place)
+            shared_place |= parts
     scale = measured_scale(achieved) if config.fit.sigma == "measured" else {}
     fluctuation = None
     if not scale:  # which has all that the frames show
@@ -112,11 +116,9 @@ def reported_rows(
 
 
 def _with_changing(
-    fits: pd.DataFrame, evidence: Evidence | None, shared_place: BoolArray
+    fits: pd.DataFrame, evidence: Evidence, shared_place: BoolArray
 ) -> tuple[pd.DataFrame, str]:
     """Flag steps whose light may still be changing, and describe that in a message."""
-    if evidence is None:
-        return fits, ""
     unseen, frames = may_rise(fits, evidence, shared_place)
     rising = int((~shared_place & (np.nan_to_num(evidence.rise_frames) > 0)).sum())
     text = rise_message(frames, int(unseen.sum()), rising, len(fits))

@@ -14,13 +14,16 @@ Bright ones show that this happens.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 import scipy
+from numpy.typing import NDArray
 
 from iscat_analysis.inference.nuisances import Evidence
-from iscat_analysis.records import BoolArray, Status
+from iscat_analysis.records import BoolArray, FloatArray, Status
 
 SAME_NM = 150.0
 """Distance within which two steps are at one place."""
@@ -51,43 +54,71 @@ def at_a_shared_place(
 ) -> BoolArray:
     """Flag steps that may be changes of the light of a particle that is there already.
 
-    These are steps much smaller than that particle, at its place or, smaller still, beside it.  Of
-    two steps of the same sign, mass and place within one window, both are flagged.  A resolution
-    is λ/NA; contrasts fluctuate by a relative standard deviation.
+    These are steps much smaller than that particle, at its place or, smaller still, beside it.  A
+    resolution is λ/NA; contrasts fluctuate by a relative standard deviation.
 
     Shapes: result (rows,).
     """
-    flagged = np.zeros(len(table), dtype=bool)
-    real = np.flatnonzero(
-        ~table["status"].isin(_NO_STEP).to_numpy() & table["mass_kda"].notna().to_numpy()
-    )
-    if real.size < 2:
-        return flagged
-    place = table[["x_nm", "y_nm"]].to_numpy(float)[real]
-    mass, frame = table["mass_kda"].to_numpy(float)[real], table["frame"].to_numpy(float)[real]
-    error = table["sigma_mass_kda"].to_numpy(float)[real]
-    window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[real]
-    farthest = max(SAME_NM, _BESIDE * resolution_nm)
     least_here = 1 / max(1 / _LEAST_MASS_RATIO, _LARGEST_CHANGE * relative)
-    for i, j in scipy.spatial.cKDTree(place).query_pairs(farthest):
-        if abs(mass[i]) < abs(mass[j]):
-            i, j = j, i  # i is the larger
-        apart = abs(frame[i] - frame[j])
-        near = apart < max(window[i], window[j])
+    flagged = np.zeros(len(table), dtype=bool)
+    steps = _Steps.of(table)
+    for i, j in steps.pairs(max(SAME_NM, _BESIDE * resolution_nm)):
+        mass, frame, window = steps.mass, steps.frame, steps.window
+        near = abs(frame[i] - frame[j]) < max(window[i], window[j])
         there = frame[j] > frame[i] if mass[i] > 0 else frame[j] < frame[i]
-        gone = mass[i] * mass[j] < 0 and abs(mass[i] + mass[j]) < 4 * np.hypot(error[i], error[j])
-        same = math.dist(place[i], place[j]) < SAME_NM
+        both = mass[i] + mass[j]
+        gone = mass[i] * mass[j] < 0 and abs(both) < 4 * np.hypot(steps.error[i], steps.error[j])
+        same = math.dist(steps.place[i], steps.place[j]) < SAME_NM
         least = least_here if same else _LEAST_MASS_RATIO_BESIDE
         if (there or near) and not gone and abs(mass[i]) > least * abs(mass[j]):
-            flagged[real[j]] = True
-        elif (
-            same
-            and near
-            and mass[i] * mass[j] > 0
-            and abs(mass[i]) <= _MOST_MASS_RATIO * abs(mass[j])
-        ):
-            flagged[real[[i, j]]] = True
+            flagged[steps.row[j]] = True
     return flagged
+
+
+def in_parts(table: pd.DataFrame, rise_frames: FloatArray) -> BoolArray:
+    """Flag steps of the same sign, mass and place within one window: parts of one landing.
+
+    Shapes: `rise_frames` (rows,), which stay out of the windows; result (rows,).
+    """
+    flagged = np.zeros(len(table), dtype=bool)
+    steps = _Steps.of(table)
+    window = steps.window + np.nan_to_num(rise_frames)[steps.row]
+    for i, j in steps.pairs(SAME_NM):
+        ratio = steps.mass[i] / steps.mass[j]
+        near = abs(steps.frame[i] - steps.frame[j]) < max(window[i], window[j])
+        if near and 0 < ratio <= _MOST_MASS_RATIO:
+            flagged[steps.row[[i, j]]] = True
+    return flagged
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """The rows of a table that are steps.
+
+    Shapes: `row, mass, error, frame, window` (n,), `place` (n, 2).
+    """
+
+    row: NDArray[np.int64]
+    place: FloatArray
+    mass: FloatArray
+    error: FloatArray
+    frame: FloatArray
+    window: FloatArray
+
+    @classmethod
+    def of(cls, table: pd.DataFrame) -> _Steps:
+        real = ~table["status"].isin(_NO_STEP) & table["mass_kda"].notna()
+        row = np.flatnonzero(real.to_numpy())
+        names = "mass_kda", "sigma_mass_kda", "frame"
+        mass, error, frame = (table[name].to_numpy(float)[row] for name in names)
+        window = np.maximum(table["n_before"], table["n_after"]).to_numpy(float)[row]
+        return cls(row, table[["x_nm", "y_nm"]].to_numpy(float)[row], mass, error, frame, window)
+
+    def pairs(self, farthest_nm: float) -> Iterator[tuple[int, int]]:
+        """Give those that are near each other, the larger mass first."""
+        if self.row.size > 1:
+            for i, j in scipy.spatial.cKDTree(self.place).query_pairs(farthest_nm):
+                yield (i, j) if abs(self.mass[i]) >= abs(self.mass[j]) else (j, i)
 
 
 def may_rise(

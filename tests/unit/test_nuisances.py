@@ -20,8 +20,14 @@ from iscat_analysis.inference.nuisances import Evidence, evidence_of
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate
-from iscat_analysis.search.sliding import Patch, StepFrame, common_rise, locate_step
-from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise
+from iscat_analysis.search.sliding import (
+    Patch,
+    StepFrame,
+    common_rise,
+    go_on_rising,
+    locate_step,
+)
+from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 
@@ -324,8 +330,13 @@ def test_light_that_settles_exponentially_goes_on_rising() -> None:
     found = [dated(settling, seed) for seed in range(20)]
     assert sum(one.rise > 0 for one in found) == 20
     assert sum(one.p_constant < 1e-3 for one in found) >= 15
-    straight = [dated(np.clip((frames - 80) / 40 + 0.5, 0, 1), seed) for seed in range(20)]
+    line = np.clip((frames - 80) / 40 + 0.5, 0, 1)
+    straight = [dated(line, seed) for seed in range(20)]
     assert sum(one.p_constant < 1e-3 for one in straight) <= 1  # the control
+    for course, goes_on in ((settling, True), (line, False)):  # of which no single one shows it
+        faint = [dated(course, seed, height=0.015, expected=40) for seed in range(20)]
+        assert sum(one.p_constant < 1e-3 for one in faint) <= 2
+        assert go_on_rising([one.settling for one in faint]) == goes_on
 
 
 # ---- places that are shared ------------------------------------------------------------------
@@ -339,7 +350,12 @@ def test_steps_of_a_particle_that_is_there_are_told_from_others() -> None:
         "mass_kda": [205.0, -12.0, 12.0, 100.0, 90.0, 60.0, -61.0],
         "sigma_mass_kda": 3.0, "n_before": 80, "n_after": 80, "status": "ok",
     })  # fmt: skip
-    assert at_a_shared_place(table).tolist() == [False, True, False, True, True, False, False]
+    assert at_a_shared_place(table).tolist() == [False, True] + [False] * 5
+    parts = [False] * 3 + [True] * 2 + [False] * 2
+    assert in_parts(table, np.zeros(7)).tolist() == parts
+    table.loc[4, "frame"] = 490
+    assert not in_parts(table, np.zeros(7)).any()
+    assert in_parts(table, np.full(7, 20.0)).tolist() == parts  # frames that their windows lack
     table.loc[1, "x_nm"] = 190.0  # beside it, as of a particle that moved
     assert at_a_shared_place(table, 370.0)[1]
     assert not at_a_shared_place(table, 300.0)[1]

@@ -39,7 +39,7 @@ from iscat_analysis.search.sliding.noise import (
     measure_motion,
     measure_noise,
 )
-from iscat_analysis.search.sliding.rises import common_rise
+from iscat_analysis.search.sliding.rises import common_rise, go_on_rising
 from iscat_analysis.search.sliding.search import (
     CORRELATION,
     STRIDES,
@@ -80,6 +80,7 @@ __all__ = [
     "cut_off",
     "find_steps",
     "frame_heights",
+    "go_on_rising",
     "good_frames",
     "locate_step",
     "longest_window",

@@ -36,6 +36,7 @@ class StepFrame:
     p_constant: float
     rise: int = 0
     rise_profile: tuple[float, ...] = ()
+    settling: tuple[float, ...] = ()
 
     @property
     def gap(self) -> int:
@@ -125,8 +126,10 @@ def locate_step(
         p = min(_p_constant(straight, weight), rise.p_line)
         half_width = max(half_width, rise.frames // 2)
     p = 1 - (1 - p) ** 2
-    frames_of_rise = 0 if rise is None else rise.frames
-    return StepFrame(patch.first + turn, half_width, height, snr, p, frames_of_rise, profile)
+    frame = patch.first + turn
+    if rise is None:
+        return StepFrame(frame, half_width, height, snr, p, rise_profile=profile)
+    return StepFrame(frame, half_width, height, snr, p, rise.frames, profile, rise.settling)
 
 
 def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArray, float]:

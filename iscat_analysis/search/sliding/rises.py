@@ -40,12 +40,15 @@ class Rise:
         Of the frames after over those before.
     p_line : float
         Chance that a line seems so much worse than an exponential.
+    settling : tuple of float
+        Log-likelihoods of exponentials over that of the line.
     """
 
     frames: int
     centre: int
     height: float
     p_line: float
+    settling: tuple[float, ...]
 
 
 def find_rise(
@@ -88,14 +91,25 @@ def find_rise(
         return None, profile
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
     curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
-    better = float(_gains(np.concatenate(curves), w, y).max()) - gain
-    p_line = float(erfc(np.sqrt(max(better, 0.0))))  # of χ² with one degree of freedom
+    settling = tuple(float(_gains(curve, w, y).max()) - gain for curve in curves)
+    p_line = float(erfc(np.sqrt(max(*settling, 0.0))))  # of χ² with one degree of freedom
     height = _gain_beyond(heights, weight, centre, rise // 2 + 1)
-    return Rise(rise, centre, height, p_line), profile
+    return Rise(rise, centre, height, p_line, settling), profile
 
 
 def common_rise(profiles: Sequence[tuple[float, ...]]) -> int:
-    """Give the frames over which the light of most steps rises; 0 if they are steps.
+    """Give the frames over which the light of most steps rises; 0 if they are steps."""
+    best = _common(profiles)
+    return _RISE_FRAMES[best - 1] if best else 0
+
+
+def go_on_rising(settling: Sequence[tuple[float, ...]]) -> bool:
+    """Tell whether most rises are exponentials, of which each may be too faint to show it."""
+    return _common(settling) > 0
+
+
+def _common(profiles: Sequence[tuple[float, ...]]) -> int:
+    """Give the number of the course that most steps have; 0 for the one that gains refer to.
 
     The likelihood of a step has its own course with a small probability, whatever the others do.
     """
@@ -105,7 +119,7 @@ def common_rise(profiles: Sequence[tuple[float, ...]]) -> int:
     own = math.log(_ALONE / each.shape[1]) + logsumexp(each, axis=1, keepdims=True)
     total = np.logaddexp(math.log1p(-_ALONE) + each, own).sum(axis=0)
     best = int(np.argmax(total))
-    return _RISE_FRAMES[best - 1] if total[best] > total[0] + _LEAST_GAIN else 0
+    return best if total[best] > total[0] + _LEAST_GAIN else 0
 
 
 def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
