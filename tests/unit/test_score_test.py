@@ -30,7 +30,7 @@ def _tested(changes: dict[str, Any], seed: int, count: int = COUNT) -> tuple[Sco
     return score_test(fitted, build, settings), median
 
 
-@pytest.mark.parametrize("changes", [{"focus_nm": -330.0}, {"z8": 22.0}])
+@pytest.mark.parametrize("changes", [{"focus_nm": -330.0}, {"z11": 10.0}])
 def test_pictures_that_pass_alone_reject_the_optics_together(changes: dict[str, float]) -> None:
     found, median = _tested(changes, 1)
     assert median > REJECTED_P
