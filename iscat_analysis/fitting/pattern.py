@@ -7,11 +7,18 @@ window holds, smear included.  Only blocks within two windows make it, so that i
 the way a movie is cut does not matter, and most particles in it are there all the time and move
 with it.  One that lands or leaves within those blocks is in B with the share f of their light,
 which `Neighbours` takes off again.
+
+Two patterns of which one moves have no common motion: what each loses by the mean of both grows
+with time.  Where pixels change so, beyond noise, B goes along a line in time, pixel by pixel.  Its
+slope comes from the blocks before and after the windows, each side by itself, so that what lands or
+leaves at the step is not in it, and noise of the windows neither; it is taken times the share of
+its variance that is not noise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -33,6 +40,12 @@ from iscat_analysis.search.sliding import STRIDES, Chunk
 SPAN = 2
 """Windows before a step, and as many after it, whose frames make the pattern."""
 
+SLOPE_SPAN = 6
+"""Windows before a step, and as many after it, within which pixels may change along a line."""
+
+_LEAST_EXCESS = 2.5  # variance of slopes over that of noise; rings of what lands make it 2
+_MEDIAN_SQUARE = 0.4549  # of a standard normal variable
+_LOOKED_AT = 5  # turns at which slopes are compared with noise
 _MARGIN_PX = 8  # around a region, so that its own edges do not matter
 _REACH = SPAN * STRIDES
 
@@ -63,6 +76,12 @@ class LocalPattern:
 
     mover: Mover
     spectrum: ComplexArray
+    slope: ComplexArray
+    """Change of the spectrum per frame."""
+
+    frame: float
+    """When the spectrum is that of the pattern, relative to the chunk."""
+
     inner: tuple[slice, slice]
     still: FloatArray
 
@@ -87,7 +106,13 @@ class MovingPattern:
         self._still = still_light(chunk.blocks_e, chunk.usable)
         self._stride = int(edges[1] - edges[0])
         self.chunk = replace(chunk, usable=trusted(chunk.usable, widest))
-        self.contrast = self._contrasts(mapper)
+        self._block_light = np.array([self._light(block) for block in _blocks(edges)])
+        self._centres = (edges[:-1] + edges[1:] - 1) / 2
+        mover = Mover((chunk.shape[0], chunk.shape[1]))
+        spectra = np.stack(list(mapper(partial(self._at_rest, mover), range(len(self._blocks)))))
+        self._slope_variance = 0.0
+        self._slope_variance = self._variance_of_slopes(mover, spectra)
+        self.contrast = self._contrasts(mover, spectra, mapper)
 
     def shift(self, frames: slice) -> FloatArray:
         """Mean shift (y, x) of the light of frames relative to the chunk [pixels]."""
@@ -109,9 +134,21 @@ class MovingPattern:
 
     def span(self, before: slice, after: slice) -> slice:
         """Frames, relative to the chunk, whose light makes the pattern of two windows."""
-        blocks = self._around((before.stop + after.start) // 2)
+        used = np.flatnonzero(self.weights(before, after, after))
         edges = self.chunk.edges
-        return slice(int(edges[blocks.start]), int(edges[blocks.stop]))
+        return slice(int(edges[used[0]]), int(edges[used[-1] + 1]))
+
+    def weights(self, before: slice, after: slice, frames: slice) -> FloatArray:
+        """Give the weight of every block in the pattern that frames of two windows see, (blocks,).
+
+        Of the light per unit power; all together are 1.
+        """
+        turn = (before.stop + after.start) // 2
+        blocks, light = self._around(turn), self._block_light
+        mean = np.zeros(light.size)
+        mean[blocks] = light[blocks] / max(light[blocks].sum(), 1e-300)
+        later = self._time(frames) - self._middle(blocks)
+        return np.asarray(mean + later * self._slope_weights(turn) * light)
 
     def local(self, region: Region, frame: int) -> LocalPattern:
         """Pattern of a region around a frame of the movie."""
@@ -123,25 +160,30 @@ class MovingPattern:
             inner.append(slice(low - first, high - first))
         here = (sides[0], sides[1])
         nearest = self._nearest[0][here], self._nearest[1][here]
-        blocks = self._around(frame - chunk.first)
         shape = (here[0].stop - here[0].start, here[1].stop - here[1].start)
         mover = Mover(shape)
-        spectrum = sum(
-            mover.spectrum((chunk.blocks_e[k] / self._still)[nearest])
-            * mover.transfer(-self._blocks[k : k + 1], np.ones(1))
-            for k in range(blocks.start, blocks.stop)
-        )
+        blocks, slopes = self._around(frame - chunk.first), self._slope_weights(frame - chunk.first)
+        around = np.zeros(slopes.size)
+        around[blocks] = 1.0
+        spectrum: ComplexArray | float = 0.0
+        slope: ComplexArray | float = 0.0
+        for k in np.flatnonzero(around + np.abs(slopes)).tolist():
+            rest = mover.spectrum((chunk.blocks_e[k] / self._still)[nearest])
+            rest *= mover.transfer(-self._blocks[k : k + 1], np.ones(1))
+            spectrum, slope = spectrum + around[k] * rest, slope + slopes[k] * rest
         frames = slice(int(chunk.edges[blocks.start]), int(chunk.edges[blocks.stop]))
         return LocalPattern(
-            mover, np.asarray(spectrum / self._light(frames)), (inner[0], inner[1]),
-            self._still[region.slices],
+            mover, np.asarray(spectrum / self._light(frames)), np.asarray(slope),
+            self._middle(blocks),
+            (inner[0], inner[1]), self._still[region.slices],
         )  # fmt: skip
 
     def seen(self, pattern: LocalPattern, frames: slice) -> FloatArray:
         """Light that frames, relative to the chunk, hold per unit power without particles."""
         shifts, light = self._pieces(frames)
         transfer = pattern.mover.transfer(shifts, light / light.sum())
-        moved = pattern.mover.image(pattern.spectrum * transfer)[pattern.inner]
+        spectrum = pattern.spectrum + (self._time(frames) - pattern.frame) * pattern.slope
+        moved = pattern.mover.image(spectrum * transfer)[pattern.inner]
         return np.asarray(pattern.still * moved)
 
     def between(
@@ -176,29 +218,82 @@ class MovingPattern:
         parts = [slice(a, b) for a, b in pairwise(cuts)]
         return np.array([self.shift(p) for p in parts]), np.array([self._light(p) for p in parts])
 
-    def _contrasts(self, mapper: Mapper) -> NDArray[np.float32]:
-        chunk, count = self.chunk, len(self._blocks)
-        mover = Mover(chunk.shape)
-        light = np.array([self._light(block) for block in _blocks(chunk.edges)])
+    def _at_rest(self, mover: Mover, block: int) -> NDArray[np.complex64]:
+        """Spectrum of a block in the frame of the sample; single precision is 1e-7 of it."""
+        image = mover.spectrum((self.chunk.blocks_e[block] / self._still)[self._nearest])
+        back = mover.transfer(-self._blocks[block : block + 1], np.ones(1))
+        return (image * back).astype(np.complex64)
 
-        def still(k: int) -> NDArray[np.complex64]:
-            """Spectrum of a block in the frame of the sample; single precision is 1e-7 of it."""
-            image = mover.spectrum((chunk.blocks_e[k] / self._still)[self._nearest])
-            back = mover.transfer(-self._blocks[k : k + 1], np.ones(1))
-            return (image * back).astype(np.complex64)
+    def _time(self, frames: slice) -> float:
+        return (frames.start + frames.stop - 1) / 2
+
+    def _middle(self, blocks: slice) -> float:
+        """Mean frame of the light of blocks."""
+        light = self._block_light[blocks]
+        return float(self._centres[blocks] @ light / max(light.sum(), 1e-300))
+
+    def _slope_weights(self, turn: int) -> FloatArray:
+        """Give the weights of blocks, of their light, in the slope of pixels at a turn, (blocks,).
+
+        They are least squares with a level of each side of its own, times the share of the
+        variance of slopes that is not noise.
+        """
+        weights, information = self._least_squares(turn)
+        share = self._slope_variance / (self._slope_variance + 1 / max(information, 1e-300))
+        return weights * share
+
+    def _least_squares(self, turn: int) -> tuple[FloatArray, float]:
+        """Give weights of blocks in the slope, and the information of it per light and power."""
+        middle, count = round(turn / self._stride), len(self._blocks)
+        far, near = SLOPE_SPAN * STRIDES, STRIDES
+        weights, information = np.zeros(count), 0.0
+        for start, stop in ((middle - far, middle - near), (middle + near, middle + far)):
+            side = slice(min(max(start, 0), count), min(max(stop, 0), count))
+            away = self._centres[side] - self._middle(side)
+            weights[side] = away * (self._block_light[side] > 0)
+            information += float(self._block_light[side] @ away**2)
+        return weights / max(information, 1e-300), information
+
+    def _variance_of_slopes(self, mover: Mover, spectra: NDArray[np.complex64]) -> float:
+        """Give the variance of slopes over the light, beyond that of noise; 0 where it is none."""
+        chunk, used = self.chunk, self.chunk.usable
+        last, read = len(chunk.counts), chunk.camera.read_variance_e2(chunk.shape)
+        counts = (chunk.blocks_e.sum(axis=0) + last * read) / self._still**2
+        found = []
+        for turn in np.linspace(0, last, _LOOKED_AT + 2)[1:-1].round().astype(int).tolist():
+            weights, information = self._least_squares(turn)
+            if not information > 0:
+                continue
+            slope = mover.image(np.tensordot(weights, spectra, 1))[used]
+            noise = counts[used] / max(self._block_light.sum(), 1e-300) / information
+            found.append((float(np.median(slope**2 / noise)) / _MEDIAN_SQUARE, information))
+        if not found or np.median([excess for excess, _ in found]) < _LEAST_EXCESS:
+            return 0.0
+        return max(
+            float(np.median([(excess - 1) / information for excess, information in found])), 0
+        )
+
+    def _contrasts(
+        self, mover: Mover, spectra: NDArray[np.complex64], mapper: Mapper
+    ) -> NDArray[np.float32]:
+        chunk, count, light = self.chunk, len(self._blocks), self._block_light
 
         def seen(spectrum: ComplexArray, blocks: slice) -> FloatArray:
             share = light[blocks] / max(light[blocks].sum(), 1e-300)
             return self._still * mover.image(spectrum * mover.transfer(self._blocks[blocks], share))
 
-        spectra = np.stack(list(mapper(still, range(count))))
         out = np.zeros((count - 1, *chunk.shape), dtype=np.float32)
 
         def one(j: int) -> None:
             around = slice(max(j + 1 - _REACH, 0), j + 1 + _REACH)
-            spectrum = spectra[around].sum(axis=0)
-            before = seen(spectrum, slice(max(j + 1 - STRIDES, 0), j + 1))
-            after = seen(spectrum, slice(j + 1, j + 1 + STRIDES))
+            spectrum = spectra[around].sum(axis=0) / max(light[around].sum(), 1e-300)
+            slopes = self._slope_weights(int(chunk.edges[j + 1]))
+            slope = np.tensordot(slopes, spectra, 1) if slopes.any() else np.zeros(())
+            sides = slice(max(j + 1 - STRIDES, 0), j + 1), slice(j + 1, j + 1 + STRIDES)
+            before, after = (
+                seen(spectrum + (self._middle(side) - self._middle(around)) * slope, side)
+                for side in sides
+            )
             used = chunk.usable  # the light is normalised on them, in the search as here
             level = after[used].sum() / before[used].sum()
             out[j, used] = after[used] / (level * before[used]) - 1

@@ -247,8 +247,8 @@ class _Point:
         if not (known >= 0).all():
             return pixels
         groupings = (np.arange(len(known)), known)
-        excess = max((1.0, *(_excess(pixels, whole, each) for each in groupings)))
-        return np.asarray(pixels * excess)
+        most = max((1.0, *(excess(pixels, whole, each) for each in groupings)))
+        return np.asarray(pixels * most)
 
     def pixel_scatter(self) -> tuple[FloatArray, FloatArray]:
         """Covariance of every picture's reduced score from its residuals, and the score.
@@ -305,7 +305,7 @@ class _Point:
         return shared, own
 
 
-def _excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
+def excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -> float:
     """Say how many times more the scores of owners scatter than expected, over all parameters.
 
     The scores of all add up to nothing, which takes one of them.

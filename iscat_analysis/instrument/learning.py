@@ -30,10 +30,14 @@ from iscat_analysis.instrument.microscope import (
     REJECTED_P,
     TESTED,
     median_p,
+    microscopes,
     not_alone,
+    reach_nm,
     refuse_uncalibratable,
 )
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.instrument.result import OpticsCalibration
+from iscat_analysis.instrument.score_test import ScoreTest, score_test
 from iscat_analysis.instrument.sources import StandingAlone, WholeField, seen_in_field
 from iscat_analysis.instrument.uneven import (
     EVEN,
@@ -45,6 +49,7 @@ from iscat_analysis.instrument.uneven import (
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import terms_of
 from iscat_analysis.optics.parameters import (
+    FIELD,
     FREE,
     LEAST_IMAGES,
     free_groups,
@@ -92,7 +97,7 @@ def learn_optics(
     with threads(config.compute.workers) as pool:
         try:
             tested = tested_optics(movie, config, camera, pool, opening)
-            passed = optics.calibrate == "auto" and tested.median_p >= REJECTED_P
+            passed = optics.calibrate == "auto" and not tested.rejected
             if passed and not tested.change.matters:
                 return config, tested.summary | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
@@ -114,7 +119,7 @@ def learn_optics(
             changing = tested is not None and tested.change.matters
             reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
             warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
-            summary = tested.summary if tested else {}
+            summary = tested.summary if tested else _untested(config)
             return config, summary | {"calibrated": False, "reason": reason}
     verdict = tested.change.said if passed else _verdict(tested)
     return adopted(found, config, tested.summary, verdict, warn=warn)
@@ -132,10 +137,35 @@ class Tested:
     change: Change = EVEN
     """Over the field or in time, that they ask for."""
 
+    together: ScoreTest | None = None
+    """What they say together; None where each has a height of its own, which focus imitates."""
+
+    @property
+    def rejected(self) -> bool:
+        """Whether the configured optics do not describe them, one by one or together."""
+        return self.median_p < REJECTED_P or (self.together is not None and self.together.rejected)
+
     @property
     def summary(self) -> dict[str, Any]:
         """Give what the summary says of the test."""
-        return {"tested": self.particles, "median_p": self.median_p}
+        said: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
+        return said if self.together is None else said | _doubted(self.together)
+
+
+def _doubted(together: ScoreTest) -> dict[str, Any]:
+    """Give what the summary says of optics that are not learned."""
+    return {
+        "log_bayes_factor": together.log_bayes_factor,
+        "left_over": together.left_over,
+        "doubt": together.doubt.model_dump(),
+    }
+
+
+def _untested(config: Config) -> dict[str, Any]:
+    """Give the same where no pictures say anything of them."""
+    if heights_free(config):
+        return {}
+    return _doubted(score_test((), microscopes(config, 0.0), settings_of(config)))
 
 
 def tested_optics(
@@ -162,14 +192,20 @@ def tested_optics(
         by_noise = noise_differs(movie, config, camera)
         raise DataError(too_few(movie.name, len(images), by_noise=by_noise))
     median, fitted = median_p(images, config, others, pool.map)
-    if first and median < REJECTED_P:  # more particles, and whose rings they show
+    together = _together(fitted, config, pool)
+    rejected = median < REJECTED_P or (together is not None and together.rejected)
+    if first and rejected:  # more particles, and whose rings they show
         images, others = bright_particle_images(movie, config, camera, pool, opening)
         alone = len(images)
         median, fitted = median_p(images, config, others, pool.map)
+        together = _together(fitted, config, pool)
     change = EVEN
     if not heights_free(config):
         view = FieldOfView.of(movie, config, in_time=sliding)
         change = asked_change(fitted, config, settings_of(config), view, pool.map)
+        over_field = [name for name in change.terms if name in FIELD]
+        if over_field:
+            together = _together(view.placed(fitted), config, pool, over_field)
     if sliding and change.matters:  # which the first particles of a long movie tell badly
         images, others = bright_particle_images(movie, config, camera, pool, opening, whole=True)
         alone = len(images)
@@ -179,7 +215,23 @@ def tested_optics(
         alone -= sum(k < alone for k in pairs)
         if len(images) < LEAST_TESTED:
             raise DataError(too_few(movie.name, len(images)))
-    return Tested(Collected(config, images[:alone], others), len(images), median, change)
+        single = [image for k, image in enumerate(fitted) if k not in pairs]
+        together = _together(single, config, pool)
+    seen = Collected(config, images[:alone], others)
+    return Tested(seen, len(images), median, change, together)
+
+
+def _together(
+    fitted: Sequence[ParticleImage],
+    config: Config,
+    pool: ThreadPoolExecutor,
+    terms: Sequence[str] = (),
+) -> ScoreTest | None:
+    """Ask all pictures together whether the configured optics are right."""
+    if heights_free(config):
+        return None
+    build = microscopes(config, max(map(reach_nm, fitted)))
+    return score_test(fitted, build, settings_of(config), terms, pool.map)
 
 
 def why_not(config: Config) -> str:
@@ -343,11 +395,14 @@ def _verdict(tested: Tested | None) -> str:
     """Say what the test found where the optics are not learned."""
     if tested is None:
         return "the optics cannot be tested on this movie"
-    if tested.median_p >= REJECTED_P:
+    if not tested.rejected:
         return "the optics cannot be learned from this movie"
+    why = f"median p-value {tested.median_p:.1g}"
+    if tested.median_p >= REJECTED_P and tested.together is not None:
+        why = f"log Bayes factor of others {tested.together.log_bayes_factor:.3g}"
     return (
         f"the configured optics do not describe the brightest {min(tested.particles, TESTED)} "
-        f"particles (median p-value {tested.median_p:.1g}), and they cannot be learned from them"
+        f"particles ({why}), and they cannot be learned from them"
     )
 
 

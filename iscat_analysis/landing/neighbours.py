@@ -125,6 +125,15 @@ class Neighbours:
         later = (power[frames.stop] - turned) / whole
         return float(later if step.sign > 0 else 1 - later)
 
+    def _presences(self, step: Step) -> FloatArray:
+        """Give `presence` in every block of the chunk, (blocks,)."""
+        edges = self._chunk.edges
+        turns = step.at.turns if step.at.rise else np.array([step.at.frame])
+        turned = np.clip((turns - self._chunk.first)[:, None], edges[:-1], edges[1:])
+        ends, whole = self._power[edges[1:]], np.diff(self._power[edges])
+        later = (ends - self._power[turned].mean(axis=0)) / np.where(whole > 0, whole, 1.0)
+        return np.asarray(later if step.sign > 0 else 1 - later)
+
     def box(self, step: Step) -> tuple[slice, slice]:
         """Pixels of the field that a step's image covers."""
         (y, x), (height, width) = step.corner, step.image.shape
@@ -139,15 +148,19 @@ class Neighbours:
         if self._pattern is None:
             factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
             return factor
-        held = self.presence(step, self._pattern.span(before, after))
-        if shares == (held, held):
-            return np.ones(image.shape)
         windows = before, after
+        blocks = self._presences(step)
+        held = [float(self._pattern.weights(before, after, window) @ blocks) for window in windows]
+        if shares == tuple(held):
+            return np.ones(image.shape)
         there = [
             1 + share * self.seen(step, self._present(step, window), inside)
             for share, window in zip(shares, windows, strict=True)
         ]
-        known = [1 + held * self.seen(step, window, inside) for window in windows]
+        known = [
+            1 + share * self.seen(step, window, inside)
+            for share, window in zip(held, windows, strict=True)
+        ]
         moving: FloatArray = there[1] / there[0] * known[0] / known[1]
         return moving
 

@@ -52,6 +52,9 @@ class Parameter:
     largest_step: float
     """Of one step of the search."""
 
+    usual_error: float
+    """Standard deviation of a configured value that nobody has measured."""
+
     mirrored: int = 1
     """Its sign in the microscope on the other side of focus that makes the same pictures."""
 
@@ -59,23 +62,23 @@ class Parameter:
     """The change that makes no difference."""
 
 
-_EVEN, _ODD = (Parameter("zernike", 100.0, 25.0, mirrored=sign) for sign in (-1, 1))
+_EVEN, _ODD = (Parameter("zernike", 100.0, 25.0, 5.0, mirrored=sign) for sign in (-1, 1))
 
 PARAMETERS = {
-    "focus_nm": Parameter("focus", 1000.0, 120.0),
-    FOCUS_STEP: Parameter("focus", 50.0, 2.0, -1),
-    DRIFT: Parameter("focus", 1000.0, 100.0, -1),
-    BEND: Parameter("focus", 4000.0, 500.0, -1),
-    **dict.fromkeys(JUMPS, Parameter("focus", 1000.0, 100.0, -1)),
-    "na": Parameter("na", 0.05, 0.02),
-    "reference_phase_deg": Parameter("phase", 180.0, 40.0, -1, period=360.0),
-    "mask_na": Parameter("mask", 0.3, 0.1),
-    "attenuation": Parameter("mask", 0.5, 0.1),
+    "focus_nm": Parameter("focus", 1000.0, 120.0, 30.0),
+    FOCUS_STEP: Parameter("focus", 50.0, 2.0, 1.0, -1),
+    DRIFT: Parameter("focus", 1000.0, 100.0, 30.0, -1),
+    BEND: Parameter("focus", 4000.0, 500.0, 100.0, -1),
+    **dict.fromkeys(JUMPS, Parameter("focus", 1000.0, 100.0, 30.0, -1)),
+    "na": Parameter("na", 0.05, 0.02, 0.01),
+    "reference_phase_deg": Parameter("phase", 180.0, 40.0, 10.0, -1, period=360.0),
+    "mask_na": Parameter("mask", 0.3, 0.1, 0.02),
+    "attenuation": Parameter("mask", 0.5, 0.1, 0.05),
     **{
         name: _ODD if name in ("z7", "z8", "z9", "z10") else _EVEN
         for name in PRIMARY + SECONDARY + HIGHER
     },
-    "polarization_deg": Parameter("polarization", 90.0, 30.0, period=180.0),
+    "polarization_deg": Parameter("polarization", 90.0, 30.0, 5.0, period=180.0),
 }
 """Every continuous parameter, in the order of results.  A new one is a row here, a value in
 `settings_of`, and a derivative of the forward model."""

@@ -70,8 +70,7 @@ def make_analysis(
     if found.optics:
         further["optics"] = found.optics
     further |= extra
-    learned = bool(ready.summary.get("optics", {}).get("calibrated"))
-    rows = reported_rows(found, learned_optics=learned, camera=ready.summary["camera"])
+    rows = reported_rows(found, optics=further.get("optics", {}), camera=ready.summary["camera"])
     table, achieved, budget = rows.table, rows.achieved, rows.budget
     recorded = ready.whole.metadata.ticks
     ticks = None if recorded is None else np.array(recorded)

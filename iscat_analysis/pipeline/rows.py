@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.config import OpticsCovariance
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
@@ -52,16 +54,17 @@ class ReportedRows:
 def reported_rows(
     found: DetectionResult,
     *,
-    learned_optics: bool = False,
+    optics: Mapping[str, Any] = MappingProxyType({}),
     camera: Mapping[str, Any] | None = None,
 ) -> ReportedRows:
-    """Make the rows of all events of a movie, `camera` as the summary describes it."""
+    """Make the rows of all events of a movie, `optics` and `camera` as the summary has them."""
     fits, config, mode = found.fits, found.context.config, found.context.mode
+    learned = bool(optics.get("calibrated"))
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     evidence, heights, extension = None, None, None
     if found.evidence is not None and len(found.evidence):
         evidence = Evidence(*found.evidence.T)
-        heights = Heights.of(config, fits, evidence, learned_optics=learned_optics)
+        heights = Heights.of(config, fits, evidence, learned_optics=learned)
         if heights is None or not heights.are_wrong:  # which would look like widths
             extension = Extension.of(fits, evidence, achieved, config.particle.wiggle_nm)
     shifts = {
@@ -95,12 +98,14 @@ def reported_rows(
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    unfit = (
-        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.context.roi_px**2)
-    )
+    unfit = mass_error(optics)
+    if mode != "track":
+        unfit = max(unfit, misfit_error(fits, found.context.roi_px**2))
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
+    doubt = None if learned or "doubt" not in optics else OpticsCovariance(**optics["doubt"])
     shared = contributions(
-        config, fits, unfit, found.context.model.scale, shifts, camera, threshold
+        config, fits, unfit, found.context.model.scale, shifts, camera, threshold,
+        doubt,
     )  # fmt: skip
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:

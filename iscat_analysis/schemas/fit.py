@@ -328,15 +328,24 @@ class Fluctuation(Closed):
     frames: NotNegative = key("Correlation time [frames]")
 
 
+class Doubt(Closed):
+    """Errors of optics that were not learned."""
+
+    names: list[str] = key("Parameters, in the order of matrix")
+    matrix: list[list[float]] = key("Their covariance")
+
+
 class Learned(Closed):
     """The test of the optics by ``optics.calibrate``, and the learned optics."""
 
     tested: Count = maybe("Bright isolated particles, or tracks")
     median_p: Share = maybe("Median p-value of the brightest with the configured optics")
+    log_bayes_factor: Number = maybe("Of other optics over the configured ones, by all images")
     left_over: Number = maybe(
-        "Residual of the averaged images of tracks with the configured optics, beyond the noise, "
-        "over the image (root mean square)"
+        "What the configured optics leave over of the images, beyond the noise, over the images "
+        "(root mean square)"
     )
+    doubt: Doubt | None = maybe("Errors that the configured optics may have")
     left_over_then: Number = maybe(
         "The same with learned optics that are used although images that were held out reject them"
     )

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from iscat_analysis.calibration.mass import line_sigma_kda
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
@@ -126,10 +126,12 @@ def contributions(
     held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
     camera: Mapping[str, Any] | None = None,
     threshold_snr: float = 0.0,
+    doubt: OpticsCovariance | None = None,
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
-    `camera` is what ``summary.json`` says of it, and `threshold_snr` that of the search.
+    `camera` is what ``summary.json`` says of it, `threshold_snr` that of the search, and `doubt`
+    what the configured optics may be wrong by where none were learned.
 
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
@@ -139,6 +141,11 @@ def contributions(
             Source("selection near the threshold", "measured",
                    partial(_of_the_selection, threshold_snr),
                    "more light, or more frames; species, which know what was missed")
+        )  # fmt: skip
+    if doubt is not None:
+        sources.append(
+            Source("optics as configured", "assumed", partial(_of_configured_optics, doubt),
+                   "more or brighter particles, on which the optics are tested and learned")
         )  # fmt: skip
     sources += [_of_held(name, shift) for name, shift in held_kda.items() if shift.any()]
     found = [(source, source.errors(config, table)) for source in sources]
@@ -359,6 +366,14 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
         *(["contrast"] if _is_about_contrast(config) else []),
     ]
     return {name: sigma[:, k] for k, name in enumerate(COMMON) if name in reported}
+
+
+def _of_configured_optics(
+    doubt: OpticsCovariance, config: Config, table: pd.DataFrame
+) -> Mapping[str, FloatArray]:
+    """Give what optics that no picture has confirmed may be wrong by, as if they were measured."""
+    optics = config.optics.model_copy(update={"covariance": doubt})
+    return _of_the_optics(config.model_copy(update={"optics": optics}), table)
 
 
 def _is_about_contrast(config: Config) -> bool:

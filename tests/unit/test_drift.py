@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.ndimage import shift as image_shift
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
@@ -201,8 +202,45 @@ def test_shot_noise_is_left(rate: tuple[float, float]) -> None:
 def test_without_correction_more_than_shot_noise_is_left() -> None:
     """Control: the test above can fail."""
     chunk = _chunk(_config((0.003, -0.002)), 5)
-    still = Trajectory(np.arange(2.0), np.zeros((2, 2)), np.zeros((2, 2)))
-    assert _left(chunk, MovingPattern(chunk, still)).var() > 10
+    way = follow(chunk)
+    assert way is not None
+    pattern = MovingPattern(chunk, way)
+    pattern.contrast = np.zeros_like(pattern.contrast)
+    assert _left(chunk, pattern).var() > 10
+
+
+def _two_patterns(moved_px: float, seed: int, frames: int = 440, level_e: float = 4e4) -> Chunk:
+    """Record two patterns, the second of which moves, and nothing else."""
+    rng = np.random.default_rng(seed)
+    rough = [gaussian_filter(rng.standard_normal((80, 80)), 3.0, mode="wrap") for _ in range(2)]
+    first, second = (level_e**0.5 * (1 + 0.05 * one / one.std()) for one in rough)
+    counts = np.array(
+        [
+            rng.poisson((first * image_shift(second, (0.0, moved_px * t / frames)))[8:-8, 8:-8])
+            for t in range(frames)
+        ]
+    )
+    light, repeats = measure_frames(counts, Camera())
+    return make_chunk(
+        0, counts, ~repeats, light, Camera(), stride=STRIDE, defects=find_defects
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("moved_px", [0.0, 2.0])
+def test_of_two_patterns_that_move_against_each_other_shot_noise_is_left(moved_px: float) -> None:
+    """By the common motion alone a variance of 2.5 is left."""
+    chunk = _two_patterns(moved_px, 8)
+    way = follow(chunk)
+    assert way is not None
+    pattern = MovingPattern(chunk, way)
+    left = _left(chunk, pattern)
+    own = 1.04 if moved_px else 1.0  # slopes have noise of their own, that of as many windows
+    assert left.var() == pytest.approx(own, abs=SIGMAS * np.sqrt(2 / left.size))
+    edge = int(chunk.edges[len(chunk.blocks_e) // 2])
+    windows = slice(edge - WINDOW, edge), slice(edge, edge + WINDOW)
+    weights = [pattern.weights(*windows, window) for window in windows]
+    assert [each.sum() for each in weights] == pytest.approx([1, 1])
+    assert np.allclose(*weights) == (moved_px == 0)
 
 
 def test_a_region_sees_what_the_field_sees() -> None:

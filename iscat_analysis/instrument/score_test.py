@@ -1,0 +1,109 @@
+"""Whether all pictures together speak against the configured optics: the sum of their scores.
+
+Each picture has a score and an information of the optics, with what is its own (place, mass, level)
+eliminated.  Nobody knows how far the optics are off: each parameter by its usual error, with a
+prior P that is normal.  For scores that sum to S with information I, the change of the optics has
+the posterior mean CS with C = (P⁻¹ + I)⁻¹, and optics that are off are by the factor
+
+    B = exp(½ SᵀCS) / √det(1 + PI)
+
+likelier than those that are right (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90, 773 (1995)).
+What is not ruled out by the pictures is an error of all masses: the configured optics are right
+with probability 1/(1 + B), and otherwise off by a change of covariance C + CS(CS)ᵀ.
+
+Pictures that show something else, such as two particles at once, disagree among each other: they
+count for less by how much more their scores scatter than their information says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit
+
+from iscat_analysis.config import OpticsCovariance
+from iscat_analysis.instrument.joint_fit import asked_changes, excess
+from iscat_analysis.instrument.measure import TWIN_GAP
+from iscat_analysis.instrument.particle_image import Build, ParticleImage
+from iscat_analysis.optics.field_map import BASES
+from iscat_analysis.optics.parameters import (
+    FREE,
+    PARAMETERS,
+    PRIMARY,
+    Settings,
+    free_names,
+)
+from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.trust.systematic import REJECTED_SHARE
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """What the sum of scores says of the optics.
+
+    Shapes: `change` (n,), `covariance` (n, n).
+    """
+
+    names: tuple[str, ...]
+    change: FloatArray
+    covariance: FloatArray
+    log_bayes_factor: float
+    """That of optics which are off."""
+
+    left_over: float
+    """Root mean square of what the change would explain of the pictures, over the pictures."""
+
+    @property
+    def rejected(self) -> bool:
+        """Whether other optics are clearly likelier, and different enough to change masses."""
+        return self.log_bayes_factor > TWIN_GAP and self.left_over > REJECTED_SHARE
+
+    @property
+    def doubt(self) -> OpticsCovariance:
+        """Errors that the configured optics may have, after all that the pictures say."""
+        off = float(expit(self.log_bayes_factor))
+        matrix = off * (self.covariance + np.outer(self.change, self.change))
+        return OpticsCovariance(names=self.names, matrix=tuple(map(tuple, matrix.tolist())))
+
+
+def score_test(
+    images: Sequence[ParticleImage],
+    build: Build,
+    settings: Settings,
+    terms: Sequence[str] = (),
+    mapper: Mapper = map,
+) -> ScoreTest:
+    """Add up the scores of pictures, each fitted with the configured optics.
+
+    `terms` are coefficients of the field that are looked at beside the optics.
+    """
+    names = (*free_names(tuple(FREE), settings, PRIMARY), *terms)
+    usual = np.array([PARAMETERS[name].usual_error for name in names])
+    size, count = len(names), len(images)
+    score, information = np.zeros((count, size)), np.zeros((count, size, size))
+    if count:
+        bases = tuple(dict.fromkeys(base for name in names for base in BASES.get(name, (name,))))
+        asked = asked_changes(images, build, settings, bases, mapper)
+        slopes = np.array(
+            [[[image.slopes(name).get(base, 0.0) for base in bases] for name in names]
+             for image in images]
+        )  # fmt: skip
+        score = np.einsum("nik,nk->ni", slopes, asked.score) * usual
+        information = np.einsum("nik,nkl,njl->nij", slopes, asked.information, slopes)
+        information *= np.outer(usual, usual)
+    total, asks = information.sum(axis=0), score.sum(axis=0)
+    change = np.linalg.solve(np.eye(size) + total, asks)
+    # what pictures leave over that no change of the optics explains in all of them
+    disagreement = excess(total, score - information @ change, np.arange(count))
+    widened = max(disagreement, 1.0)
+    total, asks = total / widened, asks / widened
+    spread = np.linalg.inv(np.eye(size) + total)
+    change = spread @ asks
+    gain = 0.5 * float(asks @ change) - 0.5 * float(np.linalg.slogdet(np.eye(size) + total)[1])
+    power = math.fsum(image.snr**2 for image in images)
+    explained = max(float(change @ total @ change), 0.0)
+    left_over = math.sqrt(explained / power) if power else 0.0
+    return ScoreTest(names, usual * change, spread * np.outer(usual, usual), gain, left_over)

@@ -1,0 +1,58 @@
+"""All pictures together tell optics that are off, which none of them tells alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from calibrations import configuration, make_particle_images
+
+from iscat_analysis.instrument.joint_fit import maximise
+from iscat_analysis.instrument.microscope import REJECTED_P, goodness
+from iscat_analysis.instrument.score_test import ScoreTest, score_test
+from iscat_analysis.optics.parameters import settings_of
+
+COUNT = 8
+PHOTONS = 1.5e5  # so few that single pictures of optics that are a little off are described
+
+
+def _tested(changes: dict[str, Any], seed: int, count: int = COUNT) -> tuple[ScoreTest, float]:
+    """Test pictures as configured; besides, the median of their p-values."""
+    settings = settings_of(configuration())
+    _, images, build = make_particle_images(
+        changes, count, seed=seed, photons=PHOTONS, masses_kda=(2000.0,)
+    )
+    if not images:
+        return score_test((), build, settings), np.nan
+    fitted = maximise(images, build, settings, ()).images
+    median = float(np.median([goodness(image, build(settings))[1] for image in fitted]))
+    return score_test(fitted, build, settings), median
+
+
+@pytest.mark.parametrize("changes", [{"focus_nm": -330.0}, {"z11": 10.0}])
+def test_pictures_that_pass_alone_reject_the_optics_together(changes: dict[str, float]) -> None:
+    found, median = _tested(changes, 1)
+    assert median > REJECTED_P
+    assert found.rejected
+    ((name, value),) = changes.items()
+    index = found.names.index(name)
+    sigma = np.sqrt(found.covariance[index, index])
+    assert abs(found.change[index] - (value - settings_of(configuration())[name])) < 4 * sigma
+
+
+def test_right_optics_are_confirmed_and_leave_no_doubt() -> None:
+    prior = np.diag(np.array(_tested({}, 0, 0)[0].doubt.matrix))
+    for seed in range(4):
+        found, _ = _tested({}, seed)
+        assert not found.rejected
+        assert found.log_bayes_factor < 0
+        assert np.all(np.diag(np.array(found.doubt.matrix)) < 0.1 * prior)
+
+
+def test_without_pictures_optics_are_as_likely_off_as_right() -> None:
+    found, _ = _tested({}, 0, 0)
+    assert not found.rejected
+    assert found.log_bayes_factor == 0
+    focus = found.names.index("focus_nm")
+    assert np.sqrt(found.doubt.matrix[focus][focus]) == pytest.approx(30 / np.sqrt(2))
