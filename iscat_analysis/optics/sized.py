@@ -33,6 +33,7 @@ MASS_STEP = 5e-4
 """Relative step of the mass in differences, a 6000th of the diameter."""
 
 _MASSES_KEPT = 48  # models of single masses at hand
+_SCANNED_KEPT = 64  # the same of a scan, with tables along z of some MB each
 _SECOND = {pair: 5 + k for k, pair in enumerate(PAIRS)}  # rows of second derivatives
 
 
@@ -55,17 +56,24 @@ class SizedModel(ForwardModel):
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
         return self._of_mass(self.sphere.of_mass(amplitude))
 
+    def scanned(self, amplitude: float) -> ForwardModel:
+        """Give `at`, kept with its table along z apart from the masses that a fit passes by."""
+        return self._of_scan(self.sphere.of_mass(amplitude))
+
     @cached_property
     def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        given = _parts_of(self)
+        return memoize(_MASSES_KEPT, self._linear)
 
-        def make(sphere: Sphere) -> ForwardModel:
-            pupil = self.aperture.pupil
-            opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
-            wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
-            return ForwardModel(**{**given, "aperture": opening, "wave": wave})
+    @cached_property
+    def _of_scan(self) -> Callable[[Sphere], ForwardModel]:
+        return memoize(_SCANNED_KEPT, self._linear)
 
-        return memoize(_MASSES_KEPT, make)
+    def _linear(self, sphere: Sphere) -> ForwardModel:
+        """Make the model of the pattern of one sphere."""
+        pupil = self.aperture.pupil
+        opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
+        wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
+        return ForwardModel(**{**_parts_of(self), "aperture": opening, "wave": wave})
 
     def step_of(self, amplitude: float) -> float:
         """Give the step of the mass with which differences are taken [kDa]."""
