@@ -310,7 +310,7 @@ def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:
                 _with_spread(row["contrast"], abs(row[error] * row["contrast"] / row[column]))
                 for row in rows
             ]
-        elif name in ("mass", "D") or tracks[column].notna().any():
+        elif name in ("mass", "D") or (column in tracks and tracks[column].notna().any()):
             heading = f"{name} ± σ{f' [{unit}]' if unit else ''}"
             columns[heading] = [_with_spread(row[column], row[error]) for row in rows]
     columns["status"] = [str(row["status"]) for row in rows]

@@ -159,6 +159,11 @@ class Config(Section):
         return self
 
     @property
+    def fits_sizes(self) -> bool:
+        """Whether the diameters of spheres are fitted, from which their masses follow."""
+        return self.particle.is_sphere and self.fit.mode != "localize"
+
+    @property
     def samples_posterior(self) -> bool:
         """Whether posteriors are sampled: as configured, else if there are few events."""
         if self.fit.mode == "track":
@@ -176,11 +181,23 @@ is not seen."""
 def sphere_refusal(config: Config) -> str:
     """Say why a configuration does not go together with a sphere; else nothing."""
     particle, optics, fit = config.particle, config.optics, config.fit
-    if fit.mode not in ("size", "localize"):
+    if fit.mode not in ("size", "localize", "track"):
         return (
             f'fit.mode = "{fit.mode}" is for dipoles, whose picture has one shape, and '
-            f'particle.model is "{particle.model}": use fit.mode = "size", or "localize" for a '
-            "known diameter"
+            f'particle.model is "{particle.model}": use fit.mode = "size", "track" for spheres '
+            'that move, or "localize" for a known diameter'
+        )
+    if fit.mode == "track" and config.track.free != "joint":
+        return (
+            f'track.free = "{config.track.free}" holds the height, and particle.model is '
+            f'"{particle.model}": the diameter of a sphere needs track.free = "joint"'
+        )
+    background = config.background
+    if fit.mode == "track" and (background.method == "tracks" or background.frames == ALL):
+        return (
+            f'particle.model = "{particle.model}" needs a background that is known before its '
+            "tracks are: give frames without particles, as in background.frames = [0, 200]; one "
+            "that is learnt with the tracks is for dipoles"
         )
     for key, set_to in (
         ('optics.psf = "measured"', optics.psf == "measured"),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,16 +47,8 @@ def size_starts(
 ) -> list[FloatArray]:
     """Local maxima of the likelihood over diameter and height, best first."""
     masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
-    low, high = float(box.lower[2]), float(box.upper[2])
-    count = max(math.ceil((high - low) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1, 3)
-    heights = np.linspace(low, high, count)
-    x, y, level = float(theta[0]), float(theta[1]), float(theta[4])
-    values = np.empty((masses.size, heights.size))
-    for i, mass in enumerate(masses.tolist()):
-        linear = model.at(mass)
-        for j, z in enumerate(heights.tolist()):
-            signal = linear.amplitude_image(likelihood.grid, x, y, z, mass)
-            values[i, j] = likelihood.noise.terms(likelihood.data, signal, level).value
+    heights = scanned_heights(model, float(box.lower[2]), float(box.upper[2]))
+    values = scan_sizes(likelihood, model, theta, masses, heights)
     around = np.pad(values, 1, constant_values=-np.inf)
     neighbours = [
         around[1 + i : 1 + i + masses.size, 1 + j : 1 + j + heights.size]
@@ -70,6 +63,30 @@ def size_starts(
         begin[2], begin[3] = heights[j], masses[i]
         starts.append(begin)
     return starts or [theta.copy()]
+
+
+def scan_sizes(
+    likelihood: Likelihood,
+    model: SizedModel,
+    theta: FloatArray,
+    masses: FloatArray,
+    heights: FloatArray,
+) -> FloatArray:
+    """Log-likelihood of every mass at every height, at the place and the level of θ.
+
+    Shapes: `theta` (5,), `masses` (m,), `heights` (n,), result (m, n).
+    """
+    values = np.empty((masses.size, heights.size))
+    for row, mass in zip(values, masses.tolist(), strict=True):
+        one = replace(likelihood, model=model.scanned(mass))
+        row[:], _ = one.scan_heights(heights, np.array([*theta[:3], mass, theta[4]]), None)
+    return values
+
+
+def scanned_heights(model: SizedModel, low_nm: float, high_nm: float) -> FloatArray:
+    """Heights of a scan from one end of a range to the other [nm], shape (n,)."""
+    count = math.ceil((high_nm - low_nm) / model.fringe_nm * HEIGHTS_PER_FRINGE) + 1
+    return np.linspace(low_nm, high_nm, max(count, 3))
 
 
 def scanned_masses(model: SizedModel, low_kda: float, high_kda: float) -> FloatArray:

@@ -19,16 +19,15 @@ q |∇e|².  This is a small part of |e|², which is itself a small part of the 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.waves import LatticeField, RadialField
 
-ComplexArray = NDArray[np.complex128]
+Model = TypeVar("Model", bound=ForwardModel)
 
 PATH_SPREAD = math.sqrt(2 / 5)
 """Standard deviation of a path's variance in one exposure over its mean, both axes together."""
@@ -52,7 +51,7 @@ def path_variance_nm2(d_um2_s: float, exposure_s: float) -> float:
     return d_um2_s * 1e6 * exposure_s / 3
 
 
-def blurred(model: ForwardModel, variance_nm2: float, *, upwards: bool) -> ForwardModel:
+def blurred(model: Model, variance_nm2: float, *, upwards: bool) -> Model:
     """Average a model over the path of a particle that diffuses."""
     if variance_nm2 == 0:
         return model
@@ -63,27 +62,14 @@ def blurred(model: ForwardModel, variance_nm2: float, *, upwards: bool) -> Forwa
     if upwards:
         exponent = exponent + wave.axial**2
     dimmed = sum(share * np.exp(-exponent * v / 2) for share, v in spreads(variance_nm2))
-    return _dimmed(model, np.asarray(dimmed))
+    return model.dimmed(np.asarray(dimmed))
 
 
-def wiggled(model: ForwardModel, sd_nm: float) -> ForwardModel:
+def wiggled(model: Model, sd_nm: float) -> Model:
     """Average a model over the positions of a wiggling particle, normal about their mean."""
     if sd_nm == 0:
         return model
     wave = model.wave
     if not isinstance(wave, RadialField | LatticeField):
         raise ConfigError('optics.psf = "measured" has the wiggle of the particles it shows')
-    return _dimmed(model, np.exp(-0.5 * (wave.transverse * sd_nm) ** 2))
-
-
-def _dimmed(model: ForwardModel, dimmed: ComplexArray) -> ForwardModel:
-    """Multiply every plane wave of a model.
-
-    Shapes: `dimmed` (n,).
-    """
-    wave = model.wave
-    if isinstance(wave, RadialField):
-        return replace(model, wave=replace(wave, source=wave.source * dimmed))
-    if isinstance(wave, LatticeField):
-        return replace(model, wave=replace(wave, harmonics=wave.harmonics * dimmed))
-    return model
+    return model.dimmed(np.exp(-0.5 * (wave.transverse * sd_nm) ** 2))

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ from iscat_analysis.optics.sensitivity import (
     signal_derivatives,
 )
 from iscat_analysis.optics.stamp import sample_picture
-from iscat_analysis.optics.waves import Field, RadialField, axial_table
+from iscat_analysis.optics.waves import Field, LatticeField, RadialField, axial_table
 
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -69,6 +70,15 @@ class ForwardModel:
     def at(self, amplitude: float) -> ForwardModel:
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
         del amplitude  # a dipole has one picture
+        return self
+
+    def dimmed(self, factor: ComplexArray) -> Self:
+        """Multiply every plane wave of the light by a factor; shapes: `factor` (n,)."""
+        wave = self.wave
+        if isinstance(wave, RadialField):
+            return replace(self, wave=replace(wave, source=wave.source * factor))
+        if isinstance(wave, LatticeField):
+            return replace(self, wave=replace(wave, harmonics=wave.harmonics * factor))
         return self
 
     @property

@@ -10,9 +10,9 @@ their error is 1e-6 of the derivative, and 1e-5 of the second one.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ MASS_STEP = 5e-4
 """Relative step of the mass in differences, a 6000th of the diameter."""
 
 _MASSES_KEPT = 48  # models of single masses at hand
+_INDICES_KEPT = 6
+_SCANNED_KEPT = 64  # the same of a scan, with tables along z of some MB each
 _SECOND = {pair: 5 + k for k, pair in enumerate(PAIRS)}  # rows of second derivatives
 
 
@@ -46,6 +48,9 @@ class SizedModel(ForwardModel):
     mass_range_kda: tuple[float, float] = field(kw_only=True)
     """Masses among which a fit searches."""
 
+    dimming: ComplexArray | float = field(default=1.0, kw_only=True)
+    """What every plane wave was multiplied by: spheres of all masses move alike."""
+
     @property
     def is_sized(self) -> bool:
         """Whether particles are spheres, whose picture changes its shape with their size."""
@@ -55,17 +60,40 @@ class SizedModel(ForwardModel):
         """Give the model whose pictures grow in proportion to the amplitude near this one."""
         return self._of_mass(self.sphere.of_mass(amplitude))
 
+    def scanned(self, amplitude: float) -> ForwardModel:
+        """Give `at`, kept with its table along z apart from the masses that a fit passes by."""
+        return self._of_scan(self.sphere.of_mass(amplitude))
+
+    def of_index(self, index: float) -> SizedModel:
+        """Give the model of spheres, or of cores in the same shell, of another index."""
+        return self._of_index(index)
+
+    @cached_property
+    def _of_index(self) -> Callable[[float], SizedModel]:
+        def make(index: float) -> SizedModel:
+            return replace(self, sphere=replace(self.sphere, index=complex(index)))
+
+        return memoize(_INDICES_KEPT, make)
+
     @cached_property
     def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        given = _parts_of(self)
+        return memoize(_MASSES_KEPT, self._linear)
 
-        def make(sphere: Sphere) -> ForwardModel:
-            pupil = self.aperture.pupil
-            opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
-            wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
-            return ForwardModel(**{**given, "aperture": opening, "wave": wave})
+    @cached_property
+    def _of_scan(self) -> Callable[[Sphere], ForwardModel]:
+        return memoize(_SCANNED_KEPT, self._linear)
 
-        return memoize(_MASSES_KEPT, make)
+    def _linear(self, sphere: Sphere) -> ForwardModel:
+        """Make the model of the pattern of one sphere."""
+        pupil = self.aperture.pupil
+        opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
+        wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
+        linear = ForwardModel(**{**_parts_of(self), "aperture": opening, "wave": wave})
+        return linear.dimmed(np.asarray(self.dimming, dtype=complex))
+
+    def dimmed(self, factor: ComplexArray) -> Self:
+        """As `ForwardModel.dimmed`."""
+        return replace(super().dimmed(factor), dimming=self.dimming * factor)
 
     def step_of(self, amplitude: float) -> float:
         """Give the step of the mass with which differences are taken [kDa]."""

@@ -145,7 +145,7 @@ def make_analysis(
     described = species_of(context, table, searched)
     explained = {"explained_kda": explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
-    calibrated = config.calibration is not None or context.mode == "size"
+    calibrated = config.calibration is not None or config.fits_sizes
     wide = width_warning(described["across_particles"], calibrated=calibrated)
     if wide:
         run.warn(wide)

@@ -111,9 +111,9 @@ def reported_rows(
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = make_rows(fits, columns)
-    if mode == "size":
+    if config.fits_sizes:
         table = with_diameters(table, config.particle.density)
-    unknown = SPHERES if mode == "size" else SCALE if config.calibration is None else None
+    unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None
     budget = budget_of(
         table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured",
     ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip

@@ -196,6 +196,6 @@ def _spread(power: FloatArray) -> float:
 
 def mass_scale_of(config: Config) -> str:
     """Say where the masses come from: standards, the volume of spheres, or the model alone."""
-    if config.fit.mode == "size":
+    if config.fits_sizes:
         return "volume and density"
     return "calibration" if config.calibration else "absolute model"

@@ -261,6 +261,20 @@ TRACKS = (
     Column("ends", "end", "The same for the last frame"),
     Column("systematic_mass_kda", "number", "Error common to the movie, from calibrations [kDa]",
            "systematic [kDa]", optional=True),
+    Column(
+        "optical_diameter_nm", "positive",
+        "Diameter of the sphere that the pictures of all frames show; of spheres, which have "
+        "mass_kda from it [nm]", "optical diameter [nm]", optional=True,
+    ),
+    Column("sigma_optical_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]",
+           optional=True),
+    Column("crb_optical_diameter_nm", "positive", "Its Cramér–Rao bound [nm]", "CRB [nm]",
+           optional=True),
+    Column(
+        "optical_probability", "share",
+        "Posterior probability of that diameter among all that the pictures allow",
+        optional=True,
+    ),
 )  # fmt: skip
 """The columns of ``tracks.csv``, in order."""
 

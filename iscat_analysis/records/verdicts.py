@@ -94,6 +94,7 @@ class TrackStatus(StrEnum):
 
     FEW_FRAMES = "few_frames"
     POOR_FITS = "poor_fits"
+    AMBIGUOUS_SIZE = "ambiguous_size"
     MASS_VARIES = "mass_varies"
     PARTLY_SEEN = "partly_seen"
     SHORT_WAY = "short_way"
@@ -116,6 +117,8 @@ _TRACK_ADVICE = {
     "diffusion coefficient.",
     TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass comes from a "
     "selection of frames: see the status of its rows in fits.csv.",
+    TrackStatus.AMBIGUOUS_SIZE: "Another diameter explains all its frames almost as well: "
+    "optical_probability says how likely this one is.",
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or the masses "
     "of all tracks change together: motion blurs the image, particles met, the particle changed, "
     "or the focus drifts.",

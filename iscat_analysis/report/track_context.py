@@ -29,13 +29,15 @@ from iscat_analysis.report.tracks import (
 
 _SHOWN = (
     "n_frames", "x_nm", "y_nm", "z_nm", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
-    "systematic_mass_kda", "d_um2_s", "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm",
-    "sigma_diameter_nm", "refractive_index", "sigma_refractive_index", "exponent", "p_confinement",
-    "p_anomalous", "p_steady", "confinement_nm", "mass_scatter",
+    "systematic_mass_kda", "optical_diameter_nm", "sigma_optical_diameter_nm", "d_um2_s",
+    "sigma_d_um2_s", "crb_d_um2_s", "diameter_nm", "sigma_diameter_nm",
+    "refractive_index", "sigma_refractive_index", "exponent", "p_confinement", "p_anomalous",
+    "p_steady", "confinement_nm", "mass_scatter",
 )  # fmt: skip
 _ERROR_OF = {
     "mass_kda": "sigma_mass_kda",
     "d_um2_s": "sigma_d_um2_s",
+    "optical_diameter_nm": "sigma_optical_diameter_nm",
     "diameter_nm": "sigma_diameter_nm",
     "refractive_index": "sigma_refractive_index",
 }

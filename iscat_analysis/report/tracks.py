@@ -75,11 +75,12 @@ def medians(analysis: Analysis) -> list[tuple[str, str]]:
     size = "contrast" if main.column == "contrast" else "mass_kda"
     named = (
         (size, "contrast" if size == "contrast" else "mass", "" if size == "contrast" else "kDa"),
+        ("optical_diameter_nm", "optical diameter", "nm"),
         ("d_um2_s", "D", "µm²/s"),
         ("diameter_nm", "hydrodynamic diameter", "nm"),
         ("refractive_index", "refractive index", ""),
     )
-    found = [(label, good[name].median(), unit) for name, label, unit in named]
+    found = [(label, good[name].median(), unit) for name, label, unit in named if name in good]
     return [
         (label, f"{number(value)} {unit}".rstrip()) for label, value, unit in found
         if math.isfinite(value)
@@ -107,6 +108,7 @@ def track_lines(summary: Mapping[str, Any]) -> Iterator[str]:
 TRACK_HEADINGS: Mapping[str, tuple[str, str, str]] = {
     "mass": ("mass_kda", "sigma_mass_kda", "kDa"),
     "D": ("d_um2_s", "sigma_d_um2_s", "µm²/s"),
+    "optical diameter": ("optical_diameter_nm", "sigma_optical_diameter_nm", "nm"),
     "diameter": ("diameter_nm", "sigma_diameter_nm", "nm"),
     "index": ("refractive_index", "sigma_refractive_index", ""),
 }

@@ -64,6 +64,9 @@ COVERAGE = 0.95
 SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
+SURE_SIZE = 0.999
+"""Posterior probability of an optical diameter below which it is flagged as ambiguous."""
+
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _MOST_DOUBTFUL_SHARE = 0.1
 _ENOUGH = 3  # of the first that are as surprising leave none
@@ -335,6 +338,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
     seen = {
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
+        TrackStatus.AMBIGUOUS_SIZE: record.get("optical_probability", 1.0) < SURE_SIZE,
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10
         or setup.change * abs(record["mass_kda"]) > record["sigma_mass_kda"],
         TrackStatus.PARTLY_SEEN: _is_partly_seen(record, setup),
@@ -370,8 +374,10 @@ def _ends(rows: TrackRows, setup: TrackSetup, d_um2_s: float) -> dict[str, str]:
 
 def _table(records: Iterable[Mapping[str, Any]], fits: pd.DataFrame) -> pd.DataFrame:
     """Put records into columns with the right types."""
-    table = pd.DataFrame(list(records), columns=list(TRACK_COLUMNS))
-    table = table.astype({column.name: column.dtype for column in TRACKS if not column.optional})
+    table = pd.DataFrame(list(records))
+    kept = [column for column in TRACKS if not column.optional or column.name in table]
+    table = table.reindex(columns=[column.name for column in kept])
+    table = table.astype({column.name: column.dtype for column in kept})
     table["nearest_nm"] = table["nearest_nm"].where(np.isfinite(table["nearest_nm"]))
     if "systematic_mass_kda" in fits:
         shared = fits.groupby(track_numbers(fits))["systematic_mass_kda"].median()

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from iscat_analysis.camera.background import Check, add_frames, start_power
 from iscat_analysis.camera.counts import Camera
@@ -55,7 +56,9 @@ from iscat_analysis.tracking.frame_subset import keep_frames
 from iscat_analysis.tracking.held_height import held_height_warning
 from iscat_analysis.tracking.joining import join_blocks
 from iscat_analysis.tracking.moving_field import tracking_context
+from iscat_analysis.tracking.sizes import sphere_track, table_of_sizes
 from iscat_analysis.tracking.tracked_optics import TrialTracks, learn_from_tracks
+from iscat_analysis.tracking.tracks import mass_correlation
 from iscat_analysis.trust.null_field import FrameNoise
 
 _STEPS = 100  # of the progress of a block
@@ -262,6 +265,7 @@ def track_frames(
     repeats: list[FloatArray] = []
     noise: FrameNoise | None = None
     events: tuple[Event, ...] = ()
+    spheres: list[Event] = []  # whose diameters all frames tell together
     interrupted = False
     shown = np.ones(last - first, dtype=np.bool_)
     if not context.additive:
@@ -281,6 +285,7 @@ def track_frames(
             if events and noise is not None:
                 repeats += [noise.look(here, events)] * len(events)
             views += [view_of(number, event) for number, event in enumerate(events)]
+            spheres += events if context.model.is_sized else ()
             lines += lines_of(context, events)  # last, so that an interrupted frame has no rows
             progress("track", frame + 1 - first, last - first)
     except KeyboardInterrupt:
@@ -291,7 +296,18 @@ def track_frames(
     numbers = link(frames, places, reach_nm=track.max_step_nm, memory=track.memory_frames)
     order = np.lexsort((frames, numbers))
     own = numbers[order]
+    masses: pd.DataFrame | None = None
+    if context.model.is_sized:
+        tracked = {
+            number: sphere_track(context, [spheres[k] for k in order[own == number]], pool)
+            for number in np.unique(own).tolist()
+        }
+        again = [event for track in tracked.values() for event in track.events]
+        for k, event, line in zip(order, again, lines_of(context, again), strict=True):
+            lines[k], views[k] = line, view_of(0, event)
     fits = make_rows([lines[k] for k in order], {"event": own, "track": own})
+    if context.model.is_sized:
+        masses = table_of_sizes(tracked, mass_correlation(context, fits))
     seen: dict[int, EventView] = {}
     for number, view in zip(numbers.tolist(), views[: len(lines)], strict=True):
         if number not in seen:
@@ -306,7 +322,7 @@ def track_frames(
         summary=summary,
         repeats=tuple(repeats[row] for row in order),
         empty=noise.spread if noise else None,
-        followed=Followed(windows),
+        followed=Followed(windows, masses=masses),
         interrupted=interrupted,
     )
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import blurred
@@ -49,8 +50,7 @@ def path_covariances(context: AnalysisContext, moving: TrackedRows) -> FloatArra
             continue
         model = blurred(context.model, q, upwards=True)
         z = rows.theta[mine, 2]
-        count = max(2, math.ceil(np.ptp(z) / model.fringe_nm * _PER_FRINGE) + 1)
-        heights = np.linspace(z.min(), z.max(), count)
+        heights = _heights(model, z)
         amplitude = float(np.median(rows.theta[mine, 3]))
         share = float(np.median(moving.field.read_e2) / np.median(level))
         table = np.stack([
@@ -61,6 +61,32 @@ def path_covariances(context: AnalysisContext, moving: TrackedRows) -> FloatArra
             for j in range(4):
                 out[mine, i, j] = np.interp(z, heights, table[:, i, j])
     return out
+
+
+def path_shifts_at(
+    model: ForwardModel,
+    roi_px: int,
+    pixel_nm: float,
+    z_nm: FloatArray,
+    amplitude: float,
+    variance_nm2: float,
+) -> FloatArray:
+    """Give `path_shifts` at many heights, linear between some.
+
+    Shapes: `z_nm` (n,), result (n, 4, 9).
+    """
+    heights = _heights(model, z_nm)
+    table = np.stack([
+        path_shifts(model, roi_px, pixel_nm, h, amplitude, variance_nm2)
+        for h in heights.tolist()
+    ])  # fmt: skip
+    return np.asarray(make_interp_spline(heights, table, k=1)(z_nm))
+
+
+def _heights(model: ForwardModel, z_nm: FloatArray) -> FloatArray:
+    """Heights at which errors are computed, from the lowest to the highest."""
+    count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * _PER_FRINGE) + 1)
+    return np.linspace(z_nm.min(), z_nm.max(), count)
 
 
 def path_covariance(
@@ -75,6 +101,25 @@ def path_covariance(
     """Covariance of one fit that the unknown path of its exposure makes.
 
     Shapes: result (4, 4).
+    """
+    moved = path_shifts(model, roi_px, pixel_nm, z_nm, amplitude, variance_nm2, read_share)
+    return np.asarray(moved @ moved.T)
+
+
+def path_shifts(
+    model: ForwardModel,
+    roi_px: int,
+    pixel_nm: float,
+    z_nm: float,
+    amplitude: float,
+    variance_nm2: float,
+    read_share: float = 0.0,
+) -> FloatArray:
+    """Shift of one fit by each standard deviation of the unknown path of its exposure.
+
+    The first three are of its variances along x, y and z.
+
+    Shapes: result (4, 9).
     """
     grid, q = PixelGrid.centred(roi_px | 1, pixel_nm), variance_nm2
     signal, slopes, second = model.amplitude_hessian(grid, 0.0, 0.0, z_nm, amplitude)
@@ -94,5 +139,4 @@ def path_covariance(
     fisher = np.einsum("ayx,byx,yx->ab", slopes, slopes, weight)
     scale = 1 / np.sqrt(np.diag(fisher))
     pulls = np.einsum("ayx,kyx,yx->ak", slopes, changes, weight) * scale[:, None]
-    moved = np.linalg.solve(fisher * np.outer(scale, scale), pulls) * scale[:, None]
-    return np.asarray(moved @ moved.T)
+    return np.asarray(np.linalg.solve(fisher * np.outer(scale, scale), pulls) * scale[:, None])

@@ -148,7 +148,9 @@ def track_setup(context: AnalysisContext, windows: Windows) -> TrackSetup:
         volume=config.track.free == "joint",
         viscosity_mpa_s=config.track.viscosity_mpa_s,
         temperature_c=config.track.temperature_c,
-        index=None if absorbs else float(np.sqrt(matter.permittivity.real)),
+        index=None
+        if absorbs or config.particle.is_sphere
+        else float(np.sqrt(matter.permittivity.real)),
         density_kg_m3=matter.density_kg_m3,
         n_medium=config.optics.n_sample,
         hidden_nm=resolution_nm if background_mode(config) == "tracks" else 0.0,
@@ -283,7 +285,7 @@ def make_films(
 def _models(context: AnalysisContext, tracks: pd.DataFrame) -> dict[int, ForwardModel]:
     """Make the model of each track, sharp or blurred by its motion, as it was fitted."""
     known = np.nan_to_num(tracks["d_um2_s"].to_numpy(float))
-    if background_mode(context.config) != "tracks":
+    if background_mode(context.config) != "tracks" and not context.model.is_sized:
         known[:] = 0.0
     _, exposure_s = exposure_of(context.config)
     upwards = context.config.track.free == "joint"

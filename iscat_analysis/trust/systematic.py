@@ -214,7 +214,7 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     mass, and its picture changes with it.
     """
     mass = np.abs(table["mass_kda"].to_numpy(float))
-    if config.fit.mode != "size" or not share:
+    if not config.fits_sizes or not share:
         return {"mass_kda": share * mass}
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     if not known.any():

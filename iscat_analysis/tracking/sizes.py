@@ -1,0 +1,148 @@
+"""The diameter of each sphere that moves, from all its frames together.
+
+fits of single frames → D of each track → pictures averaged along its path → one diameter for all
+frames → fits of single frames with those pictures, near that diameter
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.events import Event
+from iscat_analysis.inference.common_size import CommonSize, common_sizes
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.sized import SizedModel
+from iscat_analysis.records import FloatArray, Status, verdict
+from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.species.displacements import LEAST_POSITIONS
+from iscat_analysis.species.tracks import Correlation
+from iscat_analysis.tracking.moving_field import exposure_of
+from iscat_analysis.tracking.paths import ALONG, path_shifts_at
+
+_SHOWS_SIZE = {Status.AMBIGUOUS_SIZE, Status.AMBIGUOUS_Z}
+"""Flags of a frame that says something of the diameter all the same."""
+
+
+@dataclass(frozen=True)
+class SphereTrack:
+    """One sphere that moves: its diameter, and its frames."""
+
+    model: SizedModel
+    events: list[Event]
+    sizes: list[CommonSize]
+    """Every likely diameter, the best first; empty where no frame can be used."""
+
+    shifts: FloatArray
+    """Of the mass in each frame that is used, for one standard deviation of its path: (frames, 9),
+    and for that of D: (frames,) in the last column."""
+
+
+def sphere_track(
+    context: AnalysisContext, events: Sequence[Event], pool: ThreadPoolExecutor
+) -> SphereTrack:
+    """Fit one diameter to the frames of a sphere, and each frame once more near it."""
+    used = [event for event in events if set(event.flags) <= _SHOWS_SIZE]
+    model = context.model
+    if not isinstance(model, SizedModel):
+        raise TypeError("diameters are of spheres")
+    if not used:
+        return SphereTrack(model, [*events], [], np.zeros((0, 10)))
+    d_um2_s, sigma_d = _diffusion(context, used)
+    variance = path_variance_nm2(d_um2_s, exposure_of(context.config)[1])
+    averaged = blurred(model, variance, upwards=True)
+    sizes = common_sizes(
+        [replace(event.likelihood, model=averaged) for event in used],
+        averaged,
+        np.array([event.place[:3] for event in used]),
+        context.config.fit.z_range_nm,
+    )
+    near = replace(averaged, mass_range_kda=_range_around(averaged, sizes))
+    start_kda = sizes[0].mass_kda
+
+    def again(event: Event) -> Event:
+        likelihood = replace(event.likelihood, model=near)
+        start = replace(event.candidate, mass_kda=start_kda)
+        z_range_nm = context.config.fit.z_range_nm
+        fit = fit_particle(likelihood, start, context.mode, z_range_nm, level=False)
+        kept = set(event.flags) - set(event.fit.flags)
+        flags = verdict([*fit.flags, *kept])[1]
+        return replace(event, fit=fit, likelihood=likelihood, flags=flags)
+
+    shifts = np.zeros((len(used), 10))
+    fitted = list(pool.map(again, events))
+    if variance > 0:
+        z = np.array([event.fit.z_nm for event in fitted])
+        place = averaged, context.roi_px, context.pixel_nm
+        moved = path_shifts_at(*place, z, start_kda, variance)
+        fitted = [_with_path(event, one) for event, one in zip(fitted, moved, strict=True)]
+        of_used = path_shifts_at(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
+        wider = of_used[:, :3].sum(axis=1) / ALONG * (sigma_d / d_um2_s)
+        shifts = np.column_stack([of_used, wider])
+    return SphereTrack(averaged, fitted, sizes, shifts)
+
+
+def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float, float]:
+    """D of a track and its standard error [µm²/s]; 0 where positions are too few, or times open."""
+    frames = np.array([event.frame for event in events])
+    rate, exposure_s = exposure_of(context.config)
+    if context.config.camera.frame_rate_hz is None or len(np.unique(frames)) < LEAST_POSITIONS:
+        return 0.0, 0.0
+    places = np.array([event.place[:2] for event in events])
+    sigma = np.array([event.fit.sigma[:2] for event in events])
+    return estimate_diffusion(
+        frames, places, sigma, frame_rate_hz=rate, exposure_ms=1e3 * exposure_s
+    )
+
+
+def _range_around(model: SizedModel, sizes: Sequence[CommonSize]) -> tuple[float, float]:
+    """Masses nearer to the best than to any other likely one [kDa]."""
+    best, *others = (one.mass_kda for one in sizes)
+    middles = [math.sqrt(best * other) for other in others]
+    low, high = model.mass_range_kda
+    return (
+        max([low, *(middle for middle in middles if middle < best)]),
+        min([high, *(middle for middle in middles if middle > best)]),
+    )
+
+
+def _with_path(event: Event, moved: FloatArray) -> Event:
+    """Add what the unknown path of the exposure does to the errors of a fit."""
+    sigma = np.sqrt(event.fit.sigma**2 + np.sum(moved**2, axis=1))
+    return replace(event, fit=replace(event.fit, sigma=sigma))
+
+
+def table_of_sizes(tracks: dict[int, SphereTrack], correlation: Correlation | None) -> pd.DataFrame:
+    """Give mass and diameter of each track, with their errors and bounds; its index is `track`."""
+    records = {
+        number: _record(track, correlation) for number, track in tracks.items() if track.sizes
+    }
+    return pd.DataFrame.from_dict(records, orient="index").rename_axis("track")
+
+
+def _record(track: SphereTrack, correlation: Correlation | None) -> dict[str, float]:
+    best = track.sizes[0]
+    mass = best.mass_kda - float(best.bias[0])
+    among = None if correlation is None else correlation(best.places[:, :2])
+    own, bound = (float(best.covariance(one)[0, 0]) for one in (among, None))
+    share = best.information[:, 0, 0] / best.information[:, 0, 0].sum()
+    paths = float(np.sum((share[:, None] * track.shifts[:, :9]) ** 2))
+    sigma = math.sqrt(own + paths + float(share @ track.shifts[:, 9]) ** 2)
+    diameter = track.model.sphere.of_mass(mass).diameter_nm
+    per_kda = diameter / (3 * mass)
+    weights = [one.log_weight - best.log_weight for one in track.sizes if one.converged]
+    known = math.nan if not best.converged else 1.0
+    return {
+        "mass_kda": mass, "sigma_mass_kda": known * sigma,
+        "crb_mass_kda": known * math.sqrt(bound),
+        "optical_diameter_nm": diameter, "sigma_optical_diameter_nm": known * per_kda * sigma,
+        "crb_optical_diameter_nm": known * per_kda * math.sqrt(bound),
+        "optical_probability": known / sum(map(math.exp, weights or [0.0])),
+    }  # fmt: skip
