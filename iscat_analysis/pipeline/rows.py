@@ -62,7 +62,9 @@ def reported_rows(
         evidence = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, evidence, learned_optics=learned_optics)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(fits, evidence, achieved, config.particle.wiggle_nm)
+            extension = Extension.of(
+                config, fits, evidence, achieved, learned_optics=learned_optics
+            )
     shifts = {
         name: finding.mass_shift_kda
         for name, finding in (("heights", heights), ("extension", extension))
