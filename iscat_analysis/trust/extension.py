@@ -16,8 +16,9 @@ times v.  Nothing is added to it, so that its error is this derivative times the
 v (GUM, F.2.4.5).
 
 Optics that were learned from the same pictures imitate a part of the width.  With R the correlation
-of v and the optics, the pictures show (1 − R²) v, with 1 − R² of the variance that they would have
-without; and masses change by what they do when the optics follow.
+of v and the optics, the pictures show (1 − R²) v, and masses change by what they do when the optics
+follow.  The noise of what is shown is taken as large as without learning: at most it is that, and
+it falls to the root of 1 − R² only where optics were learned from the very same light.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class Extension:
             return None
         left, per_mass = _beside_learned_optics(config, table) if learned_optics else (1.0, None)
         mean, error = _mean(q[many], se[many])
-        mean, error = mean / left, error / math.sqrt(left)
+        mean, error = mean / left, error / left
         length = _Length.of(*(part[many] for part in evidence[7:10]))
         moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
         significance = max(mean / error, length.significance, moved / moved_se)
