@@ -205,6 +205,12 @@ def halves(strength: float, seed: int) -> Case:
     return usual(of_halves(strength), seed)
 
 
+def halves_fitted(strength: float, seed: int) -> Case:
+    """Do the same, and fit two halves."""
+    made = halves(strength, seed)
+    return replace(made, settings={**made.settings, "fit.pairs": True})
+
+
 def slow(strength: float, seed: int) -> Case:
     """Let the light of a particle rise over so many frames."""
     return usual(alike(), seed, course=rising(strength), masses=(92.0, 205.0))
@@ -361,6 +367,9 @@ ROWS: Mapping[str, Row] = {
     ),
     "cone of illumination": Row(cone, (0.1, 0.05, 0.15), "rad", _MODEL),
     "two halves": Row(halves, (100.0, 30.0, 50.0, 70.0, 200.0), "nm", "wider|extended|apart"),
+    "two halves, fitted": Row(
+        halves_fitted, (100.0, 50.0, 70.0, 200.0), "nm", "wider|extended|apart"
+    ),
     "aggregates among proteins": Row(aggregates, (5e3, 2e3, 1e4), "kDa"),
     "vesicle among proteins": Row(vesicles, (200.0, 100.0), "nm"),
     "second pattern moves": Row(moving_pattern, (0.1, 0.03, 0.3), "px", "pattern|drift|move"),

@@ -32,6 +32,7 @@ from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.heights import Heights
+from iscat_analysis.trust.pairs import told_as_pairs, with_masses_of_pairs
 from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 
@@ -65,6 +66,9 @@ def reported_rows(
             extension = Extension.of(
                 config, fits, evidence, achieved, learned_optics=learned_optics
             )
+    if extension is not None and config.fit.pairs:
+        paired = told_as_pairs(fits, extension)
+        fits, extension = with_masses_of_pairs(fits, paired), extension.without(paired)
     shifts = {
         name: finding.mass_shift_kda
         for name, finding in (("heights", heights), ("extension", extension))

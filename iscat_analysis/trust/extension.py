@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -113,7 +113,7 @@ class Extension:
         middle, sd = _posterior(
             (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
         )
-        slope = (
+        slope: FloatArray = (
             np.abs(np.nan_to_num(evidence.mass_per_spread))
             if per_mass is None
             else per_mass * table["mass_kda"].abs().to_numpy(float)
@@ -124,6 +124,16 @@ class Extension:
             too_light = shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float)
             flagged = flagged | (known & too_light)
         return cls(mean, error, middle, sd, is_common, flagged, shift)
+
+    def without(self, rows: BoolArray) -> Extension:
+        """Leave out rows that were fitted with their width.
+
+        Shapes: `rows` (n,).
+        """
+        return replace(
+            self, flagged=self.flagged & ~rows,
+            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda),
+        )  # fmt: skip
 
     @property
     def message(self) -> str:
@@ -136,7 +146,8 @@ class Extension:
             f"pictures are wider than a point's, as of particles that wiggle by {wide:.1f} ± "
             f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
             "apart: masses are too small, flagged extended where by more than half of σ; set "
-            "particle.wiggle_nm to it (adding squares), if all particles may move alike"
+            "particle.wiggle_nm to it (adding squares), if all particles may move alike, or "
+            "fit.pairs = true, if they may be two halves"
         )
 
     @property
@@ -178,7 +189,7 @@ def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
     shown = np.exp(logarithm - logarithm.max())
     any_share = np.full(v.size, shown[0])
     any_share[1:] = cumulative_trapezoid(shown, v) / v[1:]
-    return _HIDDEN * shown[0] + (1 - _HIDDEN) * any_share
+    return np.asarray(_HIDDEN * shown[0] + (1 - _HIDDEN) * any_share)
 
 
 def _normal(mean: float, error: float) -> LogLikelihood:
