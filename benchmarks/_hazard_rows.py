@@ -205,6 +205,12 @@ def halves(strength: float, seed: int) -> Case:
     return usual(of_halves(strength), seed)
 
 
+def halves_fitted(strength: float, seed: int) -> Case:
+    """Do the same, and fit two halves."""
+    made = halves(strength, seed)
+    return replace(made, settings={**made.settings, "fit.pairs": True})
+
+
 def slow(strength: float, seed: int) -> Case:
     """Let the light of a particle rise over so many frames."""
     return usual(alike(), seed, course=rising(strength), masses=(92.0, 205.0))
@@ -357,7 +363,7 @@ ROWS: Mapping[str, Row] = {
     "aligned by interpolation": Row(interpolated, (1.0, 0.5, 3.0), "px", "interpolated"),
     "heights held": Row(heights, (20.0, 10.0, 60.0), "nm", "not equally high"),
     "heights learned": Row(heights_learned, (20.0, 10.0, 60.0), "nm", "heights"),
-    "tether": Row(tether, (35.0, 17.0, 52.0), "nm rms", "wiggle|wider"),
+    "tether": Row(tether, (35.0, 10.0, 17.0, 25.0, 52.0), "nm rms", "wiggle|wider"),
     "jitter": Row(jitter, (15.0, 10.0, 25.0), "nm rms", "wiggle|wider"),
     "light that rises": Row(slow, (40.0, 10.0, 20.0), "frames", "rises|goes on changing"),
     "breathing": Row(breath, (0.05, 0.03, 0.1), "", "fluctuate|goes on changing"),
@@ -368,7 +374,10 @@ ROWS: Mapping[str, Row] = {
         slow_breath, (100.0, 20.0, 400.0), "frames", "fluctuate|goes on changing"
     ),
     "cone of illumination": Row(cone, (0.1, 0.05, 0.15), "rad", _MODEL),
-    "two halves": Row(halves, (100.0, 50.0, 200.0), "nm", "wider|extended|apart"),
+    "two halves": Row(halves, (100.0, 30.0, 50.0, 70.0, 200.0), "nm", "wider|extended|apart"),
+    "two halves, fitted": Row(
+        halves_fitted, (100.0, 50.0, 70.0, 200.0), "nm", "wider|extended|apart"
+    ),
     "aggregates among proteins": Row(aggregates, (5e3, 2e3, 1e4), "kDa"),
     "vesicle among proteins": Row(vesicles, (200.0, 100.0), "nm"),
     "second pattern moves": Row(moving_pattern, (0.1, 0.03, 0.3), "px", "pattern|drift|move"),

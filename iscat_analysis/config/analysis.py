@@ -135,6 +135,10 @@ class Fit(Section):
         "curvature",
         description='"curvature" (of the likelihood) | "measured": scaled by the measured spread',
     )
+    pairs: bool = Field(
+        False,
+        description="fit two equal halves to every particle, and give extended ones their mass",
+    )
     z_range_nm: tuple[
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
         Annotated[NonNegative, length(0.0, LARGEST_NM)],

@@ -87,6 +87,11 @@ class Uncertainty(Section):
     height_nm: NonNegative = Field(
         2.0, description="of the mean height of particles, if particle.height_nm is fixed"
     )
+    wiggle_nm: NonNegative = Field(
+        15.0,
+        description="of how far particles wiggle, or have parts that are apart, along each axis "
+        "beyond particle.wiggle_nm, before their images are seen",
+    )
     magnification: Annotated[NonNegative, Field(lt=0.5)] = Field(
         0.005, description="of camera.pixel_size_nm, as a share of it"
     )

@@ -94,6 +94,22 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _pairs_suit_mode(self) -> Config:
+        if self.fit.pairs:
+            for key, is_set in (
+                (f'fit.mode = "{self.fit.mode}"', self.fit.mode != "mass"),
+                ('optics.scheme = "darkfield"', self.optics.scheme == "darkfield"),
+                ('optics.psf = "measured"', self.optics.psf == "measured"),
+                ("particle.height_sd_nm", self.particle.height_prior_sd_nm > 0),
+            ):
+                if is_set:
+                    raise ValueError(
+                        f"fit.pairs = true does not go together with {key}: pairs are fitted in "
+                        'fit.mode = "mass", at one height, with the model of interference'
+                    )
+        return self
+
+    @model_validator(mode="after")
     def _median_has_frames(self) -> Config:
         background, tracked = self.background, self.fit.mode == "track"
         if background.frames == ALL and not (tracked and self.optics.scheme != "darkfield"):

@@ -15,7 +15,8 @@ from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Fitted
 from iscat_analysis.fitting.regions import photons_scale
-from iscat_analysis.inference.nuisances import NOTHING, evidence_of
+from iscat_analysis.inference.nuisances import NOTHING, Evidence, evidence_of
+from iscat_analysis.inference.pairs import pair_of
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
@@ -125,7 +126,14 @@ def _line(
         frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
         quantum=quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
-    return line if event.half_width is None else line | {FRAME_COLUMN: event.half_width}
+    if event.half_width is not None:
+        line[FRAME_COLUMN] = event.half_width
+    if context.config.fit.pairs:
+        pair = pair_of(
+            event.likelihood, event.fit, Evidence(*evidence_of(event.likelihood, event.fit))
+        )
+        line |= pair._asdict() | {"pair_mass_kda": event.sign * pair.pair_mass_kda}
+    return line
 
 
 def table_of(context: AnalysisContext, events: Sequence[Event]) -> pd.DataFrame:

@@ -35,6 +35,7 @@ from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
 from iscat_analysis.trust.heights import Heights
+from iscat_analysis.trust.pairs import told_as_pairs, with_masses_of_pairs
 from iscat_analysis.trust.systematic import contributions, misfit_error, total
 
 
@@ -66,7 +67,12 @@ def reported_rows(
         evidence = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, evidence, learned_optics=learned)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(fits, evidence, achieved, config.particle.wiggle_nm)
+            extension = Extension.of(
+                config, fits, evidence, achieved, learned_optics=learned_optics
+            )
+    if extension is not None and config.fit.pairs:
+        paired = told_as_pairs(fits, extension)
+        fits, extension = with_masses_of_pairs(fits, paired), extension.without(paired)
     shifts = {
         name: finding.mass_shift_kda
         for name, finding in (("heights", heights), ("extension", extension))

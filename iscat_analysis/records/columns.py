@@ -170,6 +170,41 @@ EVENTS = (
         "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
         optional=True,
     ),
+    Column(
+        "pair_mass_kda", "number",
+        "Mass of the particle if it is two equal halves; with fit.pairs [kDa]", "pair", "kDa",
+        optional=True,
+    ),
+    Column(
+        "sigma_pair_mass_kda", "positive",
+        "Its standard deviation, which is its Cramér–Rao bound [kDa]", "σ", optional=True,
+    ),
+    Column(
+        "separation_nm", "not_negative", "Distance of the halves [nm]", "separation", "nm",
+        optional=True,
+    ),
+    Column(
+        "sigma_separation_nm", "positive",
+        "Its standard deviation, which is its Cramér–Rao bound [nm]", "σ", optional=True,
+    ),
+    Column(
+        "angle_deg", "number", "Direction of the halves, from x towards y, 0 to 180 [°]",
+        optional=True,
+    ),
+    Column(
+        "sigma_angle_deg", "positive",
+        "Its standard deviation, which is its Cramér–Rao bound [°]", optional=True,
+    ),
+    Column(
+        "p_point", "share", "Probability that a point gains as much by a second half",
+        optional=True,
+    ),
+    Column(
+        "pair_chi2_reduced", "number", "Reduced χ² with two halves", optional=True,
+    ),
+    Column(
+        "pair_p_value", "share", "Probability of a worse fit if it is two halves", optional=True,
+    ),
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
 

@@ -312,10 +312,10 @@ class Heights(Closed):
 class Extension(Closed):
     """Width of the particles' images beyond that of the model."""
 
-    variance_nm2: Number = key(
-        "Mean variance of positions along each axis [nm²]; null if few events"
-    )
+    variance_nm2: Number = key("Variance of positions along each axis, from the widths [nm²]")
     variance_se_nm2: Number = key("Its standard error [nm²]")
+    posterior_mean_nm2: Number = key("Mean of its posterior, with length, motion and prior [nm²]")
+    posterior_sd_nm2: Number = key("Its standard deviation [nm²]")
     flagged: Count = key("Rows that are flagged extended for it")
 
 

@@ -110,7 +110,7 @@ def _shift(
     if mass_kda is not None:
         scale = forward_model(config, respond.model.reach_nm).scale
         amplitude = float(scale.amplitudes(mass_kda))
-    return respond.to_input(_change(key, config, respond, amplitude, sigma), amplitude)[0]
+    return respond.to_input(_change(key, config, respond, amplitude, sigma), amplitude).amplitude
 
 
 def _response(config: Config, table: pd.DataFrame) -> Response:
@@ -156,7 +156,7 @@ def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> 
     if respond.names:
         faint = respond.faint_amplitude
         change = _change(key, config, respond, faint, sigma)
-        _, optics = respond.to_input(change, faint)
+        optics = respond.to_input(change, faint).optics
         height = respond.model.height_nm
         contrast, _, slopes = peak_gradient(respond.model, height, faint, respond.names)
         shift -= float(slopes @ optics) / contrast

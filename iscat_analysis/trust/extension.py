@@ -1,40 +1,59 @@
 """Particles whose pictures are wider than a point's: they wiggle, or have parts that are apart.
 
-Three things tell the variance q of a particle's places along each axis.  The width of its pictures,
+Three things tell the variance v of a particle's places along each axis.  The width of its pictures,
 which is weak, since a wider picture is nearly a fainter one.  Their length, for particles that lie
 at random: parts that are apart make pictures long, each its own way, and a covariance of places has
-a mean variance q at least as large as what one axis has beyond the other.  And time: particles that
-wiggle from frame to frame have positions that scatter from frame to frame by more than the noise of
-places without a particle, on the side of the step where they are.  What moves within a frame does
-not scatter from frame to frame.  Length and time thus say that there is a spread, and how large it
-is at least; how large it is, the width says.
+a mean variance v at least as large as half of what one axis has beyond the other.  And time:
+particles that wiggle from frame to frame have positions that scatter from frame to frame by more
+than the noise of places without a particle, on the side of the step where they are.  What moves
+within a frame does not scatter from frame to frame.
+
+Before the movie, √v is positive and normal with the standard deviation `uncertainty.wiggle_nm`.
+Length and time show a share of v: nothing in half of all cases (a wiggle has no direction, parts
+that are apart do not move), any share with the same probability in the others.  With the width,
+this gives the posterior of v.  A mass that was fitted with a point is too small by its derivative
+times v.  Nothing is added to it, so that its error is this derivative times the root mean square of
+v (GUM, F.2.4.5).
+
+Optics that were learned from the same pictures imitate a part of the width.  With R the correlation
+of v and the optics, the pictures show (1 − R²) v, and masses change by what they do when the optics
+follow.  The noise of what is shown is taken as large as without learning: at most it is that, and
+it falls to the root of 1 − R² only where optics were learned from the very same light.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import chdtrc, chdtri, log_ndtr
+from scipy.integrate import cumulative_trapezoid
+from scipy.special import chdtrc, chdtri, ndtri
 
+from iscat_analysis.config import Config
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
+from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import BoolArray, FloatArray, Status
+from iscat_analysis.trust.response import response_of
 
 FEWEST = 6
-"""Events without which nothing is said of a spread that all particles have."""
+"""Events without which no spread is called common to all particles."""
 
-_SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it,
-_SYSTEMATIC_SIGMAS = 2.5  # and beyond which systematic errors have it
-_CHANCE = 1e-5  # of one event that is flagged with no spread, and of pictures of all that are long
+_SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it
+_CHANCE = 1e-5  # of one event that is flagged with no spread
 # Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
 _LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
+_HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
+_LEAST_LEFT = 1e-3  # share of a width that learned optics leave over, beneath which it is rounding
+_STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
+
+LogLikelihood = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -44,17 +63,22 @@ class Extension:
     Attributes
     ----------
     variance_nm2, variance_se_nm2 : float
-        Mean variance of places along each axis beyond what the model has, and its error [nm²].
+        Mean variance of places along each axis beyond what the model has, as the widths of the
+        pictures alone show it, and its error [nm²].
+    mean_nm2, sd_nm2 : float
+        Mean and standard deviation of its posterior [nm²].
     is_common : bool
         Whether all particles are extended.
     flagged : ndarray of bool
         Rows whose masses are too small because of it.
     mass_shift_kda : ndarray
-        What it changes of every mass [kDa].
+        By how much every mass may be too small [kDa].
     """
 
     variance_nm2: float
     variance_se_nm2: float
+    mean_nm2: float
+    sd_nm2: float
     is_common: bool
     flagged: BoolArray
     mass_shift_kda: FloatArray
@@ -62,61 +86,125 @@ class Extension:
     @classmethod
     def of(
         cls,
+        config: Config,
         table: pd.DataFrame,
         evidence: Evidence,
         in_time: Mapping[str, EmpiricalSpread],
-        wiggle_nm: float = 0.0,
+        *,
+        learned_optics: bool = False,
     ) -> Extension | None:
-        """Estimate the extension from all rows, beyond a known wiggle; None where there is none."""
+        """Estimate the extension from all rows, beyond a known wiggle; None without evidence."""
         marks = zip(table["status"], table["flags"].fillna(""), strict=True)
         good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
         known = np.isfinite(q) & np.isfinite(se) & np.isfinite(evidence.sigma_across_nm2)
-        if not known.any():
-            return None
-        own = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
         many = good & known
-        mean, error, significance = math.nan, math.nan, 0.0
-        shift = np.zeros(len(table))
-        if many.sum() >= FEWEST:
-            mean, error = _mean(q[many], se[many])
-            least = [
-                _length(*(part[many] for part in evidence[7:10])),
-                _wiggle(table[many], in_time, wiggle_nm),
-            ]
-            significance = max(size / sigma for size, sigma in [(mean, error), *least])
-            if significance > _SYSTEMATIC_SIGMAS:
-                clear = [size for size, sigma in least if size > _SYSTEMATIC_SIGMAS * sigma]
-                mean, error = _at_least(mean, error, max(clear, default=0.0))
-                shift = np.abs(np.nan_to_num(evidence.mass_per_spread)) * math.hypot(mean, error)
-        if significance > _SIGNIFICANT:
-            own = own | (
-                known & (shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float))
-            )
-        return cls(mean, error, significance > _SIGNIFICANT, own, shift)
+        if not many.any():
+            return None
+        left, per_mass = _beside_learned_optics(config, table) if learned_optics else (1.0, None)
+        mean, error = _mean(q[many], se[many])
+        mean, error = mean / left, error / left
+        length = _Length.of(*(part[many] for part in evidence[7:10]))
+        moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
+        significance = max(mean / error, length.significance, moved / moved_se)
+        is_common = bool(many.sum() >= FEWEST and significance > _SIGNIFICANT)
+        # what is clear by itself needs no prior
+        prior_sd = math.inf if is_common else config.uncertainty.wiggle_nm
+        middle, sd = _posterior(
+            (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
+        )
+        slope: FloatArray = (
+            np.abs(np.nan_to_num(evidence.mass_per_spread))
+            if per_mass is None
+            else per_mass * table["mass_kda"].abs().to_numpy(float)
+        )
+        shift = slope * math.hypot(middle, sd)
+        flagged = known & (q > 0) & (np.nan_to_num(evidence.chi2_spread) > chdtri(3, _CHANCE))
+        if is_common:
+            too_light = shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float)
+            flagged = flagged | (known & too_light)
+        return cls(mean, error, middle, sd, is_common, flagged, shift)
+
+    def without(self, rows: BoolArray) -> Extension:
+        """Leave out rows that were fitted with their width.
+
+        Shapes: `rows` (n,).
+        """
+        return replace(
+            self, flagged=self.flagged & ~rows,
+            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda),
+        )  # fmt: skip
 
     @property
     def message(self) -> str:
         """Message for the user; empty where pictures are as wide as the model's."""
         if not self.is_common:
             return ""
-        wide = math.sqrt(self.variance_nm2)
-        error = self.variance_se_nm2 / (2 * wide)
+        wide = math.sqrt(self.mean_nm2)
+        error = self.sd_nm2 / (2 * wide)
         return (
             f"pictures are wider than a point's, as of particles that wiggle by {wide:.1f} ± "
             f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
             "apart: masses are too small, flagged extended where by more than half of σ; set "
-            "particle.wiggle_nm to it (adding squares), if all particles may move alike"
+            "particle.wiggle_nm to it (adding squares), if all particles may move alike, or "
+            "fit.pairs = true, if they may be two halves"
         )
 
     @property
     def summary(self) -> Mapping[str, Any]:
         """What ``summary.json`` says."""
         return {
-            "variance_nm2": None if math.isnan(self.variance_nm2) else self.variance_nm2,
-            "variance_se_nm2": None if math.isnan(self.variance_se_nm2) else self.variance_se_nm2,
+            "variance_nm2": self.variance_nm2,
+            "variance_se_nm2": self.variance_se_nm2,
+            "posterior_mean_nm2": self.mean_nm2,
+            "posterior_sd_nm2": self.sd_nm2,
             "flagged": int(self.flagged.sum()),
         }
+
+
+def _posterior(
+    width: tuple[float, float], prior_sd_nm: float, *shares: LogLikelihood
+) -> tuple[float, float]:
+    """Mean and standard deviation of v, given its width and what a share of it shows [nm²]."""
+    mean, error = width
+    reach = math.sqrt(max(mean, 0.0) + _REACH_SIGMAS * error)
+    root = np.linspace(0.0, min(reach, _REACH_SIGMAS * prior_sd_nm), _STEPS)
+    v = root**2
+    if v[-1] == 0:
+        return 0.0, 0.0
+    logarithm = _normal(mean, error)(v) - 0.5 * (root / prior_sd_nm) ** 2
+    weight = np.exp(logarithm - logarithm.max())
+    for share in shares:
+        weight *= _of_a_share(share, v)
+    middle = float(np.average(v, weights=weight))
+    return middle, math.sqrt(float(np.average((v - middle) ** 2, weights=weight)))
+
+
+def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
+    """Likelihood of v of which nothing is shown, or any share.
+
+    Shapes: `v` (n,), which rises from 0; result (n,).
+    """
+    logarithm = log_likelihood(v)
+    shown = np.exp(logarithm - logarithm.max())
+    any_share = np.full(v.size, shown[0])
+    any_share[1:] = cumulative_trapezoid(shown, v) / v[1:]
+    return np.asarray(_HIDDEN * shown[0] + (1 - _HIDDEN) * any_share)
+
+
+def _normal(mean: float, error: float) -> LogLikelihood:
+    return lambda v: -0.5 * ((v - mean) / error) ** 2
+
+
+def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float | None]:
+    """Share of a width that learned optics leave over, and the share of mass lost per variance."""
+    errors = config.optics.covariance
+    if errors is None:
+        return 1.0, None
+    respond = response_of(config, table, errors.of_the_middle.names)
+    scale = forward_model(config, respond.model.reach_nm).scale
+    shifts = respond.to_width(float(scale.amplitudes(float(table["mass_kda"].abs().median()))))
+    return max(shifts.left, _LEAST_LEFT), abs(shifts.amplitude)
 
 
 def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
@@ -133,32 +221,53 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     return mean, math.sqrt(max(chi2_reduced, 1.0) / float(weight.sum()))
 
 
-def _at_least(mean: float, error: float, least: float) -> tuple[float, float]:
-    """Mean and standard deviation of a normal law that is cut off below."""
-    cut = (least - mean) / error
-    rise = math.exp(-(cut**2) / 2 - float(log_ndtr(-cut))) / math.sqrt(2 * math.pi)
-    return mean + error * rise, error * math.sqrt(max(1 + cut * rise - rise**2, 0.0))
+@dataclass(frozen=True)
+class _Length:
+    """How long pictures are, each in its own direction; what all have in common is of the optics.
 
-
-def _length(across: FloatArray, along: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Least mean variance that elongated pictures show, and its error.
-
-    Each particle has its own direction of elongation; what all have in common belongs to the
-    optics.
-
-    Shapes: `across, along, sigma` (n,).
+    Attributes
+    ----------
+    squares : float
+        Sum of (across² + along²)/σ², of which noise alone has `dof` on average.
+    precision : float
+        Sum of 1/σ² [1/nm⁴].
     """
-    parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
-    squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-    squares = squares[squares < np.median(squares) * _OUTLIER_SIGMAS**2]
-    n = squares.size
-    if n < FEWEST or chdtrc(2 * n - 2, squares.sum()) > _CHANCE:
-        return 0.0, 1.0
-    beyond = squares.sum() / n - 2
-    error = squares.std() / math.sqrt(n)
-    wide2 = beyond * float(np.median(sigma)) ** 2
-    # of the root of the mean square, from that of the square
-    return math.sqrt(wide2), math.sqrt(wide2) * error / (2 * beyond)
+
+    squares: float = 0.0
+    dof: int = 0
+    precision: float = 0.0
+
+    @classmethod
+    def of(cls, across: FloatArray, along: FloatArray, sigma: FloatArray) -> _Length:
+        """Sum over particles, without those that are far longer than most.
+
+        Shapes: `across, along, sigma` (n,).
+        """
+        parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
+        squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
+        kept = squares < np.median(squares) * _OUTLIER_SIGMAS**2
+        n = int(kept.sum())
+        return cls(
+            float(squares[kept].sum()), 2 * max(n - 1, 0), float((sigma[kept] ** -2.0).sum())
+        )
+
+    @property
+    def significance(self) -> float:
+        """Standard deviations of a normal law that are as rare as pictures so long by chance."""
+        return -float(ndtri(chdtrc(self.dof, self.squares))) if self.dof else 0.0
+
+    def log_likelihood(self, variance: FloatArray) -> FloatArray:
+        """Of half of what the variance along one axis has beyond the other.
+
+        The sum of squares is of a noncentral χ² law, which is normal for many events.
+
+        Shapes: `variance` (n,), result (n,).
+        """
+        if not self.dof:
+            return np.zeros(variance.size)
+        beyond = variance**2 * self.precision
+        spread = 2 * self.dof + 4 * beyond
+        return -0.5 * ((self.squares - self.dof - beyond) ** 2 / spread + np.log(spread))
 
 
 def _wiggle(
@@ -166,7 +275,8 @@ def _wiggle(
 ) -> tuple[float, float]:
     """Variance of positions from frame to frame beyond the noise, and its error.
 
-    Half of the frames that are compared hold no particle; its wiggle is twice the mean.
+    Half of the frames that are compared hold no particle; its wiggle is twice the mean.  Where
+    frames were not compared the error is infinite.
     """
     before, after = table["n_before"].to_numpy(float), table["n_after"].to_numpy(float)
     frames = before * after / np.maximum(before + after, 1.0)
@@ -174,7 +284,7 @@ def _wiggle(
     for name in ("x_nm", "y_nm"):
         spread = in_time.get(name)
         if spread is None or spread.single or not spread.by_frames or not spread.empty:
-            return 0.0, 1.0
+            return 0.0, math.inf
         one = float(np.median(table[f"crb_{name}"].to_numpy(float) ** 2 * frames))
         excess = spread.by_frames[0] ** 2 - spread.empty[0] ** 2
         error = 2 * spread.by_frames[0] * spread.by_frames_se[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -28,7 +29,26 @@ COMMON = (*PARAMETERS, "contrast")
 _AMPLITUDES = 4  # at which the response to the optics is computed, for the span of all events
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 _FAINT = 1e-6  # peak contrast of a particle whose scattered light alone is nothing
+_XX, _YY = 5, 7  # rows of second derivatives
 _UNDETERMINED = 1e-7  # of the information, below which pictures do not tell a parameter
+
+
+class Shifts(NamedTuple):
+    """What a picture that differs from the model does to a fit.
+
+    Attributes
+    ----------
+    amplitude : float
+        Shift of ln a.
+    optics : ndarray
+        Shifts of the learned optics, (k,).
+    left : float
+        Share of the information about the difference that learned optics leave over.
+    """
+
+    amplitude: float
+    optics: FloatArray
+    left: float
 
 
 @dataclass(frozen=True)
@@ -97,13 +117,13 @@ class Response:
         """Amplitude of a particle whose scattered light alone is negligible."""
         return _FAINT / peak_per_amplitude(self.model)
 
-    def to_input(self, derivative: FloatArray, amplitude: float) -> tuple[float, FloatArray]:
+    def to_input(self, derivative: FloatArray, amplitude: float) -> Shifts:
         """Shift of ln a and of the optics where pictures differ by a derivative from the model.
 
         Parameters of the optics that were learned from such pictures imitate the difference as far
         as they can, and the particle the rest.
 
-        Shapes: `derivative` (ny, nx), `optics` (k,).
+        Shapes: `derivative` (ny, nx).
         """
         theta = self.theta(self.model.height_nm, amplitude)
         whole = joint_information(self.expected(theta), theta, self.names, [derivative])
@@ -118,7 +138,14 @@ class Response:
         optics = (inverse @ (information[1:, 0] / size)) / size
         moved = imitation(whole, count)
         row = self._row_of_mass
-        return float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics
+        left = 1 - float(information[0, 1:] @ optics) / float(information[0, 0])
+        return Shifts(float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics, left)
+
+    def to_width(self, amplitude: float) -> Shifts:
+        """Shifts per variance of the places of a particle along each axis [1/nm²]."""
+        theta = self.theta(self.model.height_nm, amplitude)
+        rows = self.expected(theta).derivatives(theta)
+        return self.to_input((rows[:, _XX] + rows[:, _YY]) / 2, amplitude)
 
     @property
     def _row_of_mass(self) -> int:

@@ -171,7 +171,7 @@ def _of_held(name: str, shift_kda: FloatArray) -> Source:
     """Make a source of heights or extensions that were held although particles differ in them."""
     remedy = {
         "heights": 'fit them: particle.height_nm = "auto", or particle.height_sd_nm',
-        "extension": "say how far particles wiggle: particle.wiggle_nm",
+        "extension": "more or brighter particles; particle.wiggle_nm, uncertainty.wiggle_nm",
     }[name]
     return Source(
         f"{name} of the particles", "measured", lambda *_: {"mass_kda": shift_kda}, remedy

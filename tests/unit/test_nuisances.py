@@ -19,7 +19,7 @@ from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.nuisances import Evidence, evidence_of
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.records import Candidate
+from iscat_analysis.records import Candidate, FloatArray
 from iscat_analysis.search.sliding import (
     Patch,
     StepFrame,
@@ -37,6 +37,7 @@ SETTINGS = (
     "camera.pixel_size_nm=84", "optics.na=1.42", "optics.focus_nm=-300", "optics.attenuation=1",
     "calibration.gradient_per_kda=-3.1e-5", "particle.height_nm=5",
 )  # fmt: skip
+CONFIG = load_config(None, list(SETTINGS))
 
 
 @cache
@@ -86,7 +87,7 @@ def test_points_at_their_height_show_nothing() -> None:
         assert abs(pull.mean()) < SIGMAS / TRIALS**0.5
         assert abs(pull.std() - 1) < SIGMAS / (2 * TRIALS) ** 0.5
     assert abs(told.chi2_spread.mean() - 3) < SIGMAS * (6 / TRIALS) ** 0.5
-    assert not Extension.of(rows(TRIALS), told, {}).flagged.any()
+    assert not Extension.of(CONFIG, rows(TRIALS), told, {}).flagged.any()
     heights = spread_of_heights(told.z_nm, told.sigma_z_nm)
     assert heights is not None
     assert not heights.is_spread
@@ -113,7 +114,7 @@ def test_a_wiggle_is_as_wide_as_the_model_has_it() -> None:
 def test_particles_in_two_halves_are_flagged(apart_nm: float) -> None:
     masses, told = seen(apart_nm=apart_nm)
     assert masses.mean() < 0.95 * MASS_KDA
-    judged = Extension.of(rows(TRIALS), told, {})
+    judged = Extension.of(CONFIG, rows(TRIALS), told, {})
     assert judged.flagged.all()
     assert "wider than a point's" in judged.message
 
@@ -144,31 +145,79 @@ def test_equal_heights_are_not_spread() -> None:
 # ---- places that wiggle from frame to frame ----------------------------------------------------
 
 
+def of_many(
+    width_nm2: FloatArray, se_nm2: float, across_nm2: FloatArray, along_nm2: FloatArray
+) -> Evidence:
+    """Evidence of events whose widths and lengths are given, the latter ±100 nm²."""
+    one = np.ones(len(width_nm2))
+    return Evidence(
+        5.0 * one, 0.5 * one, one, width_nm2, se_nm2 * one, 0.015 * one, 3.0 * one,
+        across_nm2, along_nm2, 100.0 * one, 0.0 * one,
+    )  # fmt: skip
+
+
+def in_time(moved_nm2: float) -> dict[str, EmpiricalSpread]:
+    """Measured spread of particles that move so much from frame to frame, ±14 nm²."""
+    excess = moved_nm2 / (2 * ONE_FRAME_NM2)
+    return dict.fromkeys(("x_nm", "y_nm"), EmpiricalSpread(
+        1.0, (0.9, 1.1), 40, True, 0.0, (1.0, 2.0),
+        (math.sqrt(max(1 + excess, 0.0)), 1.0), (0.03, 0.03), (1.0, 1.0, 1.0),
+    ))  # fmt: skip
+
+
+ONE_FRAME_NM2 = 4.0 * 40  # variance of the place in a single frame of `rows`
+
+
 def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
-    told = Evidence(
-        *np.tile([5.0, 0.5, 1.0, 0.0, 1000.0, 0.015, 3.0, 0.0, 0.0, 400.0, 0.0], (40, 1)).T
-    )
-    one = 4.0 * 40  # variance of a single frame [nm²]
-
-    def spread(excess: float) -> EmpiricalSpread:
-        return EmpiricalSpread(
-            1.0, (0.9, 1.1), 40, True, 0.0, (1.0, 2.0),
-            (math.sqrt(1 + excess), 1.0), (0.03, 0.03), (1.0, 1.0, 1.0),
-        )  # fmt: skip
-
-    moved = dict.fromkeys(("x_nm", "y_nm"), spread(15.0**2 / (2 * one)))
-    found = Extension.of(rows(40), told, moved)
+    none, moved = np.zeros(40), in_time(15.0**2)
+    told = of_many(none, 1000.0, none, none)
+    found = Extension.of(CONFIG, rows(40), told, moved)
     width_se = 1000.0 / math.sqrt(40)
-    assert 15.0**2 < found.variance_nm2 < 15.0**2 + width_se  # no less than it wiggles
+    assert 15.0**2 < found.mean_nm2 < 15.0**2 + width_se  # no less than it wiggles
     assert found.flagged.all()
-    exact = Evidence(*told[:4], told.sigma_spread_nm2 / 1000, *told[5:])
-    wide = Evidence(*exact[:3], np.full(40, 35.0**2), *exact[4:])
-    within = Extension.of(rows(40), wide, moved)  # most of it is within a frame
-    assert within.variance_nm2 == pytest.approx(35.0**2, rel=1e-3)
-    assert not Extension.of(rows(40), told, moved, 15.0).flagged.any()  # the model has it
-    still = Extension.of(rows(40), told, dict.fromkeys(moved, spread(0.0)))
-    assert not still.flagged.any()
-    assert not still.mass_shift_kda.any()
+    wide = of_many(np.full(40, 35.0**2), 1.0, none, none)
+    within = Extension.of(CONFIG, rows(40), wide, moved)  # most of it is within a frame
+    assert within.mean_nm2 == pytest.approx(35.0**2, rel=1e-3)
+    known = load_config(None, [*SETTINGS, "particle.wiggle_nm=15"])
+    assert not Extension.of(known, rows(40), told, moved).flagged.any()  # the model has it
+    assert not Extension.of(CONFIG, rows(40), told, in_time(0.0)).flagged.any()
+
+
+# ---- what a movie does not know of widths ------------------------------------------------------
+
+
+@pytest.mark.parametrize("events", [4, 40])
+def test_the_error_of_masses_has_the_width_that_a_movie_does_not_show(events: int) -> None:
+    """Drawn from the prior: wiggles within frames or between them, and parts that are apart."""
+    rng, sd = np.random.default_rng(12), CONFIG.uncertainty.wiggle_nm
+    squares, seen_alone = [], []
+    for trial in range(300):
+        v, angle = (rng.normal() * sd) ** 2, rng.uniform(0, 2 * math.pi, events)
+        apart, between = v * (trial % 3 == 0), v * rng.uniform() * (trial % 3 == 1)
+        noise = 100.0 * rng.normal(size=(2, events))
+        told = of_many(
+            v + 1000.0 * rng.normal(size=events), 1000.0,
+            apart * np.cos(angle) + noise[0], apart * np.sin(angle) + noise[1],
+        )  # fmt: skip
+        found = Extension.of(CONFIG, rows(events), told, in_time(between + 14.0 * rng.normal()))
+        shift = found.mass_shift_kda[0] / 0.015
+        squares.append((v / shift) ** 2)
+        seen_alone.append((v / max(found.variance_nm2, 1.0)) ** 2)
+    error = np.std(squares) / len(squares) ** 0.5
+    assert abs(np.mean(squares) - 1) < SIGMAS * error + 0.1
+    assert np.mean(seen_alone) > 10  # the control: what the width alone shows is no error
+
+
+def test_many_particles_leave_a_small_error_and_an_input_turns_it_off() -> None:
+    shares = []
+    for events in (16, 1600):
+        width = 1000.0 * np.random.default_rng(1).normal(size=events)
+        told = of_many(width - width.mean(), 1000.0, np.zeros(events), np.zeros(events))
+        shares.append(Extension.of(CONFIG, rows(events), told, {}).mass_shift_kda[0] / MASS_KDA)
+    assert shares[0] < 0.015
+    assert shares[1] < 0.0015
+    certain = load_config(None, [*SETTINGS, "uncertainty.wiggle_nm=0"])
+    assert not Extension.of(certain, rows(1600), told, {}).mass_shift_kda.any()
 
 
 # ---- light that fluctuates -------------------------------------------------------------------

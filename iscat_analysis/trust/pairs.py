@@ -1,0 +1,48 @@
+"""Particles that are wider than points get the mass of two halves, where the halves are told.
+
+Whether a row is flagged `extended` is known of the whole movie, or of a picture that is clearly
+wider; so is here whether its light tells the halves.  A rule about the distance that each picture
+shows would choose those that noise has made longer.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from iscat_analysis.inference.fit import POOR_FIT_P
+from iscat_analysis.records import BoolArray, Status
+from iscat_analysis.trust.extension import Extension
+
+_TOLD_SIGMAS = 2.0  # of the square of the distance, beyond which its error is nearly normal
+_SURE_P = 1e-5  # of a point, below which one picture alone tells it
+_REPLACED = {
+    "mass_kda": "pair_mass_kda",
+    "sigma_mass_kda": "sigma_pair_mass_kda",
+    "crb_mass_kda": "sigma_pair_mass_kda",
+    "chi2_reduced": "pair_chi2_reduced",
+    "p_value": "pair_p_value",
+}
+
+
+def told_as_pairs(table: pd.DataFrame, extension: Extension) -> BoolArray:
+    """Tell which extended rows get the mass of two halves."""
+    square_sigma = 2 * table["separation_nm"] * table["sigma_separation_nm"]
+    of_movie = 8 * extension.mean_nm2 if extension.is_common else 0.0  # v is d²/8
+    told = (of_movie > _TOLD_SIGMAS * square_sigma) | (table["p_point"] < _SURE_P)
+    return np.asarray(told & table["pair_mass_kda"].notna() & extension.flagged)
+
+
+def with_masses_of_pairs(table: pd.DataFrame, which: BoolArray) -> pd.DataFrame:
+    """Replace masses, errors and goodness of fit; a fit that is good no longer is `poor_fit`."""
+    out = table.copy()
+    for name, by in _REPLACED.items():
+        out.loc[which, name] = table.loc[which, by]
+    for row in out.index[which & (table["pair_p_value"] >= POOR_FIT_P).to_numpy()]:
+        flags = [f for f in str(out.at[row, "flags"] or "").split(";") if f not in ("", _POOR)]
+        out.at[row, "flags"] = ";".join(flags)
+        out.at[row, "status"] = flags[0] if flags else Status.OK.value
+    return out
+
+
+_POOR = Status.POOR_FIT.value
