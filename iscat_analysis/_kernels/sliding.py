@@ -20,7 +20,7 @@ def block_sums(
     counts: NDArray[Any],
     good: BoolArray,
     total: NDArray[Any],
-    sums: FloatArray,
+    sums: MapArray,
     highest: NDArray[Any],
 ) -> None:
     """Sum a block of frames.
@@ -80,13 +80,14 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
 
 
 @kernel(fastmath={"reassoc", "nsz"})
-def contrast_map(earlier: FloatArray, later: FloatArray, weight: MapArray, out: MapArray) -> float:
+def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, minus its weighted mean.
 
     Shapes: `earlier, later` (k, y, x), `weight` (y, x), `out` (y, x).
     """
     rows, columns = weight.shape
-    before, after = np.zeros((rows, columns)), np.zeros((rows, columns))
+    before = np.zeros((rows, columns), dtype=np.float32)
+    after = np.zeros((rows, columns), dtype=np.float32)
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):

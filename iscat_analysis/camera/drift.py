@@ -79,7 +79,7 @@ class Trajectory:
 
 
 def follow_pattern(
-    blocks_e: FloatArray,
+    blocks_e: NDArray[np.floating],
     power: FloatArray,
     frames: FloatArray,
     usable: BoolArray,
@@ -96,7 +96,7 @@ def follow_pattern(
     nearest = filling(usable)
     still = still_light(blocks_e, usable)
     # of a count divided by E < 1 the variance is more than that of a count, as by read noise
-    light = blocks_e[lit].sum(axis=0) / (max(power[lit].sum(), 1e-300) * still)
+    light = blocks_e[lit].sum(axis=0, dtype=float) / (max(power[lit].sum(), 1e-300) * still)
     noise = light * (1 / still - 1) + read_variance_e2 / still**2
     usable = trusted(usable)
     mover = Mover((usable.shape[0], usable.shape[1]))
@@ -244,7 +244,7 @@ def filling(usable: BoolArray) -> tuple[FloatArray, ...]:
     return tuple(index)
 
 
-def still_light(blocks_e: FloatArray, usable: BoolArray) -> FloatArray:
+def still_light(blocks_e: NDArray[np.floating], usable: BoolArray) -> FloatArray:
     """Estimate the light that does not move with the pattern.
 
     Shapes: `blocks_e` (k, y, x), `usable` (y, x), result (y, x).

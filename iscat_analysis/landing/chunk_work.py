@@ -210,4 +210,5 @@ def _ends(chunk: Chunk, inside: slice) -> FloatArray:
     held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
-    return np.stack([chunk.blocks_e[part].mean(axis=0) for part in (blocks[:few], blocks[-few:])])
+    ends = blocks[:few], blocks[-few:]
+    return np.stack([chunk.blocks_e[part].mean(axis=0, dtype=np.float64) for part in ends])

@@ -105,6 +105,10 @@ class Neighbours:
         """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
         return round(self._roi_px * min(max(start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
 
+    def reach_px(self, step: Step) -> float:
+        """Farthest centre of a fitted square that holds pixels of a step's image."""
+        return self._half(step.start) + self._roi_px / 2 + 2
+
     def overlaps(self, step: Step, start: int, stop: int) -> bool:
         """Whether a step lies inside frames relative to the chunk."""
         first = self._chunk.first
@@ -234,7 +238,7 @@ class Neighbours:
                 *((s.start.x_px, s.start.y_px, s.at.frame) for s in steps), strict=True
             )
         )
-        reach = np.array([self._half(s.start) for s in steps]) + self._roi_px / 2 + 2
+        reach = np.array([self.reach_px(s) for s in steps])
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])

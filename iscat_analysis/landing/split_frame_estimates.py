@@ -30,7 +30,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
 from iscat_analysis.search.sliding import Chunk
-from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, middle_of_box
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
 
 PLACES, MOVIE_PLACES = 20_000, 100_000
@@ -38,6 +38,9 @@ PLACES, MOVIE_PLACES = 20_000, 100_000
 
 MOST_WINDOWS, FEWEST_WINDOWS = 8, 2
 """Windows of a chunk that are looked at."""
+
+TILE_SIDE_PX = 256
+"""Side of the middle of a tile at which its noise is looked at."""
 
 _LEAST_LIGHT_E = 1e4  # of a frame, whose power is then known to 1 %
 _BLOCK_BYTES = 16 * 2**20
@@ -144,14 +147,18 @@ def step_controls(
     neighbours: Neighbours,
     own: Box = EVERYWHERE,
 ) -> EmptySpread | None:
-    """Make the same estimates in windows in which nothing lands or leaves, at its own pixels."""
+    """Make the same estimates in windows in which nothing lands or leaves, at its own pixels.
+
+    The middle of a tile is enough: its field has many.
+    """
     times = sorted({event.frame for event in events})
     times = [t for t in times if chunk.first <= t - window and t + window <= chunk.stop]
     if not times:
         return None
+    box = EVERYWHERE if own == EVERYWHERE else middle_of_box(own, chunk.shape, TILE_SIDE_PX)
     field = empty_field(
-        context, chunk.mean_e, chunk.camera.read_variance_e2(chunk.shape), chunk.usable,
-        [event.fit for event in events], level=True,
+        context, chunk.mean_e[box], chunk.camera.read_variance_e2(chunk.shape)[box],
+        chunk.usable[box], [event.fit for event in events], level=True,
     )  # fmt: skip
     most = most_windows(field.places, (chunk.edges.size - 2) / context.searches)
     apart: list[int] = []
@@ -159,33 +166,29 @@ def step_controls(
         if not apart or t >= apart[-1] + window:
             apart.append(t)
     chosen = [apart[i] for i in np.unique(np.linspace(0, len(apart) - 1, most).round().astype(int))]
-    others = np.ones(chunk.shape, dtype=np.bool_)
-    others[own] = False
     total: EmptySpread | None = None
     for turn in chosen:
         near = [s for s in steps if abs(s.at.frame - turn) <= window]
         taken = taken_places(
             context, chunk.shape, [(s.start.x_px, s.start.y_px, s.excess == 0) for s in near]
         )
-        taken |= others
         sides, powers = [], []
         for start, stop in ((turn - window, turn), (turn, turn + window)):
             parts, light = [], []
             for cut in _cuts(chunk, start, stop):
                 power = float(chunk.power[cut].sum())
-                sum_e = _summed(chunk, cut)
+                sum_e = _summed(chunk, cut, box)
                 known = np.zeros(chunk.shape)
                 for s in near:
-                    box = neighbours.box(s)
-                    known[box] += neighbours.presence(s, cut) * s.image
-                known = context.left(known)
-                parts.append(field.errors(sum_e, power, known * chunk.mean_e))
+                    known[neighbours.box(s)] += neighbours.presence(s, cut) * s.image
+                known = context.left(known)[box]
+                parts.append(field.errors(sum_e, power, known * chunk.mean_e[box]))
                 light.append(power)
             sides.append(parts)
             powers.append(np.array(light))
         if min(len(p) for p in powers) < 2:
             continue
-        found = field.spread(sides[0], sides[1], (powers[0], powers[1]), taken)
+        found = field.spread(sides[0], sides[1], (powers[0], powers[1]), taken[box])
         total = found if total is None else total + found
     return total
 
@@ -206,10 +209,11 @@ def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
             yield slice(int(good[a]), int(good[b - 1]) + 1)
 
 
-def _summed(chunk: Chunk, cut: slice) -> FloatArray:
+def _summed(chunk: Chunk, cut: slice, box: Box) -> FloatArray:
+    """Sum frames over a box of pixels."""
     span = chunk.first + cut.start, chunk.first + cut.stop
-    (rows, columns) = chunk.shape
-    return chunk.patch(*span, (0, rows), (0, columns)).window(*span)[0]
+    rows, columns = (part.indices(n)[:2] for part, n in zip(box, chunk.shape, strict=True))
+    return chunk.patch(*span, rows, columns).window(*span)[0]
 
 
 # ---- background frames -----------------------------------------------------------------------

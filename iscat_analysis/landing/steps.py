@@ -37,7 +37,7 @@ from iscat_analysis.landing.tasks import Task, TaskBuilder
 from iscat_analysis.landing.traces import clip_of, patch_of, trace_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.residue import chi2_excess
+from iscat_analysis.search.residue import Described, chi2_excess
 from iscat_analysis.search.sliding import (
     Chunk,
     MapArray,
@@ -48,7 +48,7 @@ from iscat_analysis.search.sliding import (
     go_on_rising,
     make_filter,
 )
-from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, is_within
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
 ROUNDS = 10
@@ -58,6 +58,7 @@ _SWEEPS = 10  # fits of what has neighbours that still move, with everything els
 # Of the threshold; a fit that reaches less is what other steps explain
 _LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
+_CORE_MARGIN_PX = 4.0  # beyond the core of a tile, from which a last fit may lead into it
 _LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
 
 
@@ -135,12 +136,14 @@ class ChunkFitter:
             known = len(steps)
             steps = steps + fresh
             seen, bound = self._neighbours.of(steps)
-            chosen = set(range(known, len(steps)))
+            relevant = self._relevant(steps, bound)
+            new = relevant.intersection(range(known, len(steps)))
+            chosen = new
             for _ in range(_SWEEPS):
                 improved = self._improve(steps, chosen, seen)
                 moved = {i for i in chosen if _has_moved(steps[i], improved[i])}
                 steps = improved
-                chosen = {i for i, others in enumerate(bound) if moved.intersection(others)}
+                chosen = {i for i in relevant if moved.intersection(bound[i])}
                 if not chosen:
                     break
             rise = {
@@ -149,9 +152,9 @@ class ChunkFitter:
             }
             if rise != self._tasks.rise:
                 self._tasks.rise = rise
-                steps = self._improve(steps, set(range(len(steps))), seen)
+                steps = self._improve(steps, relevant, seen)
             if "z_nm" in FREE_PARAMETERS[self._context.mode]:
-                steps = self._lifted(steps, set(range(known, len(steps))), seen)
+                steps = self._lifted(steps, new, seen)
             credible = self._credible(steps)
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
@@ -174,15 +177,17 @@ class ChunkFitter:
         seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
         # steps of the other polarity are fitted too: their rings have the one that is reported
         sign = reported_steps(self._context)
-        own = [
+        now = [
             i
             for i, s in enumerate(everything)
             if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
+        own = [i for i in now if self._is_near_core(everything[i], _CORE_MARGIN_PX)]
         found = self._pool.map(
             lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
         )
-        fitted = self._judged([one for one in found if one is not None])
+        beside = [steps[i] for i in sorted({*now}.difference(own)) if i < len(steps)]
+        fitted = self._judged([one for one in found if one is not None], beside)
         if fitted and not self._pattern and self._controlled:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
@@ -237,6 +242,20 @@ class ChunkFitter:
         mass = max(mass, 1e-3 * context.model.material.mass_kda)
         start = Candidate(peak.x_px, peak.y_px, context.height_nm(mass), mass, abs(peak.snr))
         return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
+
+    def _relevant(self, steps: Sequence[Step], bound: Sequence[Sequence[int]]) -> set[int]:
+        """Select the steps that change what is fitted in the core, and those that change these.
+
+        Others keep what the search found of them.
+        """
+        reaches = [self._is_near_core(s, self._neighbours.reach_px(s)) for s in steps]
+        return {
+            i for i, others in enumerate(bound) if reaches[i] or any(reaches[k] for k in others)
+        }
+
+    def _is_near_core(self, step: Step, margin_px: float) -> bool:
+        """Whether a step is in the core of a tile, or nearer to it than a margin."""
+        return is_within(self._own, step.start.y_px, step.start.x_px, margin_px)
 
     # ---- one step --------------------------------------------------------------------------
 
@@ -358,14 +377,20 @@ class ChunkFitter:
         )
         return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
 
-    def _judged(self, finished: Sequence[_Finished]) -> list[StepEvent]:
-        """Judge all steps, including side lobes and steps that explain less than they leave."""
-        steps = [own.fitted.step for own in finished]
+    def _judged(self, finished: Sequence[_Finished], beside: Sequence[Step]) -> list[StepEvent]:
+        """Judge all steps, including side lobes and steps that explain less than they leave.
+
+        Those beside them are not reported, but may be so bright that what they leave over is.
+        """
+        steps = [*(own.fitted.step for own in finished), *beside]
         settling = {
             sign: go_on_rising([step.at.settling for step in steps if step.sign == sign])
             for sign in (1, -1)
         }
         described = [own.fitted.event.described for own in finished]
+        described += [
+            Described(s.start.snr if s.theta is None else s.snr, s.excess) for s in beside
+        ]
         frame = np.array([step.at.frame for step in steps])
         x_px, y_px = _places(steps)
         judged = []

@@ -130,8 +130,8 @@ def _spots(
     def one(j: int) -> NDArray[np.float32]:
         low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
         ratio = power[middle:high].sum() / max(power[low:middle].sum(), 1e-300)
-        before = chunk.blocks_e[low:middle].sum(axis=0)
-        after = chunk.blocks_e[middle:high].sum(axis=0)
+        before = chunk.blocks_e[low:middle].sum(axis=0, dtype=np.float64)
+        after = chunk.blocks_e[middle:high].sum(axis=0, dtype=np.float64)
         if not 0 < ratio < 1e6:
             return np.zeros(chunk.shape, dtype=np.float32)
         lit = used & (before > 0) & (after > 0)

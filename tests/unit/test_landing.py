@@ -516,7 +516,7 @@ def test_windows_that_do_not_fit_into_memory() -> None:
 )
 def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[int]) -> None:
     """The first is longer where that and the next have room for 2 × 75 frames beside windows."""
-    config = _config("compute.memory_limit_mb=200", "background.window_frames=20")
+    config = _config("compute.memory_limit_mb=136", "background.window_frames=20")
     movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
     reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
     plan = chunks_module.plan_chunks(reader, config, 20, 5)

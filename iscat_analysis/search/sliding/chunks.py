@@ -253,9 +253,9 @@ class Reader:
         step = max(1, step // _TOGETHER) if step < len(counts) else step
         starts = range(0, len(counts), step)
 
-        def one(start: int) -> tuple[FloatArray, NDArray[Any]]:
+        def one(start: int) -> tuple[NDArray[np.float32], NDArray[Any]]:
             lit = counts[start : start + step][good[start : start + step]]
-            return summed(lit) if len(lit) else (np.zeros(self.shape), highest)
+            return summed(lit) if len(lit) else (np.zeros(self.shape, np.float32), highest)
 
         for first in range(0, len(starts), _TOGETHER):
             for sums, most in pool.map(one, starts[first : first + _TOGETHER]):
@@ -440,11 +440,11 @@ def choose_tiles(
 
 
 def _per_block(config: Config) -> int:
-    """Bytes of a pixel of a block beside its counts: its sum and its map.
+    """Bytes of a pixel of a block beside its counts: its sum, its map and its highest count.
 
     Where the motion of the pattern is divided out, that and a spectrum as well.
     """
-    return 32 if config.background.follows_pattern else 20
+    return 22 if config.background.follows_pattern else 10
 
 
 def plan_chunks(

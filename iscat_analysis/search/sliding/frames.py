@@ -43,7 +43,7 @@ class Chunk:
     usable: BoolArray
     saturated: BoolArray
     edges: NDArray[np.int64]
-    blocks_e: FloatArray
+    blocks_e: NDArray[np.float32]  # a millionth of their noise is lost
     check: Callable[[], None]
     let_go: Callable[[], None]  # of pages of the file, once a region was copied
     level_e: float  # mean light of a pixel and frame, of the whole field
@@ -242,12 +242,12 @@ def good_frames(counts: NDArray[Any], camera: Camera) -> BoolArray:
     return well_lit(light) & ~repeats
 
 
-def summed(counts: NDArray[Any]) -> tuple[FloatArray, NDArray[Any]]:
+def summed(counts: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[Any]]:
     """Sum frames, and find the highest count of every pixel.
 
     Shapes: `counts` (t, y, x), `sums, highest` (y, x).
     """
-    sums, highest = np.empty(counts.shape[1:]), counts[0].copy()
+    sums, highest = np.empty(counts.shape[1:], dtype=np.float32), counts[0].copy()
     block_sums(counts, np.ones(len(counts), dtype=np.bool_), _scratch(counts), sums, highest)
     return sums, highest
 
@@ -278,8 +278,8 @@ def make_chunk(
     """
     edges, blocks, highest = _sum_blocks(counts, good, camera, stride, check, mapper)
     sums = _judged(
-        (first, first + len(counts)), good, light_e, blocks.sum(axis=0), highest.max(axis=0),
-        camera, defects,
+        (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
+        highest.max(axis=0), camera, defects,
     )  # fmt: skip
     return _chunk(counts, sums, camera, edges, blocks, check, _nothing)
 
@@ -354,7 +354,7 @@ def _chunk(
     sums: FieldSums,
     camera: Camera,
     edges: NDArray[np.int64],
-    blocks: FloatArray,
+    blocks: NDArray[np.float32],
     check: Callable[[], None],
     let_go: Callable[[], None],
 ) -> Chunk:
@@ -376,14 +376,14 @@ def _sum_blocks(
     stride: int,
     check: Callable[[], None],
     mapper: Mapper,
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[Any]]:
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[Any]]:
     """Sum blocks of so many frames, and find the highest count of each pixel in each.
 
     Shapes: `counts` (t, y, x), `blocks_e, highest` (k, y, x).
     """
     frames, rows, columns = counts.shape
     edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
-    blocks = np.empty((edges.size - 1, rows, columns))
+    blocks = np.empty((edges.size - 1, rows, columns), dtype=np.float32)
     offset = np.asarray(camera.offset_adu)
     highest = np.empty((edges.size - 1, rows, columns), dtype=counts.dtype)
 

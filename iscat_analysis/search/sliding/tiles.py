@@ -20,6 +20,25 @@ EVERYWHERE: Box = (slice(None), slice(None))
 """All pixels."""
 
 
+def middle_of_box(box: Box, shape: tuple[int, int], side_px: int) -> Box:
+    """Give the middle of a box in an image, of at most a given side."""
+    low, high = zip(*(part.indices(n)[:2] for part, n in zip(box, shape, strict=True)), strict=True)
+    begins = [max(a, (a + b - side_px) // 2) for a, b in zip(low, high, strict=True)]
+    rows, columns = (
+        slice(begin, min(begin + side_px, b)) for begin, b in zip(begins, high, strict=True)
+    )
+    return rows, columns
+
+
+def is_within(box: Box, y_px: float, x_px: float, margin_px: float) -> bool:
+    """Whether a place is in a box of pixels, or nearer to it than a margin."""
+    return all(
+        (part.start is None or place >= part.start - 0.5 - margin_px)
+        and (part.stop is None or place < part.stop - 0.5 + margin_px)
+        for place, part in zip((y_px, x_px), box, strict=True)
+    )
+
+
 @dataclass(frozen=True)
 class Tile:
     """Half-open ranges of full-frame pixels: the core of a tile, and the core with its halo."""
@@ -42,10 +61,14 @@ class Tile:
 
     @property
     def inner(self) -> Box:
-        """Index of the core in the tile."""
-        (top, bottom), (left, right) = self.core_rows, self.core_columns
-        y, x = self.corner
-        return slice(top - y, bottom - y), slice(left - x, right - x)
+        """Index of the core in the tile; without an end where the field ends."""
+        rows, columns = (
+            slice(low - first if low > first else None, high - first if high < last else None)
+            for (low, high), (first, last) in (
+                (self.core_rows, self.rows), (self.core_columns, self.columns),
+            )
+        )  # fmt: skip
+        return rows, columns
 
     @property
     def corner(self) -> tuple[int, int]:
