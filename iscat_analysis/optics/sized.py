@@ -57,15 +57,14 @@ class SizedModel(ForwardModel):
 
     @cached_property
     def _of_mass(self) -> Callable[[Sphere], ForwardModel]:
-        given = _parts_of(self)
+        return memoize(_MASSES_KEPT, self._linear)
 
-        def make(sphere: Sphere) -> ForwardModel:
-            pupil = self.aperture.pupil
-            opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
-            wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
-            return ForwardModel(**{**given, "aperture": opening, "wave": wave})
-
-        return memoize(_MASSES_KEPT, make)
+    def _linear(self, sphere: Sphere) -> ForwardModel:
+        """Make the linear model of one sphere."""
+        pupil = self.aperture.pupil
+        opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
+        wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
+        return ForwardModel(**{**parts_of(self), "aperture": opening, "wave": wave})
 
     def step_of(self, amplitude: float) -> float:
         """Give the step of the mass with which differences are taken [kDa]."""
@@ -154,9 +153,9 @@ class SizedModel(ForwardModel):
 def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:
     """Make the model of spheres of all masses from that of one, with the diameters to search."""
     low, high = (sphere_mass_kda(diameter, sphere.density_kg_m3) for diameter in diameters_nm)
-    return SizedModel(**_parts_of(model), sphere=sphere, mass_range_kda=(low, high))
+    return SizedModel(**parts_of(model), sphere=sphere, mass_range_kda=(low, high))
 
 
-def _parts_of(model: ForwardModel) -> dict[str, Any]:
+def parts_of(model: ForwardModel) -> dict[str, Any]:
     """Name the parts of which a linear model is made."""
     return {each.name: getattr(model, each.name) for each in fields(ForwardModel)}

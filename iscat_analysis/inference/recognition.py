@@ -1,0 +1,238 @@
+"""Whether a particle that was fitted as a dipole is a sphere that stands on the coverslip.
+
+A dipole does not describe a large particle: its centre is higher than that of a protein, and light
+from its parts interferes.  A fit that is poor, or so bright that a compact protein of its mass
+would be no dipole, is therefore repeated with spheres of several materials.  Beside the place they
+have one parameter, as the dipole has, or two where the refractive index is fitted; a dipole at
+another height has two as well.  In the Bayesian information criterion each costs half the logarithm
+of the number of pixels (G. Schwarz, Ann. Statist. 6, 461, 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.sizes import (
+    OTHER_SIZE_SHARE,
+    SURE_ODDS,
+    has_other_size,
+    scanned_masses,
+)
+from iscat_analysis.inference.slow_scoring import maximize_slowly
+from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.seated import SeatedModel
+from iscat_analysis.records import (
+    Alternative,
+    Box,
+    Candidate,
+    FitResult,
+    FloatArray,
+    Status,
+    verdict,
+)
+from iscat_analysis.units import sphere_diameter_nm
+
+LARGEST_DIPOLE = 1 / 16
+"""Diameter of a compact particle over the wavelength in the sample beyond which it is no dipole:
+light from its far side is an eighth of a period late."""
+
+LEFT_SHARE = 0.1
+"""Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
+
+_FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
+_STRENGTHS = np.geomspace(0.2, 4.0, 10)  # of the light of a sphere whose index is fitted
+_INDEX_STEP = 1e-4  # for the derivative along the index
+_LARGEST_INDEX_STEP = 0.05
+_TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
+
+
+class _Sphere(NamedTuple):
+    """A sphere at a maximum of its likelihood, and that less the cost of its parameters."""
+
+    likelihood: Likelihood
+    optimum: Optimum
+    criterion: float
+
+
+def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
+    """Tell whether a dipole does not describe a particle, or is too heavy to be one."""
+    return Status.POOR_FIT in fit.flags or is_too_heavy(likelihood.model, fit)
+
+
+def is_too_heavy(model: ForwardModel, fit: FitResult) -> bool:
+    """Tell whether a compact particle of the fitted mass would be no dipole."""
+    diameter = sphere_diameter_nm(abs(fit.mass_kda), model.material.density_kg_m3)
+    return diameter > LARGEST_DIPOLE * model.optics.wavelength_nm / model.optics.n_sample
+
+
+def recognised(
+    likelihood: Likelihood,
+    fit: FitResult,
+    spheres: Sequence[SeatedModel],
+    z_range_nm: tuple[float, float],
+    *,
+    level: bool,
+) -> tuple[Likelihood, FitResult] | None:
+    """Fit the sphere that describes a particle better than any dipole; None if there is none."""
+    each = math.log(likelihood.n_pixels) / 2
+    least = fit.log_likelihood + math.log(SURE_ODDS)
+    found: list[_Sphere] = []
+    for model in spheres:
+        seated = replace(likelihood, model=model, prior=None)
+        cost = each if model.fits_index else 0.0
+        for one, optimum in _maxima(seated, fit.theta, least=least + cost, level=level):
+            found.append(_Sphere(one, optimum, optimum.log_likelihood - cost))
+            least = max(least, found[-1].criterion - math.log(SURE_ODDS))
+    if not found:
+        return None
+    found.sort(key=lambda one: -one.criterion)
+    best = found[0]
+    sphere = fit_seated(best.likelihood, best.optimum.theta, level=level)
+    excess, left = (max(one[1].chi2_reduced - 1, 0.0) for one in ((likelihood, fit), sphere))
+    if sphere[1].p_value < POOR_FIT_P and left > LEFT_SHARE * excess:
+        return None
+    start = Candidate(*_place(likelihood, fit.theta), fit.theta[2], fit.mass_kda, fit.snr)
+    lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)
+    if lifted.log_likelihood - each > best.criterion:
+        return None
+    mass = float(best.optimum.theta[AMPLITUDE])
+    others = tuple(
+        Alternative(0.0, best.criterion - other.criterion, float(other.optimum.theta[AMPLITUDE]))
+        for other in found[1:]
+        if abs(other.optimum.theta[AMPLITUDE] / mass - 1) > OTHER_SIZE_SHARE
+    )
+    flags = list(sphere[1].flags)
+    if has_other_size(others, best.optimum, float(sphere[1].sigma[AMPLITUDE])):
+        flags.append(Status.AMBIGUOUS_SIZE)
+    status, noticed = verdict(flags)
+    shift = fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1])
+    whole = replace(sphere[1], alternatives=others, status=status, flags=noticed)
+    return sphere[0], whole.shifted(*shift)
+
+
+def fit_seated(
+    seated: Likelihood, theta: FloatArray, *, level: bool
+) -> tuple[Likelihood, FitResult]:
+    """Fit a sphere from a start near its maximum, and its index where that is free."""
+    information: FloatArray | None = None
+    if _model_of(seated).fits_index:
+        there, optimum, information = _with_index(seated, theta, -math.inf, level=level)
+        seated, theta = there, optimum.theta
+    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
+    fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
+    flags = [*fit.flags, Status.LARGE]
+    if information is not None:  # the index is known from this picture alone, with an error
+        free = np.append(fit.box.free, True)
+        try:
+            variance = np.diag(np.linalg.inv(information[np.ix_(free, free)]))
+        except np.linalg.LinAlgError:
+            variance = np.full(int(free.sum()), np.nan)
+        sigma = np.full(6, np.nan)
+        sigma[free] = np.sqrt(variance)
+        fit = replace(fit, sigma=sigma[:4], sigma_index=float(sigma[5]))
+        low, high = _model_of(seated).indices
+        index = _model_of(seated).sphere.index.real
+        if min(index - low, high - index) < 1e-6:
+            flags.append(Status.AT_BOUND)
+    status, noticed = verdict(flags)
+    return seated, replace(fit, status=status, flags=noticed)
+
+
+def _model_of(seated: Likelihood) -> SeatedModel:
+    """Give the model of a sphere's likelihood."""
+    if not isinstance(seated.model, SeatedModel):
+        raise TypeError(f"{type(seated.model).__name__} is no SeatedModel")
+    return seated.model
+
+
+def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
+    """Give the place of θ [pixels]."""
+    pixel = likelihood.grid.pixel_nm
+    return float(theta[0]) / pixel, float(theta[1]) / pixel
+
+
+def _maxima(
+    seated: Likelihood, theta: FloatArray, *, least: float, level: bool
+) -> list[tuple[Likelihood, Optimum]]:
+    """Maximise the likelihood of a sphere from the best diameters of a scan, as far as it counts.
+
+    Where the index is fitted, so much more or less light is scanned too.
+    """
+    model = _model_of(seated)
+    x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
+    masses = scanned_masses(model, *model.mass_range_kda)
+    strengths = _STRENGTHS if model.fits_index else np.ones(1)
+    values = np.empty((masses.size, strengths.size))
+    for i, mass in enumerate(masses.tolist()):
+        linear = model.at(mass)
+        for j, strength in enumerate(strengths.tolist()):
+            signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength * mass)
+            values[i, j] = seated.noise.terms(seated.data, signal, g).value
+    around = np.pad(values, 1, constant_values=-np.inf)
+    inner = slice(1, -1)
+    higher = [around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:]]
+    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(higher, axis=0)))
+    optima: list[tuple[Likelihood, Optimum]] = []
+    for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
+        begin = np.array([x, y, 0.0, masses[i], g])
+        if model.fits_index:
+            there = replace(seated, model=model.of_strength(float(strengths[j])))
+            end, found, _ = _with_index(there, begin, least, level=level)
+        else:
+            end, box = seated, _box(seated, begin, level=level)
+            begin = np.clip(begin, box.lower, box.upper)
+            found = seated.maximize(begin, box.free, box.lower, box.upper, least=least)
+        if found.converged and found.log_likelihood > least:
+            optima.append((end, found))
+    return optima
+
+
+def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
+    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
+    return search_box(seated, start, "mass", seated.model.z_range_nm, level=level)
+
+
+def _with_index(
+    seated: Likelihood, theta: FloatArray, least: float, *, level: bool
+) -> tuple[Likelihood, Optimum, FloatArray]:
+    """Maximise over the index too; gives the likelihood at it, and the information, (6, 6)."""
+    model, box = _model_of(seated), _box(seated, theta, level=level)
+
+    def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        x, y, gap, mass, g, index = (float(value) for value in point)
+        below, here, above = (
+            model.of_index(index + step) for step in (-_INDEX_STEP, 0.0, _INDEX_STEP)
+        )
+        place = (seated.grid, x, y, gap, mass)
+        signal, own = here.amplitude_gradient(*place)
+        change = above.amplitude_image(*place) - below.amplitude_image(*place)
+        terms = seated.noise.terms(seated.data, signal, g)
+        if not math.isfinite(terms.value):
+            return -np.inf, np.full(6, np.nan), np.full((6, 6), np.nan)
+        signals = np.concatenate([own, change[None] / (2 * _INDEX_STEP)]) * terms.by_signal
+        rows = np.concatenate([signals[:4], terms.by_level[None], signals[4:]]).reshape(6, -1)
+        return (
+            terms.value,
+            rows @ terms.score.ravel(),
+            (rows * terms.information.ravel()) @ rows.T,
+        )
+
+    lower, upper = (np.append(end, n) for end, n in zip((box.lower, box.upper), model.indices,
+                                                        strict=True))  # fmt: skip
+    begin = np.clip(np.append(theta, model.sphere.index.real), lower, upper)
+    quarter = model.optics.wavelength_nm / 4
+    farthest = np.array([quarter, quarter, np.inf, np.inf, 1.0, _LARGEST_INDEX_STEP])
+    end, value, passes, converged, information = maximize_slowly(
+        score_fisher, begin, np.append(box.free, True), lower, upper, farthest,
+        tolerance=_TOLERANCE, passes=_PASSES, least=least,
+    )  # fmt: skip
+    there = replace(seated, model=model.of_index(float(end[5])))
+    optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
+    return there, optimum, information
