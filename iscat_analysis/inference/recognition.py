@@ -20,9 +20,9 @@ import numpy as np
 from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.sizes import (
+    OTHER_SIZE,
     OTHER_SIZE_SHARE,
     SURE_ODDS,
-    has_other_size,
     scanned_masses,
 )
 from iscat_analysis.inference.slow_scoring import maximize_slowly
@@ -48,17 +48,39 @@ LEFT_SHARE = 0.1
 
 _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.2, 4.0, 10)  # of the light of a sphere whose index is fitted
+_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
+_BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
 _INDEX_STEP = 1e-4  # for the derivative along the index
 _LARGEST_INDEX_STEP = 0.05
 _TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
 class _Sphere(NamedTuple):
-    """A sphere at a maximum of its likelihood, and that less the cost of its parameters."""
+    """A sphere at a maximum of its likelihood, and the information there, of the index too."""
 
     likelihood: Likelihood
     optimum: Optimum
-    criterion: float
+    information: FloatArray
+    criterion: float = 0.0
+
+    @property
+    def mass_kda(self) -> float:
+        """Its mass."""
+        return float(self.optimum.theta[AMPLITUDE])
+
+    def is_like(self, other: _Sphere) -> bool:
+        """Whether both have the same size within their errors, or nearly so."""
+        apart = abs(self.mass_kda - other.mass_kda)
+        error = math.hypot(self._sigma_kda, other._sigma_kda)
+        return apart < max(OTHER_SIZE_SHARE * self.mass_kda, OTHER_SIZE * error)
+
+    @property
+    def _sigma_kda(self) -> float:
+        """Standard error of the mass."""
+        free = np.flatnonzero(np.diag(self.information) > 0)
+        free = free[free != 2]  # the gap is held
+        inverse = np.linalg.pinv(self.information[np.ix_(free, free)], hermitian=True)
+        return math.sqrt(max(float(inverse[2, 2]), 0.0))
 
 
 def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
@@ -84,11 +106,12 @@ def recognised(
     each = math.log(likelihood.n_pixels) / 2
     least = fit.log_likelihood + math.log(SURE_ODDS)
     found: list[_Sphere] = []
+    begin = _centred(likelihood, fit.theta)
     for model in spheres:
         seated = replace(likelihood, model=model, prior=None)
         cost = each if model.fits_index else 0.0
-        for one, optimum in _maxima(seated, fit.theta, least=least + cost, level=level):
-            found.append(_Sphere(one, optimum, optimum.log_likelihood - cost))
+        for one in _maxima(seated, begin, least=least + cost, level=level):
+            found.append(one._replace(criterion=one.optimum.log_likelihood - cost))
             least = max(least, found[-1].criterion - math.log(SURE_ODDS))
     if not found:
         return None
@@ -102,19 +125,30 @@ def recognised(
     lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)
     if lifted.log_likelihood - each > best.criterion:
         return None
-    mass = float(best.optimum.theta[AMPLITUDE])
     others = tuple(
-        Alternative(0.0, best.criterion - other.criterion, float(other.optimum.theta[AMPLITUDE]))
+        Alternative(0.0, best.criterion - other.criterion, other.mass_kda)
         for other in found[1:]
-        if abs(other.optimum.theta[AMPLITUDE] / mass - 1) > OTHER_SIZE_SHARE
+        if not best.is_like(other)
     )
     flags = list(sphere[1].flags)
-    if has_other_size(others, best.optimum, float(sphere[1].sigma[AMPLITUDE])):
+    if others and others[0].log_likelihood_gap < math.log(SURE_ODDS):
         flags.append(Status.AMBIGUOUS_SIZE)
     status, noticed = verdict(flags)
     shift = fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1])
     whole = replace(sphere[1], alternatives=others, status=status, flags=noticed)
     return sphere[0], whole.shifted(*shift)
+
+
+def refitted(
+    likelihood: Likelihood, fit: FitResult, sphere: SeatedModel, *, level: bool
+) -> tuple[Likelihood, FitResult]:
+    """Fit a sphere that was recognised to counts of which its neighbours have changed."""
+    seated, again = fit_seated(
+        replace(likelihood, model=sphere, prior=None), fit.theta, level=level
+    )
+    kept = [flag for flag in fit.flags if flag == Status.AMBIGUOUS_SIZE]
+    status, noticed = verdict([*again.flags, *kept])
+    return seated, replace(again, alternatives=fit.alternatives, status=status, flags=noticed)
 
 
 def fit_seated(
@@ -123,8 +157,8 @@ def fit_seated(
     """Fit a sphere from a start near its maximum, and its index where that is free."""
     information: FloatArray | None = None
     if _model_of(seated).fits_index:
-        there, optimum, information = _with_index(seated, theta, -math.inf, level=level)
-        seated, theta = there, optimum.theta
+        found = _with_index(seated, theta, -math.inf, level=level)
+        seated, theta, information = found.likelihood, found.optimum.theta, found.information
     start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
     fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
     flags = [*fit.flags, Status.LARGE]
@@ -158,9 +192,26 @@ def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
     return float(theta[0]) / pixel, float(theta[1]) / pixel
 
 
-def _maxima(
-    seated: Likelihood, theta: FloatArray, *, least: float, level: bool
-) -> list[tuple[Likelihood, Optimum]]:
+def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Move θ to the centre of the picture's energy, if the dipole was fitted to a part of a ring."""
+    signal = np.nan_to_num(likelihood.measured_signal())
+    energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
+    grid = likelihood.grid
+    x, y = float(theta[0]), float(theta[1])
+    for reach in _REACHES_NM:
+        near = (grid.y_nm[:, None] - y) ** 2 + (grid.x_nm - x) ** 2 < reach**2
+        weight = np.where(near, energy, 0.0)
+        if not weight.any():
+            return theta
+        x, y = (float(np.average(axis, weights=weight.sum(over)))
+                for axis, over in ((grid.x_nm, 0), (grid.y_nm, 1)))  # fmt: skip
+    moved = theta.copy()
+    if math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM:
+        moved[:2] = x, y
+    return moved
+
+
+def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
     """Maximise the likelihood of a sphere from the best diameters of a scan, as far as it counts.
 
     Where the index is fitted, so much more or less light is scanned too.
@@ -179,18 +230,19 @@ def _maxima(
     inner = slice(1, -1)
     higher = [around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:]]
     peaks = np.argwhere(np.isfinite(values) & (values >= np.max(higher, axis=0)))
-    optima: list[tuple[Likelihood, Optimum]] = []
+    optima: list[_Sphere] = []
     for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
         begin = np.array([x, y, 0.0, masses[i], g])
         if model.fits_index:
             there = replace(seated, model=model.of_strength(float(strengths[j])))
-            end, found, _ = _with_index(there, begin, least, level=level)
+            found = _with_index(there, begin, least, level=level)
         else:
-            end, box = seated, _box(seated, begin, level=level)
+            box = _box(seated, begin, level=level)
             begin = np.clip(begin, box.lower, box.upper)
-            found = seated.maximize(begin, box.free, box.lower, box.upper, least=least)
-        if found.converged and found.log_likelihood > least:
-            optima.append((end, found))
+            end = seated.maximize(begin, box.free, box.lower, box.upper, least=least)
+            found = _Sphere(seated, end, end.fisher)
+        if found.optimum.converged and found.optimum.log_likelihood > least:
+            optima.append(found)
     return optima
 
 
@@ -199,10 +251,8 @@ def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
     return search_box(seated, start, "mass", seated.model.z_range_nm, level=level)
 
 
-def _with_index(
-    seated: Likelihood, theta: FloatArray, least: float, *, level: bool
-) -> tuple[Likelihood, Optimum, FloatArray]:
-    """Maximise over the index too; gives the likelihood at it, and the information, (6, 6)."""
+def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
+    """Maximise over the index too, which is the last parameter."""
     model, box = _model_of(seated), _box(seated, theta, level=level)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
@@ -235,4 +285,4 @@ def _with_index(
     )  # fmt: skip
     there = replace(seated, model=model.of_index(float(end[5])))
     optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
-    return there, optimum, information
+    return _Sphere(there, optimum, information)

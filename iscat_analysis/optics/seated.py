@@ -52,6 +52,11 @@ class SeatedModel(SizedModel):
         """Whether the refractive index is fitted."""
         return self.indices[0] < self.indices[1]
 
+    def in_place_of(self, model: ForwardModel) -> SeatedModel:
+        """Give the model of the same spheres as far as a wider one of the same microscope goes."""
+        kept = {name: getattr(self, name) for name in ("factor", "strength", "scale", "z_range_nm")}
+        return replace(self, **parts_of(model) | kept)
+
     def of_index(self, index: float) -> SeatedModel:
         """Give the model of the same spheres with another refractive index."""
         return replace(self, sphere=replace(self.sphere, index=complex(index)))

@@ -168,6 +168,11 @@ EVENTS = (
         "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
     ),
     Column(
+        "refractive_index", "positive",
+        "Refractive index of the sphere, where model is sphere and it is fitted", optional=True,
+    ),
+    Column("sigma_refractive_index", "positive", "Its standard deviation", optional=True),
+    Column(
         "other_diameter_nm", "positive",
         "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
         optional=True,

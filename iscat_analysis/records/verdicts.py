@@ -82,10 +82,10 @@ SEVERITY = (
     Status.PROCESSED,
 )
 """Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; no
-dipole and so no mass; a model that does not describe the data, their change in time or their width; one of several diameters
-or heights;
-a mass shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that
-are not in proportion to the light; frames that were processed."""
+dipole and so no mass; a model that does not describe the data, their change in time or their width;
+one of several diameters or heights; a mass shared with a neighbour; pixels left out; a mass on the
+scale of other optics; counts that are not in proportion to the light; frames that were
+processed."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
