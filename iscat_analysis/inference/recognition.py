@@ -19,6 +19,7 @@ import numpy as np
 
 from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.noise_models import PixelTerms
 from iscat_analysis.inference.sizes import (
     OTHER_SIZE,
     OTHER_SIZE_SHARE,
@@ -51,7 +52,6 @@ _STRENGTHS = np.geomspace(0.2, 4.0, 10)  # of the light of a sphere whose index 
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
 _INDEX_STEP = 1e-4  # for the derivative along the index
-_LARGEST_INDEX_STEP = 0.05
 _TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
@@ -193,7 +193,7 @@ def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
 
 
 def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Move θ to the centre of the picture's energy, if the dipole was fitted to a part of a ring."""
+    """Move θ to the centre of the picture's energy, if the dipole is on a part of a ring."""
     signal = np.nan_to_num(likelihood.measured_signal())
     energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
     grid = likelihood.grid
@@ -234,7 +234,12 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
     for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
         begin = np.array([x, y, 0.0, masses[i], g])
         if model.fits_index:
-            there = replace(seated, model=model.of_strength(float(strengths[j])))
+            there = replace(
+                seated,
+                model=model.of_strength(
+                    float(strengths[j]) * model.strength_of(model.sphere.index.real)
+                ),
+            )
             found = _with_index(there, begin, least, level=level)
         else:
             box = _box(seated, begin, level=level)
@@ -252,37 +257,50 @@ def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
 
 
 def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
-    """Maximise over the index too, which is the last parameter."""
+    """Maximise over the index too.
+
+    The picture says well how much light there is, and less well of how large a sphere: the last
+    parameter is the light of a small sphere, which hardly changes along the ridge of the likelihood.
+    """
     model, box = _model_of(seated), _box(seated, theta, level=level)
+    low, high = model.indices
+
+    def index_of(point: FloatArray) -> float:
+        return min(max(model.index_of(point[5] / point[AMPLITUDE]), low), high)
+
+    def by_index(point: FloatArray, index: float) -> tuple[PixelTerms, FloatArray]:
+        """Give pixels and their derivatives along θ and the index, shape (6, n)."""
+        x, y, gap, mass, g = (float(value) for value in point[:5])
+        place = (seated.grid, x, y, gap, mass)
+        signal, own = model.of_index(index).amplitude_gradient(*place)
+        below, above = (
+            model.of_index(index + step).amplitude_image(*place)
+            for step in (-_INDEX_STEP, _INDEX_STEP)
+        )
+        terms = seated.noise.terms(seated.data, signal, g)
+        signals = [*own, terms.by_level / terms.by_signal, (above - below) / (2 * _INDEX_STEP)]
+        return terms, (np.array(signals) * terms.by_signal).reshape(6, -1)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        x, y, gap, mass, g, index = (float(value) for value in point)
-        below, here, above = (
-            model.of_index(index + step) for step in (-_INDEX_STEP, 0.0, _INDEX_STEP)
-        )
-        place = (seated.grid, x, y, gap, mass)
-        signal, own = here.amplitude_gradient(*place)
-        change = above.amplitude_image(*place) - below.amplitude_image(*place)
-        terms = seated.noise.terms(seated.data, signal, g)
+        mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
+        terms, rows = by_index(point, index_of(point))
         if not math.isfinite(terms.value):
             return -np.inf, np.full(6, np.nan), np.full((6, 6), np.nan)
-        signals = np.concatenate([own, change[None] / (2 * _INDEX_STEP)]) * terms.by_signal
-        rows = np.concatenate([signals[:4], terms.by_level[None], signals[4:]]).reshape(6, -1)
-        return (
-            terms.value,
-            rows @ terms.score.ravel(),
-            (rows * terms.information.ravel()) @ rows.T,
-        )
+        rows[5] *= model.index_slope(strength) / mass  # per light, at the same mass
+        rows[AMPLITUDE] -= strength * rows[5]  # at the same light
+        score = rows @ terms.score.ravel()
+        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
 
-    lower, upper = (np.append(end, n) for end, n in zip((box.lower, box.upper), model.indices,
-                                                        strict=True))  # fmt: skip
-    begin = np.clip(np.append(theta, model.sphere.index.real), lower, upper)
+    light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
+    lower, upper = np.append(box.lower, 0.0), np.append(box.upper, np.inf)
     quarter = model.optics.wavelength_nm / 4
-    farthest = np.array([quarter, quarter, np.inf, np.inf, 1.0, _LARGEST_INDEX_STEP])
-    end, value, passes, converged, information = maximize_slowly(
-        score_fisher, begin, np.append(box.free, True), lower, upper, farthest,
-        tolerance=_TOLERANCE, passes=_PASSES, least=least,
+    farthest = np.array([quarter, quarter, np.inf, np.inf, 1.0, np.inf])
+    end, value, passes, converged, _ = maximize_slowly(
+        score_fisher, np.clip(np.append(theta, light), lower, upper), np.append(box.free, True),
+        lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=least,
     )  # fmt: skip
-    there = replace(seated, model=model.of_index(float(end[5])))
+    index = index_of(end)
+    terms, rows = by_index(end, index)
+    information = (rows * terms.information.ravel()) @ rows.T
     optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
-    return _Sphere(there, optimum, information)
+    return _Sphere(replace(seated, model=model.of_index(index)), optimum, information)

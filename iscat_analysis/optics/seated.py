@@ -34,6 +34,7 @@ and the largest one."""
 BILAYER_NM, BILAYER_INDEX = 5.0, 1.46
 """Shell of a vesicle that is filled with the sample's medium: a bilayer of lipids."""
 
+_MOST_STRENGTH = 0.9  # an index of five times the sample's
 _THINNEST_CORE = 1.1  # diameter of the smallest vesicle over twice its shell
 
 
@@ -62,12 +63,23 @@ class SeatedModel(SizedModel):
         return replace(self, sphere=replace(self.sphere, index=complex(index)))
 
     def of_strength(self, strength: float) -> SeatedModel:
-        """Give that of the index with which small spheres scatter so much more."""
+        """Give that of the index with which small spheres scatter so much light per volume."""
+        return self.of_index(min(max(self.index_of(strength), self.indices[0]), self.indices[1]))
+
+    def strength_of(self, index: float) -> float:
+        """Give the light of a small sphere per volume, (n² − n_s²)/(n² + 2 n_s²)."""
         medium = self.optics.n_sample**2
-        here = self.sphere.index.real**2
-        ratio = strength * (here - medium) / (here + 2 * medium)
-        index = math.sqrt(medium * (1 + 2 * ratio) / (1 - ratio)) if ratio < 1 else math.inf
-        return self.of_index(min(max(index, self.indices[0]), self.indices[1]))
+        return (index**2 - medium) / (index**2 + 2 * medium)
+
+    def index_of(self, strength: float) -> float:
+        """Give the index of that much light."""
+        ratio = min(strength, _MOST_STRENGTH)
+        return self.optics.n_sample * math.sqrt((1 + 2 * ratio) / (1 - ratio))
+
+    def index_slope(self, strength: float) -> float:
+        """Give the change of the index with the light."""
+        ratio = min(strength, _MOST_STRENGTH)
+        return 1.5 * self.optics.n_sample**2 / (self.index_of(ratio) * (1 - ratio) ** 2)
 
     def centre_nm(self, z_nm: float, amplitude: float) -> float:
         """As `ForwardModel.centre_nm`."""
