@@ -48,7 +48,7 @@ LEFT_SHARE = 0.1
 """Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
 
 _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
-_STRENGTHS = np.geomspace(0.2, 4.0, 10)  # of the light of a sphere whose index is fitted
+_STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
 _INDEX_STEP = 1e-4  # for the derivative along the index
@@ -220,11 +220,12 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
     masses = scanned_masses(model, *model.mass_range_kda)
     strengths = _STRENGTHS if model.fits_index else np.ones(1)
+    own = model.strength_of(model.sphere.index.real) if model.fits_index else 1.0
     values = np.empty((masses.size, strengths.size))
     for i, mass in enumerate(masses.tolist()):
         linear = model.at(mass)
         for j, strength in enumerate(strengths.tolist()):
-            signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength * mass)
+            signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
             values[i, j] = seated.noise.terms(seated.data, signal, g).value
     around = np.pad(values, 1, constant_values=-np.inf)
     inner = slice(1, -1)
@@ -236,9 +237,7 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
         if model.fits_index:
             there = replace(
                 seated,
-                model=model.of_strength(
-                    float(strengths[j]) * model.strength_of(model.sphere.index.real)
-                ),
+                model=model.of_strength(float(strengths[j])),
             )
             found = _with_index(there, begin, least, level=level)
         else:
@@ -260,7 +259,7 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
     """Maximise over the index too.
 
     The picture says well how much light there is, and less well of how large a sphere: the last
-    parameter is the light of a small sphere, which hardly changes along the ridge of the likelihood.
+    parameter is the light of a small sphere, which is the same along the likelihood's ridge.
     """
     model, box = _model_of(seated), _box(seated, theta, level=level)
     low, high = model.indices
