@@ -371,7 +371,7 @@ def _fit_all(
             return None
         known = events[first + index] if first + index < len(events) else None
         if known is not None and known.sphere is not None:
-            seated, again = refitted(likelihood, known.fit, known.sphere, level=False)
+            seated, again = refitted(likelihood, known.sphere, known.fit, level=False)
             return Fitted(region, again, seated)
         likelihood = context.with_prior(likelihood, start.mass_kda)
         fit = fit_particle(

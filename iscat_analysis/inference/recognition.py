@@ -140,7 +140,7 @@ def recognised(
 
 
 def refitted(
-    likelihood: Likelihood, fit: FitResult, sphere: SeatedModel, *, level: bool
+    likelihood: Likelihood, sphere: SeatedModel, fit: FitResult, *, level: bool
 ) -> tuple[Likelihood, FitResult]:
     """Fit a sphere that was recognised to counts of which its neighbours have changed."""
     seated, again = fit_seated(
@@ -156,7 +156,7 @@ def fit_seated(
 ) -> tuple[Likelihood, FitResult]:
     """Fit a sphere from a start near its maximum, and its index where that is free."""
     information: FloatArray | None = None
-    if _model_of(seated).fits_index:
+    if model_of(seated).fits_index:
         found = _with_index(seated, theta, -math.inf, level=level)
         seated, theta, information = found.likelihood, found.optimum.theta, found.information
     start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
@@ -171,15 +171,15 @@ def fit_seated(
         sigma = np.full(6, np.nan)
         sigma[free] = np.sqrt(variance)
         fit = replace(fit, sigma=sigma[:4], sigma_index=float(sigma[5]))
-        low, high = _model_of(seated).indices
-        index = _model_of(seated).sphere.index.real
+        low, high = model_of(seated).indices
+        index = model_of(seated).sphere.index.real
         if min(index - low, high - index) < 1e-6:
             flags.append(Status.AT_BOUND)
     status, noticed = verdict(flags)
     return seated, replace(fit, status=status, flags=noticed)
 
 
-def _model_of(seated: Likelihood) -> SeatedModel:
+def model_of(seated: Likelihood) -> SeatedModel:
     """Give the model of a sphere's likelihood."""
     if not isinstance(seated.model, SeatedModel):
         raise TypeError(f"{type(seated.model).__name__} is no SeatedModel")
@@ -216,7 +216,7 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
 
     Where the index is fitted, so much more or less light is scanned too.
     """
-    model = _model_of(seated)
+    model = model_of(seated)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
     masses = scanned_masses(model, *model.mass_range_kda)
     strengths = _STRENGTHS if model.fits_index else np.ones(1)
@@ -261,7 +261,7 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
     The picture says well how much light there is, and less well of how large a sphere: the last
     parameter is the light of a small sphere, which is the same along the likelihood's ridge.
     """
-    model, box = _model_of(seated), _box(seated, theta, level=level)
+    model, box = model_of(seated), _box(seated, theta, level=level)
     low, high = model.indices
 
     def index_of(point: FloatArray) -> float:
