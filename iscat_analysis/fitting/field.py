@@ -66,7 +66,9 @@ def fit_field(
     progress: Progress = silent,
 ) -> tuple[tuple[Event, ...], Windows]:
     """Find and fit every particle in a field."""
-    events = [] if starts else _large_ones(context, windows, pool)
+    events: list[Fitted] = []
+    if not starts:
+        events, windows = _large_ones(context, windows, pool)
     fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
@@ -106,36 +108,38 @@ def fit_field(
 
 def _large_ones(
     context: AnalysisContext, windows: Windows, pool: ThreadPoolExecutor
-) -> list[Fitted]:
+) -> tuple[list[Fitted], Windows]:
     """Find spheres before anything else, the brightest first.
 
     The search for dipoles would take the rings of their pictures for particles.  A place is where
     the light changes most, whatever the picture looks like.
     """
-    if not context.spheres_of(context.model):
-        return []
-    rows, columns = windows.after_e.shape
     found: list[Fitted] = []
+    if not context.spheres_of(context.model):
+        return found, windows
+    nominal = context.model.material.mass_kda
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     seen: list[tuple[float, float]] = []
     vain = 0
     while vain < _IN_VAIN:
-        explained = context.left(total_signal(context, (rows, columns), found))
+        explained = context.left(total_signal(context, shape, found))
         whole = search_likelihood(context, windows, explained)
         place = brightest_place(whole, explained, seen, context.roi_px / 4)
         if place is None:
             break
         seen.append(place)
-        nominal = context.model.material.mass_kda
+        vain += 1
         starts = [Candidate(*place, 0.0, sign * nominal, 0.0) for sign in (1, -1)]
-        tried = _fit_all(context, windows, starts, found, pool, first=len(found))
-        if not tried or not may_be_large(tried[0].likelihood, tried[0].fit):
+        dipoles = _fit_all(context, windows, starts, found, pool, first=len(found))
+        best = max(dipoles, key=lambda one: one.fit.log_likelihood, default=None)
+        if best is None or not may_be_large(best.likelihood, best.fit):
             continue
-        best = max(tried, key=lambda one: one.fit.log_likelihood)
-        (sphere,) = with_spheres(context, [best], pool, level=False)
-        vain = 0 if sphere.sphere else vain + 1
-        if sphere.sphere:
-            found.append(sphere)
-    return found
+        (large,) = with_spheres(context, [best], pool, level=False)
+        if large.sphere:
+            vain = 0
+        if large.sphere or _chi2_left(large) < EXPLAINS * large.snr**2:
+            found, windows = _settled(context, windows, [*found, large], pool)
+    return found, windows
 
 
 def _settled(

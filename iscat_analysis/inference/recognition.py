@@ -28,7 +28,7 @@ from iscat_analysis.inference.sizes import (
 )
 from iscat_analysis.inference.slow_scoring import maximize_slowly
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.seated import SeatedModel
+from iscat_analysis.optics.seated import SeatedModel, largest_dipole_nm
 from iscat_analysis.records import (
     Alternative,
     Box,
@@ -39,10 +39,6 @@ from iscat_analysis.records import (
     verdict,
 )
 from iscat_analysis.units import sphere_diameter_nm
-
-LARGEST_DIPOLE = 1 / 16
-"""Diameter of a compact particle over the wavelength in the sample beyond which it is no dipole:
-light from its far side is an eighth of a period late."""
 
 LEFT_SHARE = 0.1
 """Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
@@ -91,7 +87,7 @@ def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
 def is_too_heavy(model: ForwardModel, fit: FitResult) -> bool:
     """Tell whether a compact particle of the fitted mass would be no dipole."""
     diameter = sphere_diameter_nm(abs(fit.mass_kda), model.material.density_kg_m3)
-    return diameter > LARGEST_DIPOLE * model.optics.wavelength_nm / model.optics.n_sample
+    return diameter > largest_dipole_nm(model.optics)
 
 
 def recognised(
@@ -121,7 +117,7 @@ def recognised(
     excess, left = (max(one[1].chi2_reduced - 1, 0.0) for one in ((likelihood, fit), sphere))
     if sphere[1].p_value < POOR_FIT_P and left > LEFT_SHARE * excess:
         return None
-    start = Candidate(*_place(likelihood, fit.theta), fit.theta[2], fit.mass_kda, fit.snr)
+    start = Candidate(*_place(likelihood, begin), float(begin[2]), fit.mass_kda, fit.snr)
     lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)
     if lifted.log_likelihood - each > best.criterion:
         return None

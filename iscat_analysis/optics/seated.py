@@ -26,6 +26,10 @@ from iscat_analysis.optics.spheres import SMALLEST_NM, Sphere, has_shells
 from iscat_analysis.optics.waves import lifted
 from iscat_analysis.units import sphere_mass_kda
 
+LARGEST_DIPOLE = 1 / 16
+"""Diameter of a compact particle over the wavelength in the sample beyond which it is no dipole:
+light from its far side is an eighth of a period late."""
+
 VESICLE, SPHERE = "vesicle", "sphere"
 LEAST_CONTRAST, MIDDLE_CONTRAST, LARGEST_INDEX = 0.005, 0.07, 1.8
 """Of the index of a sphere that is fitted: its least and a middling difference from the sample's,
@@ -36,6 +40,11 @@ BILAYER_NM, BILAYER_INDEX = 5.0, 1.46
 
 _MOST_STRENGTH = 0.9  # an index of five times the sample's
 _THINNEST_CORE = 1.1  # diameter of the smallest vesicle over twice its shell
+
+
+def largest_dipole_nm(optics: Optics) -> float:
+    """Give the diameter of a compact particle beyond which it is no dipole."""
+    return LARGEST_DIPOLE * optics.wavelength_nm / optics.n_sample
 
 
 @dataclass(frozen=True)
@@ -114,6 +123,10 @@ def seated_models(
         if kind == SPHERE:
             indices = optics.n_sample + LEAST_CONTRAST, LARGEST_INDEX
         low = max(diameters_nm[0], SMALLEST_NM, 2 * _THINNEST_CORE * sphere.shell_nm)
+        if not sphere.index.imag:  # a smaller one that does not absorb is a dipole like a protein
+            low = max(low, largest_dipole_nm(optics))
+        if low >= diameters_nm[1]:
+            continue
         parts = parts_of(model) | {
             "factor": model.factor * brighter,  # the polarisability is in the sphere's pattern
             "strength": model.strength * brighter,
