@@ -65,7 +65,8 @@ def quantum_information(
             'optics.psf = "measured" has no quantum bound, because a picture does not say what '
             'light made it: use optics.psf = "model", or the CRB in the table of the fits'
         )
-    opening, wave, solid = _light(model, z_nm, measure, light, amplitude)
+    centre = model.centre_nm(z_nm, model.nominal_amplitude if amplitude is None else amplitude)
+    opening, wave, solid = _light(model, centre, measure, light, amplitude)
     pupil = opening.pupil
     kappa = pupil.axial
     if measure == "dong2021" and model.optics.scheme != "iscat":
@@ -76,7 +77,8 @@ def quantum_information(
         -1j * pupil.transverse[:, None] * np.cos(phi) * wave,
         -1j * pupil.transverse[:, None] * np.sin(phi) * wave,
         1j * kappa[:, None] * wave,
-        _growth(model, amplitude, light, wave),
+        _growth(model, amplitude, light, wave)
+        + 1j * kappa[:, None] * wave * (centre - z_nm) / 3,  # a seated sphere rises as it grows
     )
     out = np.zeros((4, 4), dtype=np.complex128)
     for i in range(4):

@@ -51,6 +51,7 @@ from iscat_analysis.config.values import (
     Mode,
     Scheme,
     Section,
+    SphereKind,
     plausible_pixel,
 )
 
@@ -87,6 +88,7 @@ __all__ = [
     "SimulatedEvent",
     "SimulatedMover",
     "Simulation",
+    "SphereKind",
     "StandardsCamera",
     "TrackConfig",
     "Uncertainty",

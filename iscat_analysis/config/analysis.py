@@ -17,6 +17,7 @@ from iscat_analysis.config.values import (
     NonNegative,
     Positive,
     Section,
+    SphereKind,
     length,
 )
 
@@ -25,6 +26,9 @@ LOWEST_VISCOSITY_MPA_S = 0.1
 
 DIAMETERS_NM = (2.0, 2000.0)
 """Range of diameters of the spheres that mode size may search."""
+
+MOST_SPHERES = 32
+"""Materials of spheres that are tried, at most."""
 
 TEMPERATURES_C = (-100.0, 250.0)
 """Temperatures of liquids in a microscope; the upper end is below their values in kelvin."""
@@ -145,7 +149,13 @@ class Fit(Section):
     ] = Field((0.0, 1000.0), description="bounds of z if it is free")
     diameter_range_nm: tuple[
         Annotated[Positive, length(*DIAMETERS_NM)], Annotated[Positive, length(*DIAMETERS_NM)]
-    ] = Field((10.0, 400.0), description="bounds of the diameter in mode size")
+    ] = Field((10.0, 400.0), description="bounds of the diameter in mode size, and of spheres")
+    spheres: Annotated[tuple[SphereKind, ...], Field(max_length=MOST_SPHERES)] = Field(
+        ("vesicle", "gold", "silica", "polystyrene", "sphere"),
+        description="mode mass: what may stand on the coverslip where no dipole describes a "
+        'particle: "vesicle" (5 nm of lipids around water), "gold", "silica", "polystyrene", '
+        '"sphere" (of an index that is fitted), or an index; []: nothing is tried',
+    )
 
     @model_validator(mode="after")
     def _range(self) -> Fit:

@@ -30,6 +30,10 @@ def _lower(value: Any) -> Any:
 
 
 Scheme = Annotated[Literal["iscat", "cobri", "darkfield"], BeforeValidator(_lower)]
+SphereKind = (
+    Literal["vesicle", "gold", "silica", "polystyrene", "sphere"]
+    | Annotated[float, AfterValidator(lambda index: refractive_index(index))]
+)
 Method = Literal["fixed", "sliding", "tracks", "median", "known"]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 from iscat_analysis.camera.lines import Lines, PartOfLines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
@@ -21,6 +22,7 @@ from iscat_analysis.optics.local import (
     refuse_moving_focus,
     refuse_uneven_field,
 )
+from iscat_analysis.optics.seated import SeatedModel, seated_models
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
 from iscat_analysis.search.sliding import CORRELATION, Tile
@@ -79,6 +81,21 @@ class AnalysisContext:
         """Add the prior of the height to a likelihood, in mode mass."""
         prior = height_prior(self.config, mass_kda)
         return likelihood if prior is None else replace(likelihood, prior=prior)
+
+    def spheres_of(self, model: ForwardModel) -> tuple[SeatedModel, ...]:
+        """Give the spheres that a particle may be in the microscope of a dipole's model."""
+        fit, optics = self.config.fit, self.config.optics
+        absolute = optics.convention == "exact" and optics.emission == "reciprocal"
+        if fit.mode != "mass" or not absolute or model.is_measured or self.additive:
+            return ()
+        if model is self.model:
+            return self._near_spheres
+        return seated_models(model, fit.spheres, fit.diameter_range_nm)
+
+    @cached_property
+    def _near_spheres(self) -> tuple[SeatedModel, ...]:
+        fit = self.config.fit
+        return seated_models(self.model, fit.spheres, fit.diameter_range_nm)
 
     @property
     def pixel_nm(self) -> float:

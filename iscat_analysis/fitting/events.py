@@ -15,6 +15,7 @@ from iscat_analysis.fitting.regions import Region
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.posterior import sample_posterior
 from iscat_analysis.inference.prior import Prior
+from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.pieces.regions import saturated_near
 from iscat_analysis.records import Candidate, FitResult, PosteriorResult, Status, Windows, verdict
 from iscat_analysis.search.residue import Described
@@ -43,6 +44,12 @@ class Fitted:
     def place(self) -> PlaceAndMass:
         """Position [nm] and mass [kDa]."""
         return self.fit.x_nm, self.fit.y_nm, self.fit.z_nm, self.fit.mass_kda
+
+    @property
+    def sphere(self) -> SeatedModel | None:
+        """The model of the sphere that it is; None for a dipole."""
+        model = self.likelihood.model
+        return model if isinstance(model, SeatedModel) else None
 
     @property
     def snr(self) -> float:

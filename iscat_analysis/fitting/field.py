@@ -18,6 +18,7 @@ import numpy as np
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
+from iscat_analysis.fitting.large import brightest_place, with_spheres, without_mass
 from iscat_analysis.fitting.regions import (
     Region,
     noise_cumulants,
@@ -27,7 +28,9 @@ from iscat_analysis.fitting.regions import (
     search_likelihood,
 )
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.recognition import may_be_large, refitted
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.records import (
     FREE_PARAMETERS,
     Candidate,
@@ -43,6 +46,7 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_par
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
+_IN_VAIN = 8  # bright places, after which no others are tried if a sphere describes none
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
 _MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
 # Share of the χ² in excess that a particle explains which is tried among others
@@ -63,6 +67,8 @@ def fit_field(
 ) -> tuple[tuple[Event, ...], Windows]:
     """Find and fit every particle in a field."""
     events: list[Fitted] = []
+    if not starts:
+        events, windows = _large_ones(context, windows, pool)
     fresh, doubtful = list(starts), list[Candidate]()
     for number in range(MAX_ROUNDS):
         progress("detect", number, MAX_ROUNDS)
@@ -73,6 +79,9 @@ def fit_field(
         events = _fit_all(context, windows, [*(e.candidate for e in events), *fresh], events, pool)
         windows = _refined(context, windows, events)
     events, windows = _settled(context, windows, events, pool)
+    large = with_spheres(context, events, pool, level=False)
+    if any(new.sphere and not old.sphere for new, old in zip(large, events, strict=True)):
+        events, windows = _settled(context, windows, large, pool)
     trial = None if starts else _with_concealed(context, windows, events, excess_noise, pool)
     if trial is not None:
         events, windows = trial
@@ -92,9 +101,45 @@ def fit_field(
     if doubtful and not starts:
         lobes = _fit_all(context, windows, doubtful, kept, pool, first=len(kept))
         lobes = [e for e in lobes if e.snr > least and _wanted(context, e)]
-    judged = _judged(context, windows, kept, lobes)
+    judged = _judged(context, windows, [without_mass(context, e) for e in kept], lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
+
+
+def _large_ones(
+    context: AnalysisContext, windows: Windows, pool: ThreadPoolExecutor
+) -> tuple[list[Fitted], Windows]:
+    """Find spheres before anything else, the brightest first.
+
+    The search for dipoles would take the rings of their pictures for particles.  A place is where
+    the light changes most, whatever the picture looks like.
+    """
+    found: list[Fitted] = []
+    if not context.spheres_of(context.model):
+        return found, windows
+    nominal = context.model.material.mass_kda
+    shape = (windows.after_e.shape[0], windows.after_e.shape[1])
+    seen: list[tuple[float, float]] = []
+    vain = 0
+    while vain < _IN_VAIN:
+        explained = context.left(total_signal(context, shape, found))
+        whole = search_likelihood(context, windows, explained)
+        place = brightest_place(whole, explained, seen, context.roi_px / 4)
+        if place is None:
+            break
+        seen.append(place)
+        vain += 1
+        starts = [Candidate(*place, 0.0, sign * nominal, 0.0) for sign in (1, -1)]
+        dipoles = _fit_all(context, windows, starts, found, pool, first=len(found))
+        best = max(dipoles, key=lambda one: one.fit.log_likelihood, default=None)
+        if best is None or not may_be_large(best.likelihood, best.fit):
+            continue
+        (large,) = with_spheres(context, [best], pool, level=False)
+        if large.sphere:
+            vain = 0
+        if large.sphere or _chi2_left(large) < EXPLAINS * large.snr**2:
+            found, windows = _settled(context, windows, [*found, large], pool)
+    return found, windows
 
 
 def _settled(
@@ -175,14 +220,19 @@ def total_signal(
     """
     total = np.zeros(shape)
     for event in events:
-        add_signal(context, event.place, Region((0, shape[0]), (0, shape[1])), total)
+        whole = Region((0, shape[0]), (0, shape[1]))
+        add_signal(context, event.place, whole, total, event.sphere)
     return total
 
 
 def add_signal(
-    context: AnalysisContext, place: PlaceAndMass, region: Region, total: FloatArray
+    context: AnalysisContext,
+    place: PlaceAndMass,
+    region: Region,
+    total: FloatArray,
+    sphere: SeatedModel | None = None,
 ) -> None:
-    """Add a particle's signal to the pixels of a region that it reaches.
+    """Add the signal of a particle, a dipole or a sphere, to the pixels that it reaches.
 
     Shapes: `total` (y, x).
     """
@@ -199,7 +249,10 @@ def add_signal(
         slice(rows[0] - region.rows[0], rows[1] - region.rows[0]),
         slice(columns[0] - region.columns[0], columns[1] - region.columns[0]),
     )
-    total[inside] += context.wide_at(x_nm, y_nm).image(grid, *place)
+    model = context.wide_at(x_nm, y_nm)
+    if sphere is not None:
+        model = sphere.in_place_of(model)
+    total[inside] += model.image(grid, *place)
 
 
 def search_field(
@@ -304,7 +357,7 @@ def _fit_all(
         for index, region in enumerate(regions):
             image = np.zeros(region.shape)
             if number != first + index:
-                add_signal(context, events[number].place, region, image)
+                add_signal(context, events[number].place, region, image, events[number].sphere)
             if image.any():
                 images.append((index, image))
         return images
@@ -318,9 +371,13 @@ def _fit_all(
         if taken is not None:
             others = (1 + others) / taken[region.slices] - 1
         likelihood = region_likelihood(context, windows, region, others)
-        likelihood = context.with_prior(likelihood, start.mass_kda)
         if likelihood.n_pixels < 0.5 * others.size:
             return None
+        known = events[first + index] if first + index < len(events) else None
+        if known is not None and known.sphere is not None:
+            seated, again = refitted(likelihood, known.sphere, known.fit, level=False)
+            return Fitted(region, again, seated)
+        likelihood = context.with_prior(likelihood, start.mass_kda)
         fit = fit_particle(
             likelihood, start, context.mode, context.config.fit.z_range_nm, level=False
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -25,11 +26,15 @@ from iscat_analysis.records import (
     EventView,
     FloatArray,
     PosteriorResult,
+    Status,
     Trace,
     Windows,
     make_rows,
 )
 from iscat_analysis.search.empty import EmptySpread
+
+MASSES = ("mass_kda", "sigma_mass_kda", "crb_mass_kda", "qcrb_mass_kda")
+"""Columns that a particle that is no dipole does not have."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,7 @@ def lines_of(
     context: AnalysisContext, events: Sequence[Event], *, mapper: Callable[..., Iterable[Any]] = map
 ) -> list[dict[str, Any]]:
     """Make the rows of ``fits.csv`` as plain records."""
-    heights = {event.fit.estimate[2] for event in events}
+    heights = {event.fit.estimate[2] for event in events if event.sphere is None}
     known = {}
     alike = not context.model.is_measured and not context.model.is_sized
     if len(heights) == 1 and alike:  # of heights that are not fitted
@@ -124,8 +129,12 @@ def _line(
     line = line_of(
         event.likelihood, event.fit, collected_photons(context, event), flags=event.flags,
         frame=event.frame, n_before=event.n_before, n_after=event.n_after, sign=event.sign,
-        quantum=quantum.get(event.fit.estimate[2]),
+        quantum=None if event.sphere else quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
+    if context.spheres_of(context.model) and event.sphere is None:
+        line["model"] = "none" if Status.POOR_FIT in event.flags else "dipole"
+        if Status.LARGE in event.flags:
+            line |= {"model": "none"} | dict.fromkeys(MASSES, math.nan)
     if event.half_width is not None:
         line[FRAME_COLUMN] = event.half_width
     if context.config.fit.pairs:

@@ -68,7 +68,7 @@ def evidence_of(likelihood: Likelihood, fit: FitResult, rise: int = 0) -> FloatA
     Shapes: result (11,), in the order of `Evidence`.
     """
     theta, free = fit.theta, fit.box.free
-    if likelihood.model.is_measured or not free[MASS]:
+    if likelihood.model.is_measured or likelihood.model.is_sized or not free[MASS]:
         return np.array(NOTHING)
     rows = np.moveaxis(likelihood.derivatives(theta), 1, 0)
     pull, bend, of_level = _slopes(likelihood, rows[0], math.exp(theta[LEVEL]))

@@ -78,8 +78,11 @@ def _hides_others(step: Step, threshold: float) -> bool:
     """Whether the misfit of a step could hide others.
 
     It does if the model misses a little of a very bright picture, or nearly all of a picture.  In
-    between it may be two particles that land at once.
+    between it may be two particles that land at once.  A sphere that was recognised has the right
+    picture, unless what it misses says otherwise.
     """
+    if step.sphere is not None:
+        return step.excess > (threshold / _LEAST_MISFIT_SHARE) ** 2
     described = step.excess < _LITTLE * step.snr**2
     if described and RINGS * step.start.snr > threshold:
         return True

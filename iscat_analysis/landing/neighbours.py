@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,7 +24,8 @@ from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.records import Candidate, FloatArray
+from iscat_analysis.optics.seated import SeatedModel
+from iscat_analysis.records import Candidate, FitResult, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
@@ -49,6 +50,7 @@ class Step:
     snr: float = math.inf
     excess: float = 0.0
     is_measured: bool = False  # its image is the movie's, and not the model's
+    sphere: tuple[SeatedModel, FitResult] | None = None  # that it is, and not a dipole
 
 
 class Neighbours:
@@ -73,6 +75,17 @@ class Neighbours:
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
 
+    def draw_sphere(
+        self, sign: int, at: StepFrame, sphere: SeatedModel, fit: FitResult, excess: float = 0.0
+    ) -> Step:
+        """Make a step of a sphere, with its contrast drawn where it is."""
+        pixel = self._context.pixel_nm
+        start = Candidate(fit.x_nm / pixel, fit.y_nm / pixel, fit.z_nm, fit.mass_kda, fit.snr)
+        drawn = self.draw(
+            sign, at, start, theta=fit.theta, snr=fit.snr, excess=excess, sphere=sphere
+        )
+        return replace(drawn, sphere=(sphere, fit))
+
     def draw(
         self,
         sign: int,
@@ -82,6 +95,7 @@ class Neighbours:
         theta: FloatArray | None = None,
         snr: float = math.inf,
         excess: float = 0.0,
+        sphere: SeatedModel | None = None,
     ) -> Step:
         """Make a step, with its contrast drawn where it is.
 
@@ -96,7 +110,10 @@ class Neighbours:
         pixel = context.pixel_nm
         shown = at.frame + sign * self._window // 2
         place = (start.x_px * pixel, start.y_px * pixel)
-        image = context.wide_at(*place, shown).image(grid, *place, start.z_nm, start.mass_kda)
+        model = context.wide_at(*place, shown)
+        if sphere is not None:
+            model = sphere.in_place_of(model)
+        image = model.image(grid, *place, start.z_nm, start.mass_kda)
         corner = sides[0][0], sides[1][0]
         slopes = None if self._pattern is None else derivatives(image)
         return Step(sign, at, start, corner, image, slopes, theta, snr, excess)

@@ -19,6 +19,7 @@ import numpy as np
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out
+from iscat_analysis.fitting.large import with_spheres, without_mass
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
@@ -27,6 +28,8 @@ from iscat_analysis.inference.fit import (
     search_box,
     start_theta,
 )
+from iscat_analysis.inference.recognition import model_of, refitted
+from iscat_analysis.landing.large_steps import large_steps
 from iscat_analysis.landing.measured_images import with_measured_images
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.landing.searched import Searched, searched_shares
@@ -122,6 +125,10 @@ class ChunkFitter:
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
         maps = StepMaps(self._context, self._chunk, matched, self._neighbours, self._pattern)
         steps: list[Step] = []
+        if self._pattern is None:
+            steps = large_steps(
+                self._context, self._chunk, self._window, self._neighbours, self._pool.map
+            )
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
             fresh = [
@@ -133,7 +140,7 @@ class ChunkFitter:
             ]
             if not fresh:
                 break
-            known = len(steps)
+            known = len(steps) if self.rounds > 1 else 0
             steps = steps + fresh
             seen, bound = self._neighbours.of(steps)
             relevant = self._relevant(steps, bound)
@@ -266,6 +273,12 @@ class ChunkFitter:
         z_range = self._context.config.fit.z_range_nm
 
         def fitted(step: Step, task: Task) -> Step:
+            if step.sphere is not None:
+                likelihood, fit = refitted(task.likelihood, *step.sphere, level=True)
+                excess = chi2_excess(likelihood.residuals(fit.theta))
+                return self._neighbours.draw_sphere(
+                    step.sign, task.at, model_of(likelihood), fit, excess
+                )
             likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
             box = search_box(likelihood, start, self._quick_mode, z_range, level=True)
             theta = start_theta(likelihood, start) if step.theta is None else step.theta.copy()
@@ -353,9 +366,12 @@ class ChunkFitter:
             return None
         y_px, x_px = task.offset_px
         start = _displaced(self._seated(step), y_px, x_px)
-        fit = fit_particle(
-            likelihood, start, context.mode, context.config.fit.z_range_nm, level=True
-        )
+        if step.sphere is None:
+            fit = fit_particle(
+                likelihood, start, context.mode, context.config.fit.z_range_nm, level=True
+            )
+        else:
+            likelihood, fit = refitted(likelihood, *step.sphere, level=True)
         if fit.mass_kda <= 0 and "mass_kda" in fit.free:
             return None
         pixel = context.pixel_nm
@@ -382,6 +398,13 @@ class ChunkFitter:
 
         Those beside them are not reported, but may be so bright that what they leave over is.
         """
+        events = with_spheres(
+            self._context, [own.fitted.event for own in finished], self._pool, level=True
+        )
+        finished = [
+            replace(own, fitted=replace(own.fitted, event=without_mass(self._context, event)))
+            for own, event in zip(finished, events, strict=True)
+        ]
         steps = [*(own.fitted.step for own in finished), *beside]
         settling = {
             sign: go_on_rising([step.at.settling for step in steps if step.sign == sign])

@@ -59,7 +59,9 @@ def trace_of(
     frames = np.arange(patch.first, patch.first + heights.size)
     without = (frames >= windows.frames_before[0]) & (frames < windows.frames_before[1])
     level = np.average(heights[without], weights=weight[without])
-    unit = fit.contrast * step.start.mass_kda / fit.mass_kda  # contrast of the image
+    unit = fit.contrast  # of the image
+    if event.sphere is None:
+        unit *= step.start.mass_kda / fit.mass_kda
     contrast = np.where(weight > 0, (heights - level) * unit, np.nan)
     ranges = windows.frames_before, windows.frames_after
     return Trace(

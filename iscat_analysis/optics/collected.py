@@ -19,7 +19,7 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
         return math.nan
     amplitude = model.scale.amplitude(mass_kda)
     p = model.at(amplitude).aperture.pupil
-    decay = np.exp(-2 * p.axial.imag * z_nm)
+    decay = np.exp(-2 * p.axial.imag * model.centre_nm(z_nm, amplitude))
     density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
     pupil_integral = math.pi * float(np.sum(p.weight * density))
     medium = 1.0 if model.optics.emission == "reciprocal" else 1 / model.optics.n_immersion**2

@@ -81,6 +81,11 @@ class ForwardModel:
             return replace(self, wave=replace(wave, harmonics=wave.harmonics * factor))
         return self
 
+    def centre_nm(self, z_nm: float, amplitude: float) -> float:
+        """Give the height of a particle's centre, of its height as a parameter."""
+        del amplitude  # they are the same
+        return z_nm
+
     @property
     def wavenumber(self) -> float:
         """2π over the vacuum wavelength [rad/nm]."""

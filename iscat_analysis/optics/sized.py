@@ -88,7 +88,7 @@ class SizedModel(ForwardModel):
         pupil = self.aperture.pupil
         opening = aperture_on(self.optics, pupil.theta, pupil.weight, sphere)
         wave = with_light_of(self.wave, opening, self.factor, self.oil_nm)
-        linear = ForwardModel(**{**_parts_of(self), "aperture": opening, "wave": wave})
+        linear = ForwardModel(**{**parts_of(self), "aperture": opening, "wave": wave})
         return linear.dimmed(np.asarray(self.dimming, dtype=complex))
 
     def dimmed(self, factor: ComplexArray) -> Self:
@@ -182,9 +182,9 @@ class SizedModel(ForwardModel):
 def sized(model: ForwardModel, sphere: Sphere, diameters_nm: tuple[float, float]) -> SizedModel:
     """Make the model of spheres of all masses from that of one, with the diameters to search."""
     low, high = (sphere_mass_kda(diameter, sphere.density_kg_m3) for diameter in diameters_nm)
-    return SizedModel(**_parts_of(model), sphere=sphere, mass_range_kda=(low, high))
+    return SizedModel(**parts_of(model), sphere=sphere, mass_range_kda=(low, high))
 
 
-def _parts_of(model: ForwardModel) -> dict[str, Any]:
+def parts_of(model: ForwardModel) -> dict[str, Any]:
     """Name the parts of which a linear model is made."""
     return {each.name: getattr(model, each.name) for each in fields(ForwardModel)}

@@ -25,6 +25,7 @@ a shell.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,6 +101,11 @@ def sphere_of(particle: Particle, permittivity: complex, mass_kda: float) -> Sph
         shell_nm=particle.shell_nm or 0.0,
         shell_index=particle.shell_index or 0.0,
     )
+
+
+def has_shells() -> bool:
+    """Tell whether the library for spheres with a shell is installed."""
+    return find_spec("scattnlay") is not None
 
 
 def amplitudes(orders: Coefficients, mu: ComplexArray) -> tuple[ComplexArray, ComplexArray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.heights import has_prior, height_prior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
+from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.pieces.counts import Counts, gather
 from iscat_analysis.pieces.setups import config_of
@@ -210,7 +211,29 @@ def line_of(
         row[f"sigma_{name}"] = fit.sigma[k]
         row[f"crb_{name}"] = bounds.crb_joint[k]
         row[f"qcrb_{name}"] = bounds.qcrb[k]
+    if isinstance(model, SeatedModel):
+        return row | _without_mass(model, fit, row)
     return row | sizes_of(model, fit) if isinstance(model, SizedModel) else row
+
+
+def _without_mass(model: SeatedModel, fit: FitResult, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Give the diameter of a sphere on the coverslip in the place of a mass."""
+    diameter = model.sphere.of_mass(fit.mass_kda).diameter_nm
+    slope = diameter / (3 * fit.mass_kda)
+    kinds = ("sigma", "crb", "qcrb")
+    sizes = {f"{kind}_diameter_nm": slope * row[f"{kind}_mass_kda"] for kind in kinds}
+    if model.fits_index:  # whose error is from the expected information, index and all
+        sizes["crb_diameter_nm"] = sizes["sigma_diameter_nm"]
+        sizes["refractive_index"] = model.sphere.index.real
+        sizes["sigma_refractive_index"] = fit.sigma_index
+    return {
+        "z_nm": model.centre_nm(fit.z_nm, fit.mass_kda),
+        **dict.fromkeys(("mass_kda", *(f"{kind}_mass_kda" for kind in kinds)), math.nan),
+        "model": model.name,
+        "diameter_nm": diameter,
+        **sizes,
+        **sizes_of(model, fit),
+    }
 
 
 def sizes_of(model: SizedModel, fit: FitResult) -> dict[str, float]:

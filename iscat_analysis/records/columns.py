@@ -147,8 +147,14 @@ EVENTS = (
         "repeats", optional=True,
     ),
     Column(
+        "model", "text",
+        "What describes the picture, in mode mass: dipole, a sphere of fit.spheres, or none",
+        optional=True,
+    ),
+    Column(
         "diameter_nm", "positive",
-        "Diameter of the sphere; in mode size, which has mass_kda from it [nm]", "diameter", "nm",
+        "Diameter of the sphere; in mode size mass_kda is from it, in mode mass it is that of "
+        "model, which stands on the coverslip [nm]", "diameter", "nm",
         optional=True,
     ),
     Column(
@@ -161,6 +167,11 @@ EVENTS = (
     Column(
         "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
     ),
+    Column(
+        "refractive_index", "positive",
+        "Refractive index of the sphere, where model is sphere and it is fitted", optional=True,
+    ),
+    Column("sigma_refractive_index", "positive", "Its standard deviation", optional=True),
     Column(
         "other_diameter_nm", "positive",
         "Diameter of the next likely maximum of the likelihood, where there is another [nm]",

@@ -23,6 +23,7 @@ class Status(StrEnum):
     PROCESSED = "processed"
     CHANGING = "changing"
     EXTENDED = "extended"
+    LARGE = "large"
 
     @property
     def advice(self) -> str:
@@ -58,6 +59,9 @@ _ADVICE = {
     "change.",
     Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
     "particle.wiggle_nm, or has separate parts; its mass is too small.",
+    Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
+    "says which sphere describes it, with its diameter; none: add its material to fit.spheres, or "
+    "use mode size.",
 }
 
 
@@ -65,6 +69,7 @@ SEVERITY = (
     Status.SIDELOBE,
     Status.NOT_CONVERGED,
     Status.AT_BOUND,
+    Status.LARGE,
     Status.POOR_FIT,
     Status.CHANGING,
     Status.EXTENDED,
@@ -76,11 +81,11 @@ SEVERITY = (
     Status.NONLINEAR,
     Status.PROCESSED,
 )
-"""Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; a
-model that does not describe the data, their change in time or their width; one of several diameters
-or heights;
-a mass shared with a neighbour; pixels left out; a mass on the scale of other optics; counts that
-are not in proportion to the light; frames that were processed."""
+"""Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; no
+dipole and so no mass; a model that does not describe the data, their change in time or their width;
+one of several diameters or heights; a mass shared with a neighbour; pixels left out; a mass on the
+scale of other optics; counts that are not in proportion to the light; frames that were
+processed."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:

@@ -1,0 +1,301 @@
+"""Whether a particle that was fitted as a dipole is a sphere that stands on the coverslip.
+
+A dipole does not describe a large particle: its centre is higher than that of a protein, and light
+from its parts interferes.  A fit that is poor, or so bright that a compact protein of its mass
+would be no dipole, is therefore repeated with spheres of several materials.  Beside the place they
+have one parameter, as the dipole has, or two where the refractive index is fitted; a dipole at
+another height has two as well.  In the Bayesian information criterion each costs half the logarithm
+of the number of pixels (G. Schwarz, Ann. Statist. 6, 461, 1978).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
+from iscat_analysis.inference.noise_models import PixelTerms
+from iscat_analysis.inference.sizes import (
+    OTHER_SIZE,
+    OTHER_SIZE_SHARE,
+    SURE_ODDS,
+    scanned_masses,
+)
+from iscat_analysis.inference.slow_scoring import maximize_slowly
+from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.seated import SeatedModel, largest_dipole_nm
+from iscat_analysis.records import (
+    Alternative,
+    Box,
+    Candidate,
+    FitResult,
+    FloatArray,
+    Status,
+    verdict,
+)
+from iscat_analysis.units import sphere_diameter_nm
+
+LEFT_SHARE = 0.1
+"""Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
+
+_FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
+_STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
+_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
+_BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
+_INDEX_STEP = 1e-4  # for the derivative along the index
+_TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
+
+
+class _Sphere(NamedTuple):
+    """A sphere at a maximum of its likelihood, and the information there, of the index too."""
+
+    likelihood: Likelihood
+    optimum: Optimum
+    information: FloatArray
+    criterion: float = 0.0
+
+    @property
+    def mass_kda(self) -> float:
+        """Its mass."""
+        return float(self.optimum.theta[AMPLITUDE])
+
+    def is_like(self, other: _Sphere) -> bool:
+        """Whether both have the same size within their errors, or nearly so."""
+        apart = abs(self.mass_kda - other.mass_kda)
+        error = math.hypot(self._sigma_kda, other._sigma_kda)
+        return apart < max(OTHER_SIZE_SHARE * self.mass_kda, OTHER_SIZE * error)
+
+    @property
+    def _sigma_kda(self) -> float:
+        """Standard error of the mass."""
+        free = np.flatnonzero(np.diag(self.information) > 0)
+        free = free[free != 2]  # the gap is held
+        inverse = np.linalg.pinv(self.information[np.ix_(free, free)], hermitian=True)
+        return math.sqrt(max(float(inverse[2, 2]), 0.0))
+
+
+def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
+    """Tell whether a dipole does not describe a particle, or is too heavy to be one."""
+    return Status.POOR_FIT in fit.flags or is_too_heavy(likelihood.model, fit)
+
+
+def is_too_heavy(model: ForwardModel, fit: FitResult) -> bool:
+    """Tell whether a compact particle of the fitted mass would be no dipole."""
+    diameter = sphere_diameter_nm(abs(fit.mass_kda), model.material.density_kg_m3)
+    return diameter > largest_dipole_nm(model.optics)
+
+
+def recognised(
+    likelihood: Likelihood,
+    fit: FitResult,
+    spheres: Sequence[SeatedModel],
+    z_range_nm: tuple[float, float],
+    *,
+    level: bool,
+) -> tuple[Likelihood, FitResult] | None:
+    """Fit the sphere that describes a particle better than any dipole; None if there is none."""
+    each = math.log(likelihood.n_pixels) / 2
+    least = fit.log_likelihood + math.log(SURE_ODDS)
+    found: list[_Sphere] = []
+    begin = _centred(likelihood, fit.theta)
+    for model in spheres:
+        seated = replace(likelihood, model=model, prior=None)
+        cost = each if model.fits_index else 0.0
+        for one in _maxima(seated, begin, least=least + cost, level=level):
+            found.append(one._replace(criterion=one.optimum.log_likelihood - cost))
+            least = max(least, found[-1].criterion - math.log(SURE_ODDS))
+    if not found:
+        return None
+    found.sort(key=lambda one: -one.criterion)
+    best = found[0]
+    sphere = fit_seated(best.likelihood, best.optimum.theta, level=level)
+    excess, left = (max(one[1].chi2_reduced - 1, 0.0) for one in ((likelihood, fit), sphere))
+    if sphere[1].p_value < POOR_FIT_P and left > LEFT_SHARE * excess:
+        return None
+    start = Candidate(*_place(likelihood, begin), float(begin[2]), fit.mass_kda, fit.snr)
+    lifted = fit_particle(replace(likelihood, prior=None), start, "joint", z_range_nm, level=level)
+    if lifted.log_likelihood - each > best.criterion:
+        return None
+    others = tuple(
+        Alternative(0.0, best.criterion - other.criterion, other.mass_kda)
+        for other in found[1:]
+        if not best.is_like(other)
+    )
+    flags = list(sphere[1].flags)
+    if others and others[0].log_likelihood_gap < math.log(SURE_ODDS):
+        flags.append(Status.AMBIGUOUS_SIZE)
+    status, noticed = verdict(flags)
+    shift = fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1])
+    whole = replace(sphere[1], alternatives=others, status=status, flags=noticed)
+    return sphere[0], whole.shifted(*shift)
+
+
+def refitted(
+    likelihood: Likelihood, sphere: SeatedModel, fit: FitResult, *, level: bool
+) -> tuple[Likelihood, FitResult]:
+    """Fit a sphere that was recognised to counts of which its neighbours have changed."""
+    seated, again = fit_seated(
+        replace(likelihood, model=sphere, prior=None), fit.theta, level=level
+    )
+    kept = [flag for flag in fit.flags if flag == Status.AMBIGUOUS_SIZE]
+    status, noticed = verdict([*again.flags, *kept])
+    return seated, replace(again, alternatives=fit.alternatives, status=status, flags=noticed)
+
+
+def fit_seated(
+    seated: Likelihood, theta: FloatArray, *, level: bool
+) -> tuple[Likelihood, FitResult]:
+    """Fit a sphere from a start near its maximum, and its index where that is free."""
+    information: FloatArray | None = None
+    if model_of(seated).fits_index:
+        found = _with_index(seated, theta, -math.inf, level=level)
+        seated, theta, information = found.likelihood, found.optimum.theta, found.information
+    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
+    fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
+    flags = [*fit.flags, Status.LARGE]
+    if information is not None:  # the index is known from this picture alone, with an error
+        free = np.append(fit.box.free, True)
+        try:
+            variance = np.diag(np.linalg.inv(information[np.ix_(free, free)]))
+        except np.linalg.LinAlgError:
+            variance = np.full(int(free.sum()), np.nan)
+        sigma = np.full(6, np.nan)
+        sigma[free] = np.sqrt(variance)
+        fit = replace(fit, sigma=sigma[:4], sigma_index=float(sigma[5]))
+        low, high = model_of(seated).indices
+        index = model_of(seated).sphere.index.real
+        if min(index - low, high - index) < 1e-6:
+            flags.append(Status.AT_BOUND)
+    status, noticed = verdict(flags)
+    return seated, replace(fit, status=status, flags=noticed)
+
+
+def model_of(seated: Likelihood) -> SeatedModel:
+    """Give the model of a sphere's likelihood."""
+    if not isinstance(seated.model, SeatedModel):
+        raise TypeError(f"{type(seated.model).__name__} is no SeatedModel")
+    return seated.model
+
+
+def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
+    """Give the place of θ [pixels]."""
+    pixel = likelihood.grid.pixel_nm
+    return float(theta[0]) / pixel, float(theta[1]) / pixel
+
+
+def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
+    """Move θ to the centre of the picture's energy, if the dipole is on a part of a ring."""
+    signal = np.nan_to_num(likelihood.measured_signal())
+    energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
+    grid = likelihood.grid
+    x, y = float(theta[0]), float(theta[1])
+    for reach in _REACHES_NM:
+        near = (grid.y_nm[:, None] - y) ** 2 + (grid.x_nm - x) ** 2 < reach**2
+        weight = np.where(near, energy, 0.0)
+        if not weight.any():
+            return theta
+        x, y = (float(np.average(axis, weights=weight.sum(over)))
+                for axis, over in ((grid.x_nm, 0), (grid.y_nm, 1)))  # fmt: skip
+    moved = theta.copy()
+    if math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM:
+        moved[:2] = x, y
+    return moved
+
+
+def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
+    """Maximise the likelihood of a sphere from the best diameters of a scan, as far as it counts.
+
+    Where the index is fitted, so much more or less light is scanned too.
+    """
+    model = model_of(seated)
+    x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
+    masses = scanned_masses(model, *model.mass_range_kda)
+    strengths = _STRENGTHS if model.fits_index else np.ones(1)
+    own = model.strength_of(model.sphere.index.real) if model.fits_index else 1.0
+    values = np.empty((masses.size, strengths.size))
+    for i, mass in enumerate(masses.tolist()):
+        linear = model.at(mass)
+        for j, strength in enumerate(strengths.tolist()):
+            signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
+            values[i, j] = seated.noise.terms(seated.data, signal, g).value
+    around = np.pad(values, 1, constant_values=-np.inf)
+    inner = slice(1, -1)
+    higher = [around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:]]
+    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(higher, axis=0)))
+    optima: list[_Sphere] = []
+    for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
+        begin = np.array([x, y, 0.0, masses[i], g])
+        if model.fits_index:
+            there = replace(
+                seated,
+                model=model.of_strength(float(strengths[j])),
+            )
+            found = _with_index(there, begin, least, level=level)
+        else:
+            box = _box(seated, begin, level=level)
+            begin = np.clip(begin, box.lower, box.upper)
+            end = seated.maximize(begin, box.free, box.lower, box.upper, least=least)
+            found = _Sphere(seated, end, end.fisher)
+        if found.optimum.converged and found.optimum.log_likelihood > least:
+            optima.append(found)
+    return optima
+
+
+def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
+    start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
+    return search_box(seated, start, "mass", seated.model.z_range_nm, level=level)
+
+
+def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
+    """Maximise over the index too.
+
+    The picture says well how much light there is, and less well of how large a sphere: the last
+    parameter is the light of a small sphere, which is the same along the likelihood's ridge.
+    """
+    model, box = model_of(seated), _box(seated, theta, level=level)
+    low, high = model.indices
+
+    def index_of(point: FloatArray) -> float:
+        return min(max(model.index_of(point[5] / point[AMPLITUDE]), low), high)
+
+    def by_index(point: FloatArray, index: float) -> tuple[PixelTerms, FloatArray]:
+        """Give pixels and their derivatives along θ and the index, shape (6, n)."""
+        x, y, gap, mass, g = (float(value) for value in point[:5])
+        place = (seated.grid, x, y, gap, mass)
+        signal, own = model.of_index(index).amplitude_gradient(*place)
+        below, above = (
+            model.of_index(index + step).amplitude_image(*place)
+            for step in (-_INDEX_STEP, _INDEX_STEP)
+        )
+        terms = seated.noise.terms(seated.data, signal, g)
+        signals = [*own, terms.by_level / terms.by_signal, (above - below) / (2 * _INDEX_STEP)]
+        return terms, (np.array(signals) * terms.by_signal).reshape(6, -1)
+
+    def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
+        terms, rows = by_index(point, index_of(point))
+        if not math.isfinite(terms.value):
+            return -np.inf, np.full(6, np.nan), np.full((6, 6), np.nan)
+        rows[5] *= model.index_slope(strength) / mass  # per light, at the same mass
+        rows[AMPLITUDE] -= strength * rows[5]  # at the same light
+        score = rows @ terms.score.ravel()
+        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
+
+    light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
+    lower, upper = np.append(box.lower, 0.0), np.append(box.upper, np.inf)
+    quarter = model.optics.wavelength_nm / 4
+    farthest = np.array([quarter, quarter, np.inf, np.inf, 1.0, np.inf])
+    end, value, passes, converged, _ = maximize_slowly(
+        score_fisher, np.clip(np.append(theta, light), lower, upper), np.append(box.free, True),
+        lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=least,
+    )  # fmt: skip
+    index = index_of(end)
+    terms, rows = by_index(end, index)
+    information = (rows * terms.information.ravel()) @ rows.T
+    optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
+    return _Sphere(replace(seated, model=model.of_index(index)), optimum, information)
