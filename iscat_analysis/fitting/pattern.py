@@ -225,7 +225,7 @@ class MovingPattern:
         return (image * back).astype(np.complex64)
 
     def _time(self, frames: slice) -> float:
-        return (frames.start + frames.stop - 1) / 2
+        return float(frames.start + frames.stop - 1) / 2
 
     def _middle(self, blocks: slice) -> float:
         """Mean frame of the light of blocks."""

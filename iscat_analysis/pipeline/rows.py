@@ -67,9 +67,7 @@ def reported_rows(
         evidence = Evidence(*found.evidence.T)
         heights = Heights.of(config, fits, evidence, learned_optics=learned)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(
-                config, fits, evidence, achieved, learned_optics=learned_optics
-            )
+            extension = Extension.of(config, fits, evidence, achieved, learned_optics=learned)
     if extension is not None and config.fit.pairs:
         paired = told_as_pairs(fits, extension)
         fits, extension = with_masses_of_pairs(fits, paired), extension.without(paired)
