@@ -247,8 +247,11 @@ class Neighbours:
         )
         return seen
 
-    def of(self, steps: Sequence[Step]) -> tuple[list[list[int]], list[list[int]]]:
-        """List for each step the others that its fit must include, and those that it depends on."""
+    def of(self, steps: Sequence[Step], frames: int = 0) -> tuple[list[list[int]], list[list[int]]]:
+        """List for each step the others that its fit must include, and those that it depends on.
+
+        Of `frames` around a step those are listed that are in them, if they are more.
+        """
         x, y, frame = (
             np.array(values, dtype=float)
             for values in zip(
@@ -260,7 +263,7 @@ class Neighbours:
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
-            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < reach)
+            near = (dt < max(3 * self._window, frames)) & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
             near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)

@@ -36,7 +36,7 @@ from iscat_analysis.landing.searched import Searched, searched_shares
 from iscat_analysis.landing.sidelobes import SidelobeFilter
 from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
 from iscat_analysis.landing.step_maps import StepMaps
-from iscat_analysis.landing.tasks import Task, TaskBuilder
+from iscat_analysis.landing.tasks import TRACE_FRAMES, Task, TaskBuilder
 from iscat_analysis.landing.traces import clip_of, patch_of, trace_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
 from iscat_analysis.search.empty import EmptySpread
@@ -181,7 +181,10 @@ class ChunkFitter:
             return []
         lobes = [self._begin(peak) for peak in self._doubtful]
         everything = steps + lobes
-        seen = [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything)[0]]
+        seen, around = (
+            [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything, n)[0]]
+            for n in (0, TRACE_FRAMES)
+        )
         # steps of the other polarity are fitted too: their rings have the one that is reported
         sign = reported_steps(self._context)
         now = [
@@ -191,7 +194,7 @@ class ChunkFitter:
         ]
         own = [i for i in now if self._is_near_core(everything[i], _CORE_MARGIN_PX)]
         found = self._pool.map(
-            lambda i: self._finish(i, everything, seen, lobe=i >= len(steps)), own
+            lambda i: self._finish(i, everything, seen, around, lobe=i >= len(steps)), own
         )
         beside = [steps[i] for i in sorted({*now}.difference(own)) if i < len(steps)]
         fitted = self._judged([one for one in found if one is not None], beside)
@@ -354,7 +357,13 @@ class ChunkFitter:
         return "mass" if "mass_kda" in FREE_PARAMETERS[self._context.mode] else "localize"
 
     def _finish(
-        self, index: int, steps: Sequence[Step], near: Sequence[Sequence[int]], *, lobe: bool
+        self,
+        index: int,
+        steps: Sequence[Step],
+        near: Sequence[Sequence[int]],
+        around: Sequence[Sequence[int]],
+        *,
+        lobe: bool,
     ) -> _Finished | None:
         """Fit a step for good."""
         context, step = self._context, steps[index]
@@ -387,7 +396,8 @@ class ChunkFitter:
             near[index] if context.lines is None else [i for i in range(len(steps)) if i != index]
         )
         others = tuple(steps[i] for i in seen)
-        spans, lighting = self._tasks.trace_spans(step, task.windows, others)
+        far = others if context.lines is not None else [steps[i] for i in around[index]]
+        spans, lighting = self._tasks.trace_spans(step, task.windows, far)
         repeats = step_repeats(
             self._chunk, spans, event, step, lighting, self._neighbours, self._pattern, context.mode
         )

@@ -20,11 +20,16 @@ from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.sliding import Chunk, Patch, StepFrame, crosstalk, locate_step
+from iscat_analysis.trust.changing_light import SAME_NM
 
 FEWEST_FRAMES = 10
 """A neighbour that would leave fewer is fitted beside the step, and both are flagged."""
 
-_TRACE_WINDOWS = 3  # on either side of a step, whose neighbours are known as far
+TRACE_FRAMES = 400
+"""Frames with a particle that tell how steady its light is, unless three windows are more."""
+
+_TRACE_WINDOWS = 3
+_LEAST_FRAME_SNR = 2.0  # signal-to-noise ratio of a frame below which no more than a window tells
 _LEAST_MASS_RATIO = 3.0  # of a particle over a step that may be a change of its light
 
 
@@ -155,21 +160,32 @@ class TaskBuilder:
         They go on through small steps at its place, which may be changes of its light, and end at
         others that are close.  The steps that add light of their own are given as well.
         """
-        limit_px = self._context.config.detection.min_separation_nm / self._context.pixel_nm
-        close = {id(s) for s in others if distance_px(s, step) < limit_px}
-        least = step.start.mass_kda / _LEAST_MASS_RATIO
-        own = tuple(s for s in others if id(s) not in close or s.start.mass_kda > least)
-        (begin, first), (second, end) = sorted((windows.frames_before, windows.frames_after))
+        pixel = self._context.pixel_nm
+        limit_px = self._context.config.detection.min_separation_nm / pixel
+        close = [s for s in others if distance_px(s, step) < limit_px]
+        changes = {
+            id(s)
+            for s in close
+            if distance_px(s, step) * pixel < SAME_NM
+            and s.start.mass_kda * _LEAST_MASS_RATIO <= step.start.mass_kda
+        }
+        own = tuple(s for s in others if id(s) not in changes)
+        without, there = windows.frames_before, windows.frames_after
+        if step.at.per_frame_snr < _LEAST_FRAME_SNR:
+            return (without, there), own
         reach = _TRACE_WINDOWS * self._window
-        low = max(step.at.frame - reach, self._chunk.first)
-        high = min(step.at.frame + reach, self._chunk.stop)
-        for other in own:
-            if id(other) in close:
-                gap = other.at.kept_out(self._window)
-                if other.at.frame < step.at.frame:
-                    low = max(low, other.at.frame + gap)
-                else:
-                    high = min(high, other.at.frame - gap)
+        reaches = (reach, max(reach, TRACE_FRAMES))[:: step.sign]
+        low = max(step.at.frame - reaches[0], self._chunk.first)
+        high = min(step.at.frame + reaches[1], self._chunk.stop)
+        for other in close:
+            gap = other.at.kept_out(self._window)
+            if id(other) in changes:
+                continue
+            if other.at.frame < step.at.frame:
+                low = max(low, other.at.frame + gap)
+            else:
+                high = min(high, other.at.frame - gap)
+        (begin, first), (second, end) = sorted((without, there))
         spans = (min(low, begin), first), (second, max(high, end))
         return (spans if step.sign > 0 else spans[::-1]), own
 

@@ -9,7 +9,7 @@ approximation, with the variance
 
 λ_i the squared signal-to-noise ratio of one frame, S_j the variance of component j of an ε of unit
 variance, and ℓ_j that of the noise, which is 1 if the noise is white and is measured where there is
-no particle.  The frames are those of up to three windows, in which slow fluctuations show.  The
+no particle.  The frames are more than those of a fit, so that slow fluctuations show.  The
 squares of all components are χ², so that their likelihood is known (P. Whittle, J. R. Stat. Soc. B
 15, 125 (1953)), and nothing has to be assumed of how estimates from blocks of different lengths go
 together.
@@ -41,8 +41,8 @@ _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looke
 _ALONE = 0.05  # probability that an event changes on its own
 _SEEN = 0.75  # probability from which it is told; one event alone gives 0.69
 _RELATIVE = np.geomspace(0.01, 0.3, 60)
-_CORRELATIONS = np.geomspace(2.0, 600.0, 18)  # frames
-_SLOWEST = 2.0  # correlation time over the frames that show it; slower is a course
+_CORRELATIONS = np.geomspace(2.0, 1000.0, 20)  # frames
+_SLOWEST = 4.0  # correlation time over the frames that show it; slower is a course
 _KNOWN = 16.0  # components that the noise of half a window counts for in that of longer ones
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value, Status.CHANGING.value})
 
