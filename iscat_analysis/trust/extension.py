@@ -69,10 +69,16 @@ class Extension:
         Mean and standard deviation of its posterior [nm²].
     is_common : bool
         Whether all particles are extended.
+    is_long : bool
+        Whether their pictures are long, each in its own direction.
+    long : ndarray of bool
+        Rows whose own picture is.
     flagged : ndarray of bool
         Rows whose masses are too small because of it.
     mass_shift_kda : ndarray
         By how much every mass may be too small [kDa].
+    paired : int
+        Rows that have the mass of two halves instead.
     """
 
     variance_nm2: float
@@ -80,8 +86,11 @@ class Extension:
     mean_nm2: float
     sd_nm2: float
     is_common: bool
+    is_long: bool
+    long: BoolArray
     flagged: BoolArray
     mass_shift_kda: FloatArray
+    paired: int = 0
 
     @classmethod
     def of(
@@ -123,16 +132,20 @@ class Extension:
         if is_common:
             too_light = shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float)
             flagged = flagged | (known & too_light)
-        return cls(mean, error, middle, sd, is_common, flagged, shift)
+        across, along, error_across = evidence[7:10]
+        squares = np.nan_to_num((across**2 + along**2) / error_across**2)
+        is_long = is_common and length.significance > _SIGNIFICANT
+        long = known & (squares > chdtri(2, _CHANCE))
+        return cls(mean, error, middle, sd, is_common, is_long, long, flagged, shift)
 
     def without(self, rows: BoolArray) -> Extension:
-        """Leave out rows that were fitted with their width.
+        """Leave out rows that were fitted as two halves.
 
         Shapes: `rows` (n,).
         """
         return replace(
             self, flagged=self.flagged & ~rows,
-            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda),
+            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda), paired=int(rows.sum()),
         )  # fmt: skip
 
     @property
@@ -140,6 +153,7 @@ class Extension:
         """Message for the user; empty where pictures are as wide as the model's."""
         if not self.is_common:
             return ""
+        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         wide = math.sqrt(self.mean_nm2)
         error = self.sd_nm2 / (2 * wide)
         return (
@@ -147,7 +161,7 @@ class Extension:
             f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
             "apart: masses are too small, flagged extended where by more than half of σ; set "
             "particle.wiggle_nm to it (adding squares), if all particles may move alike, or "
-            "fit.pairs = true, if they may be two halves"
+            f"fit.pairs = true, if they may be two halves{two}"
         )
 
     @property
@@ -159,6 +173,7 @@ class Extension:
             "posterior_mean_nm2": self.mean_nm2,
             "posterior_sd_nm2": self.sd_nm2,
             "flagged": int(self.flagged.sum()),
+            "paired": self.paired,
         }
 
 
