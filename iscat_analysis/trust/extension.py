@@ -50,6 +50,7 @@ _LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
+_WIDER_PRIOR = 2.0  # standard deviation of the prior over a √v that is clear
 _LEAST_LEFT = 1e-3  # share of a width that learned optics leave over, beneath which it is rounding
 _STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
 
@@ -115,10 +116,16 @@ class Extension:
         mean, error = mean / left, error / left
         length = _Length.of(*(part[many] for part in evidence[7:10]))
         moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
-        significance = max(mean / error, length.significance, moved / moved_se)
-        is_common = bool(many.sum() >= FEWEST and significance > _SIGNIFICANT)
-        # what is clear by itself needs no prior
-        prior_sd = math.inf if is_common else config.uncertainty.wiggle_nm
+        found = (
+            (mean, mean / error),
+            (length.variance_nm2, length.significance),
+            (moved, moved / moved_se),
+        )
+        clear = [variance for variance, sigmas in found if sigmas > _SIGNIFICANT]
+        is_common = bool(clear and many.sum() >= FEWEST)
+        prior_sd = config.uncertainty.wiggle_nm
+        if is_common:  # a prior that knew nothing of what is clear would hold it down
+            prior_sd = max(prior_sd, _WIDER_PRIOR * math.sqrt(max(clear)))
         middle, sd = _posterior(
             (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
         )
@@ -260,11 +267,16 @@ class _Length:
         """
         parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
         squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-        kept = squares < np.median(squares) * _OUTLIER_SIGMAS**2
+        kept = squares <= np.median(squares) * _OUTLIER_SIGMAS**2
         n = int(kept.sum())
         return cls(
             float(squares[kept].sum()), 2 * max(n - 1, 0), float((sigma[kept] ** -2.0).sum())
         )
+
+    @property
+    def variance_nm2(self) -> float:
+        """Half of what the variance along one axis has beyond the other [nm²]."""
+        return math.sqrt(max(self.squares - self.dof, 0.0) / self.precision)
 
     @property
     def significance(self) -> float:
