@@ -317,6 +317,7 @@ class Extension(Closed):
     posterior_mean_nm2: Number = key("Mean of its posterior, with length, motion and prior [nm²]")
     posterior_sd_nm2: Number = key("Its standard deviation [nm²]")
     flagged: Count = key("Rows that are flagged extended for it")
+    paired: Count = key("Rows that have the mass of two halves")
 
 
 class Fluctuation(Closed):

@@ -50,6 +50,7 @@ _LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
+_WIDER_PRIOR = 2.0  # standard deviation of the prior over a √v that is clear
 _LEAST_LEFT = 1e-3  # share of a width that learned optics leave over, beneath which it is rounding
 _STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
 
@@ -69,10 +70,16 @@ class Extension:
         Mean and standard deviation of its posterior [nm²].
     is_common : bool
         Whether all particles are extended.
+    is_long : bool
+        Whether their pictures are long, each in its own direction.
+    long : ndarray of bool
+        Rows whose own picture is.
     flagged : ndarray of bool
         Rows whose masses are too small because of it.
     mass_shift_kda : ndarray
         By how much every mass may be too small [kDa].
+    paired : int
+        Rows that have the mass of two halves instead.
     """
 
     variance_nm2: float
@@ -80,8 +87,11 @@ class Extension:
     mean_nm2: float
     sd_nm2: float
     is_common: bool
+    is_long: bool
+    long: BoolArray
     flagged: BoolArray
     mass_shift_kda: FloatArray
+    paired: int = 0
 
     @classmethod
     def of(
@@ -106,10 +116,16 @@ class Extension:
         mean, error = mean / left, error / left
         length = _Length.of(*(part[many] for part in evidence[7:10]))
         moved, moved_se = _wiggle(table[many], in_time, config.particle.wiggle_nm)
-        significance = max(mean / error, length.significance, moved / moved_se)
-        is_common = bool(many.sum() >= FEWEST and significance > _SIGNIFICANT)
-        # what is clear by itself needs no prior
-        prior_sd = math.inf if is_common else config.uncertainty.wiggle_nm
+        found = (
+            (mean, mean / error),
+            (length.variance_nm2, length.significance),
+            (moved, moved / moved_se),
+        )
+        clear = [variance for variance, sigmas in found if sigmas > _SIGNIFICANT]
+        is_common = bool(clear and many.sum() >= FEWEST)
+        prior_sd = config.uncertainty.wiggle_nm
+        if is_common:  # a prior that knew nothing of what is clear would hold it down
+            prior_sd = max(prior_sd, _WIDER_PRIOR * math.sqrt(max(clear)))
         middle, sd = _posterior(
             (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
         )
@@ -123,16 +139,20 @@ class Extension:
         if is_common:
             too_light = shift > _LEAST_SHIFT_SIGMAS * table["sigma_mass_kda"].to_numpy(float)
             flagged = flagged | (known & too_light)
-        return cls(mean, error, middle, sd, is_common, flagged, shift)
+        across, along, error_across = evidence[7:10]
+        squares = np.nan_to_num((across**2 + along**2) / error_across**2)
+        is_long = is_common and length.significance > _SIGNIFICANT
+        long = known & (squares > chdtri(2, _CHANCE))
+        return cls(mean, error, middle, sd, is_common, is_long, long, flagged, shift)
 
     def without(self, rows: BoolArray) -> Extension:
-        """Leave out rows that were fitted with their width.
+        """Leave out rows that were fitted as two halves.
 
         Shapes: `rows` (n,).
         """
         return replace(
             self, flagged=self.flagged & ~rows,
-            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda),
+            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda), paired=int(rows.sum()),
         )  # fmt: skip
 
     @property
@@ -140,6 +160,7 @@ class Extension:
         """Message for the user; empty where pictures are as wide as the model's."""
         if not self.is_common:
             return ""
+        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         wide = math.sqrt(self.mean_nm2)
         error = self.sd_nm2 / (2 * wide)
         return (
@@ -147,7 +168,7 @@ class Extension:
             f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
             "apart: masses are too small, flagged extended where by more than half of σ; set "
             "particle.wiggle_nm to it (adding squares), if all particles may move alike, or "
-            "fit.pairs = true, if they may be two halves"
+            f"fit.pairs = true, if they may be two halves{two}"
         )
 
     @property
@@ -159,6 +180,7 @@ class Extension:
             "posterior_mean_nm2": self.mean_nm2,
             "posterior_sd_nm2": self.sd_nm2,
             "flagged": int(self.flagged.sum()),
+            "paired": self.paired,
         }
 
 
@@ -245,11 +267,16 @@ class _Length:
         """
         parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
         squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
-        kept = squares < np.median(squares) * _OUTLIER_SIGMAS**2
+        kept = squares <= np.median(squares) * _OUTLIER_SIGMAS**2
         n = int(kept.sum())
         return cls(
             float(squares[kept].sum()), 2 * max(n - 1, 0), float((sigma[kept] ** -2.0).sum())
         )
+
+    @property
+    def variance_nm2(self) -> float:
+        """Half of what the variance along one axis has beyond the other [nm²]."""
+        return math.sqrt(max(self.squares - self.dof, 0.0) / self.precision)
 
     @property
     def significance(self) -> float:

@@ -1,8 +1,9 @@
 """Particles that are wider than points get the mass of two halves, where the halves are told.
 
-Whether a row is flagged `extended` is known of the whole movie, or of a picture that is clearly
-wider; so is here whether its light tells the halves.  A rule about the distance that each picture
-shows would choose those that noise has made longer.
+Halves are told where pictures are long, each in its own direction: what wiggles makes them wide.
+That is known of the whole movie, or of a picture that is clearly long.  So is the distance by which
+it is decided whether the light of a row tells it: a rule about the distance that each picture shows
+would choose those that noise has made longer.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from iscat_analysis.records import BoolArray, Status
 from iscat_analysis.trust.extension import Extension
 
 _TOLD_SIGMAS = 2.0  # of the square of the distance, beyond which its error is nearly normal
-_SURE_P = 1e-5  # of a point, below which one picture alone tells it
 _REPLACED = {
     "mass_kda": "pair_mass_kda",
     "sigma_mass_kda": "sigma_pair_mass_kda",
@@ -28,8 +28,8 @@ _REPLACED = {
 def told_as_pairs(table: pd.DataFrame, extension: Extension) -> BoolArray:
     """Tell which extended rows get the mass of two halves."""
     square_sigma = 2 * table["separation_nm"] * table["sigma_separation_nm"]
-    of_movie = 8 * extension.mean_nm2 if extension.is_common else 0.0  # v is d²/8
-    told = (of_movie > _TOLD_SIGMAS * square_sigma) | (table["p_point"] < _SURE_P)
+    of_movie = 8 * extension.mean_nm2 if extension.is_long else 0.0  # v is d²/8
+    told = (of_movie > _TOLD_SIGMAS * square_sigma) | extension.long
     return np.asarray(told & table["pair_mass_kda"].notna() & extension.flagged)
 
 

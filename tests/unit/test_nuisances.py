@@ -30,6 +30,7 @@ from iscat_analysis.search.sliding import (
 from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation
+from iscat_analysis.trust.response import response_of
 
 MASS_KDA, LIGHT_E, TRIALS, SIGMAS = 205.0, 8e6, 40, 4.0
 GRID = PixelGrid.centred(33, 84.0)
@@ -108,6 +109,40 @@ def test_a_wiggle_is_as_wide_as_the_model_has_it() -> None:
     assert masses.mean() < 0.93 * MASS_KDA
     mended = masses + told.mass_per_spread * 35.0**2
     assert abs(mended.mean() / MASS_KDA - 1) < 0.03
+
+
+def best_focus(shown: FloatArray) -> tuple[float, float, float]:
+    """Amplitude of a point at −300 nm, shift of the focus that suits best, and amplitude there."""
+    step, found = 2.0, []
+    for focus in (-300 - step, -300, -300 + step):
+        likelihood = conditional(
+            model(f"optics.focus_nm={focus}"), GRID, np.full(GRID.shape, LIGHT_E),
+            LIGHT_E * (1 + shown), np.ones(GRID.shape),
+        )  # fmt: skip
+        start = Candidate(0.0, 0.0, 5.0, MASS_KDA, 50.0)
+        fit = fit_particle(likelihood, start, "mass", (0.0, 1000.0), level=True, correct_bias=False)
+        found.append((fit.log_likelihood, fit.theta[3]))
+    (low, below), (middle, held), (high, above) = found
+    moved = 0.5 * (low - high) / (low - 2 * middle + high)
+    followed = held + moved * (above - below) / 2 + moved**2 * (below - 2 * held + above) / 2
+    return held, step * moved, followed
+
+
+def test_a_learned_focus_takes_a_part_of_a_width() -> None:
+    variance = 100.0
+    wide, point = (
+        best_focus(shown.image(GRID, 0.0, 0.0, 5.0, MASS_KDA))
+        for shown in (model("particle.wiggle_nm=10"), model())
+    )
+    config = load_config(None, [*SETTINGS, "background.method=sliding"])
+    amplitude = model().scale.amplitude(MASS_KDA)
+    shifts = response_of(config, rows(4), ("focus_nm",)).to_width(amplitude)
+    alone = response_of(config, rows(4), ()).to_width(amplitude)
+    assert alone.left == 1
+    assert 0 < shifts.left < 1
+    assert (wide[0] / point[0] - 1) / variance == pytest.approx(alone.amplitude, rel=0.05)
+    assert (wide[1] - point[1]) / variance == pytest.approx(shifts.optics[0], rel=0.05)
+    assert (wide[2] / point[2] - 1) / variance == pytest.approx(shifts.amplitude, rel=0.05)
 
 
 @pytest.mark.parametrize("apart_nm", [100.0, 200.0])

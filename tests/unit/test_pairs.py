@@ -6,6 +6,7 @@ The pictures are those of ``tests/instruments.py``, which share nothing with the
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -112,14 +113,22 @@ def test_extended_rows_get_the_mass_of_two_halves_where_these_are_told() -> None
         "pair_p_value": [0.5, 0.5, 1e-6, 0.5],
     })  # fmt: skip
     flagged = np.array([True, True, True, False])
-    wide = Extension(1250.0, 250.0, 1250.0, 250.0, True, flagged, np.full(4, 9.0))
-    which = told_as_pairs(table, wide)
+    nowhere = np.zeros(4, dtype=bool)
+    wide = Extension(
+        1250.0, 250.0, 1250.0, 250.0, True, False, nowhere, flagged, np.full(4, 9.0)
+    )  # fmt: skip
+    assert not told_as_pairs(table, wide).any()  # all may wiggle
+    long_ones = replace(wide, long=np.array([True, False, False, True]))
+    assert told_as_pairs(table, long_ones).tolist() == [True, False, False, False]
+    which = told_as_pairs(table, replace(wide, is_long=True))
     assert which.tolist() == [False, True, True, False]
     out, left = with_masses_of_pairs(table, which), wide.without(which)
     assert out["mass_kda"].tolist() == [90.0, 200.0, -200.0, 180.0]
     assert out["sigma_mass_kda"].tolist() == [6.0, 10.0, 10.0, 6.0]
     assert out["status"].tolist() == ["poor_fit", "ok", "poor_fit", "poor_fit"]
     assert left.flagged.tolist() == [True, False, False, False]
+    assert left.paired == 2
+    assert "2 rows have the mass of two halves" in left.message
     assert left.mass_shift_kda.tolist() == [9.0, 0.0, 0.0, 9.0]
 
 
