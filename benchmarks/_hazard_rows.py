@@ -380,7 +380,7 @@ ROWS: Mapping[str, Row] = {
     ),
     "aggregates among proteins": Row(aggregates, (5e3, 2e3, 1e4), "kDa"),
     "vesicle among proteins": Row(vesicles, (200.0, 100.0), "nm"),
-    "second pattern moves": Row(moving_pattern, (0.1, 0.03, 0.3), "px", "pattern|drift|move"),
+    "second pattern moves": Row(moving_pattern, (0.1, 0.03, 0.3, 1.0), "px", "pattern|drift|move"),
     "uneven amplitude of the reference": Row(uneven_amplitude, (0.05, 0.03, 0.1), "", "differ"),
     "focus tilt": Row(focus_tilt, (100.0, 50.0, 200.0), "nm", _MODEL),
     "coma at the border": Row(coma, (25.0, 10.0, 40.0), "nm", _MODEL),

@@ -120,7 +120,7 @@ def _optics(
         reference = day.settings.get("optics.focus_nm")
         shift = None if reference is None else config.optics.focus_nm - float(reference)
         return "learned from this movie", shift
-    if "median_p" not in optics and "left_over" not in optics:
+    if "tested" not in optics:
         return f"{source}, too few bright particles to test them", None
     if optics.get("reason"):
         return f"rejected by this movie ({source}), and not learned", None

@@ -269,9 +269,7 @@ class MovingPattern:
             found.append((float(np.median(slope**2 / noise)) / _MEDIAN_SQUARE, information))
         if not found or np.median([excess for excess, _ in found]) < _LEAST_EXCESS:
             return 0.0
-        return max(
-            float(np.median([(excess - 1) / information for excess, information in found])), 0
-        )
+        return float(np.median([(excess - 1) / information for excess, information in found]))
 
     def _contrasts(
         self, mover: Mover, spectra: NDArray[np.complex64], mapper: Mapper

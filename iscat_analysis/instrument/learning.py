@@ -64,6 +64,7 @@ from iscat_analysis.units import count
 LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
+_AGREEING = 2  # pictures that can disagree; of one it is not known whether it shows a particle
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 NOISE = "its noise is not what the camera's numbers predict"
@@ -115,11 +116,15 @@ def learn_optics(
                 found = learn(known, config, tuple(FREE), origin, pool.map).outcome
             else:
                 found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
+        except _TooFewError as error:
+            warn(f"{_verdict(None)}: {error}; the analysis goes on as configured")
+            summary = {} if error.together is None else _doubted(error.together)
+            return config, summary | {"calibrated": False, "reason": str(error)}
         except DataError as error:
             changing = tested is not None and tested.change.matters
             reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
             warn(f"{_verdict(tested)}: {reason}; the analysis goes on as configured")
-            summary = tested.summary if tested else _untested(config)
+            summary = tested.summary if tested else {}
             return config, summary | {"calibrated": False, "reason": reason}
     verdict = tested.change.said if passed else _verdict(tested)
     return adopted(found, config, tested.summary, verdict, warn=warn)
@@ -161,11 +166,23 @@ def _doubted(together: ScoreTest) -> dict[str, Any]:
     }
 
 
-def _untested(config: Config) -> dict[str, Any]:
-    """Give the same where no pictures say anything of them."""
-    if heights_free(config):
-        return {}
-    return _doubted(score_test((), microscopes(config, 0.0), settings_of(config)))
+class _TooFewError(DataError):
+    """The optics are not tested; what the few particles say of them together."""
+
+    def __init__(self, text: str, together: ScoreTest | None) -> None:
+        super().__init__(text)
+        self.together = together
+
+
+def _of_few(
+    images: list[ParticleImage],
+    config: Config,
+    others: Sequence[ParticleImage],
+    pool: ThreadPoolExecutor,
+) -> ScoreTest | None:
+    """Ask particles that are too few to be tested one by one."""
+    fitted = median_p(images, config, others, pool.map)[1] if images else ()
+    return _together(fitted, config, pool)
 
 
 def tested_optics(
@@ -190,7 +207,9 @@ def tested_optics(
         images, others = seen_in_field(windows, config, pool)
     if len(images) < LEAST_TESTED:
         by_noise = noise_differs(movie, config, camera)
-        raise DataError(too_few(movie.name, len(images), by_noise=by_noise))
+        said = too_few(movie.name, len(images), by_noise=by_noise)
+        few = [] if by_noise or len(images) < _AGREEING else images
+        raise _TooFewError(said, _of_few(few, config, others, pool))
     median, fitted = median_p(images, config, others, pool.map)
     together = _together(fitted, config, pool)
     rejected = median < REJECTED_P or (together is not None and together.rejected)
@@ -213,10 +232,10 @@ def tested_optics(
         pairs, median = not_alone(images, config, others, pool.map)
         images = [image for k, image in enumerate(images) if k not in pairs]
         alone -= sum(k < alone for k in pairs)
-        if len(images) < LEAST_TESTED:
-            raise DataError(too_few(movie.name, len(images)))
         single = [image for k, image in enumerate(fitted) if k not in pairs]
         together = _together(single, config, pool)
+        if len(images) < LEAST_TESTED:
+            raise _TooFewError(too_few(movie.name, len(images)), together)
     seen = Collected(config, images[:alone], others)
     return Tested(seen, len(images), median, change, together)
 
@@ -230,7 +249,7 @@ def _together(
     """Ask all pictures together whether the configured optics are right."""
     if heights_free(config):
         return None
-    build = microscopes(config, max(map(reach_nm, fitted)))
+    build = microscopes(config, max(map(reach_nm, fitted), default=0.0))
     return score_test(fitted, build, settings_of(config), terms, pool.map)
 
 

@@ -54,7 +54,8 @@ class ScoreTest:
     """That of optics which are off."""
 
     left_over: float
-    """Root mean square of what the change would explain of the pictures, over the pictures."""
+    """Root mean square of what the change would explain of the pictures, over the pictures, times
+    its probability."""
 
     @property
     def rejected(self) -> bool:
@@ -104,6 +105,6 @@ def score_test(
     change = spread @ asks
     gain = 0.5 * float(asks @ change) - 0.5 * float(np.linalg.slogdet(np.eye(size) + total)[1])
     power = math.fsum(image.snr**2 for image in images)
-    explained = max(float(change @ total @ change), 0.0)
+    explained = float(expit(gain)) * max(float(change @ total @ change), 0.0)
     left_over = math.sqrt(explained / power) if power else 0.0
     return ScoreTest(names, usual * change, spread * np.outer(usual, usual), gain, left_over)

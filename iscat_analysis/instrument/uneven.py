@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from iscat_analysis.config import JUMPS, MOVES, Config
@@ -337,6 +338,8 @@ def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
 _ENDS = 16  # frames at either end, which show the light before and after
 _LOOKED_AT = 256  # frames between them
 _VOTE = 6.0  # standard errors that each particle counts for at most
+_TIE = 1e-9  # of votes, which rounding makes
+_DARK = 0.5  # of the brightest frame, below which one shows no light
 _CORE_NM = 350.0  # from the middle of a picture: what lands beside it changes little of that
 
 
@@ -360,29 +363,49 @@ def jump_frame(view: FieldOfView, images: Sequence[ParticleImage], between: tupl
         for image in order
         if image.step < low
     ]
+    frames, light = _lit(view.movie, np.r_[low : low + _ENDS, high - _ENDS : high])
+    start, end = (
+        [one for frame, one in zip(frames, light, strict=True) if (frame < low + _ENDS) == early]
+        for early in (True, False)
+    )
+    if not start or not end:
+        return round((last.shown + first.shown) / 2)
+    changes = [
+        np.mean([one[place].ravel() for one in end], axis=0)
+        - np.mean([one[place].ravel() for one in start], axis=0)
+        for place in places
+    ]
     found, vote = round((last.shown + first.shown) / 2), _VOTE
-    while places and high - low > 2 * _ENDS + 1:
-        frames = np.unique(np.linspace(low + _ENDS, high - _ENDS - 1, _LOOKED_AT).astype(int))
-        looked = [*range(low, low + _ENDS), *frames.tolist(), *range(high - _ENDS, high)]
-        light = [view.movie.read(frame, frame + 1)[0].astype(np.float64) for frame in looked]
-        light = [one / one.mean() for one in light]
-        clear = np.zeros(len(frames) - 1)
+    while places:
+        frames, light = _lit(
+            view.movie, np.unique(np.linspace(low, high - 1, _LOOKED_AT, dtype=int))
+        )
         number = np.arange(1, len(frames))
-        for place in places:
+        clear = np.zeros((len(places), len(number)))
+        for own, place, change in zip(clear, places, changes, strict=True):
             seen = np.array([one[place].ravel() for one in light])
-            change = seen[-_ENDS:].mean(axis=0) - seen[:_ENDS].mean(axis=0)
-            sums = np.cumsum(seen[_ENDS:-_ENDS] @ change)
+            sums = np.cumsum(seen @ change)
             steps = (sums[-1] - sums[:-1]) / number[::-1] - sums[:-1] / number
             noise = np.std(np.diff(seen, axis=0)) / math.sqrt(2) * np.linalg.norm(change)
-            clear += np.minimum(
-                np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise, vote
-            )
-        found = int(frames[int(np.argmax(clear)) + 1])
-        around = max(found - 2 * _ENDS, low), min(found + 2 * _ENDS, high)
-        if around == (low, high):
+            own[:] = np.sqrt(number * number[::-1] / len(frames)) * np.abs(steps) / noise
+        # where all have their vote, those whose steps are clearest
+        votes = np.minimum(clear, vote).sum(axis=0)
+        likely = np.where(votes >= votes.max() - _TIE, clear.sum(axis=0), 0.0)
+        found = int(frames[int(np.argmax(likely)) + 1])
+        if high - low <= _LOOKED_AT:
             break
-        (low, high), vote = around, math.inf
+        around = max(2 * _ENDS, 2 * (high - low) // _LOOKED_AT)
+        low, high, vote = max(found - around, low), min(found + around, high), math.inf
     return found
+
+
+def _lit(movie: Stack, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[FloatArray]]:
+    """Read frames, and leave out those without light; each over its mean."""
+    light = [movie.read(frame, frame + 1)[0].astype(np.float64) for frame in frames.tolist()]
+    level = np.array([one.mean() for one in light])
+    lit = level > _DARK * level.max()
+    shown = [one / mean for one, mean, kept in zip(light, level, lit, strict=True) if kept]
+    return frames[lit], shown
 
 
 def in_uneven_field(
