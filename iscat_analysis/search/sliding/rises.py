@@ -7,12 +7,14 @@ rising after any line, and an exponential that describes the frames better than 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc
 
+from iscat_analysis._kernels.stepping import best_line
 from iscat_analysis.records import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -54,25 +56,23 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
     y = heights[lit] - np.average(heights[lit], weights=w)
     best, found = step + _LEAST_GAIN, (0, turn)
 
-    def tried(rise: int, centres: IntArray) -> None:
+    def tried(rise: int, first: int, last: int, step: int) -> None:
         nonlocal best, found
-        centres = centres[(centres > rise // 2) & (centres < heights.size - rise // 2)]
-        if centres.size:
-            gains = _gains(line(lit, rise, centres[:, None]), w, y)
-            top = int(np.argmax(gains))
-            if gains[top] > best:
-                best, found = float(gains[top]), (rise, int(centres[top]))
+        first += max(math.ceil((rise // 2 + 1 - first) / step), 0) * step
+        centres = first, min(last + 1, heights.size - rise // 2), step
+        best, centre = best_line(lit, w, y, rise, centres, best)
+        found = (rise, centre) if centre else found
 
     for rise in _RISE_FRAMES:
         if 2 * rise < heights.size:
             half = rise // 2
-            tried(rise, np.arange(turn - half, turn + half + 1, max(rise // 8, 1)))
+            tried(rise, turn - half, turn + half, max(rise // 8, 1))
     roughly, centre = found
     if not roughly:
         return None
     reach = max(roughly // 5, 2)
     for rise in range(round(0.7 * roughly), round(1.4 * roughly) + 1, max(roughly // 12, 1)):
-        tried(max(rise, 2), np.arange(centre - reach, centre + reach + 1))
+        tried(max(rise, 2), centre - reach, centre + reach, 1)
     rise, centre = found
     begins = centre - rise / 2 + rise * np.linspace(-0.25, 0.25, 11)
     curves = [_settling(lit, rise * share, begins[:, None]) for share in _DECAY_SHARES]
@@ -81,7 +81,7 @@ def find_rise(heights: FloatArray, weight: FloatArray, turn: int, step: float) -
     return Rise(rise, centre, _gain_beyond(heights, weight, centre, rise // 2 + 1), p_line)
 
 
-def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
+def line(frames: IntArray, rise: int, centre: int) -> FloatArray:
     """Share of the new light in frames during a linear rise."""
     return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
 
