@@ -16,6 +16,8 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 Ends = tuple[int, int, int, int]
 
+_LEAST_KNOWN = 1e-9  # of a sum of squares that is left beside a mean, and is not rounding
+
 
 @kernel()
 def part_sums(counts: NDArray[Any], good: BoolArray, edges: IntArray, out: FloatArray) -> None:
@@ -84,6 +86,43 @@ def one_change(
         else:
             jump[t], gain[t] = 0.0, math.nan
     return largest, lit
+
+
+@kernel()
+def best_line(
+    frames: IntArray,
+    weight: FloatArray,
+    heights: FloatArray,
+    rise: int,
+    centres: tuple[int, int, int],
+    least: float,
+) -> tuple[float, int]:
+    """Find the linear rise that describes heights best, of those with some centres.
+
+    Gives its log-likelihood over that of a constant and its centre; `least` and 0 where none has
+    more.
+
+    Shapes: `frames, weight, heights` (t,), `centres` first, one past the last, and step.
+    """
+    light, level = 0.0, 0.0
+    for k in range(frames.size):
+        light += weight[k]
+        level += weight[k] * heights[k]
+    found = 0
+    for centre in range(*centres):
+        new, squares, along = 0.0, 0.0, 0.0
+        for k in range(frames.size):
+            share = min(max((frames[k] + 0.5 - centre) / rise + 0.5, 0.0), 1.0)
+            new += weight[k] * share
+            squares += weight[k] * share * share
+            along += weight[k] * share * heights[k]
+        along -= new / light * level
+        known = squares - new * new / light
+        if along > 0 and known > _LEAST_KNOWN * squares:
+            gain = 0.5 * along * along / known
+            if gain > least:
+                least, found = gain, centre
+    return least, found
 
 
 @kernel()

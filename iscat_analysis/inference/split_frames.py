@@ -17,7 +17,6 @@ noise is white; the first, the mean, is left out.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -177,7 +176,8 @@ def _spectrum(series: Series) -> FloatArray:
     value = series.values / power
     mean = np.sum(weight * value, axis=1) / np.sum(weight, axis=1)
     squares = dct((value - mean[:, None]) * np.sqrt(weight), axis=1, norm="ortho") ** 2
-    for b, (first, stop) in enumerate(pairwise(MODES)):
-        part = squares[:, first:stop]
-        out[b, :-1], out[b, -1] = part.sum(axis=1), part.shape[1]
+    edges = [mode for mode in MODES[:-1] if mode < power.size]
+    last = min(MODES[-1], power.size)
+    out[: len(edges), :-1] = np.add.reduceat(squares[:, :last], edges, axis=1).T
+    out[: len(edges), -1] = np.diff([*edges, last])
     return out

@@ -66,6 +66,7 @@ class TaskBuilder:
         self._neighbours = neighbours
         self._roi_px = context.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
+        self._search_reach = self._stride + self._stride // 2 + 1  # of a date, in frames
         self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
         self.rise = {1: 0, -1: 0}  # frames over which most landings, and leavings, take place
 
@@ -79,7 +80,10 @@ class TaskBuilder:
         limit_px = context.config.detection.min_separation_nm / context.pixel_nm
         close = [s for s in neighbours if distance_px(s, step) < limit_px]
         span, crowded = self._span(step, close)
-        patch = chunk.patch(*span, region.rows, region.columns)
+        # with the frames that a first date may add
+        reach = self._search_reach if step.theta is None else 0
+        held = chunk.patch(span[0] - reach, span[1] + reach, region.rows, region.columns)
+        patch = held.frames(*span)
         if len(patch.counts) < 2:
             return None
         moving = self._pattern
@@ -95,8 +99,9 @@ class TaskBuilder:
         begin, end = max(span[0], chunk.first), min(span[1], chunk.stop)
         first = (begin, max(at.frame - gap, begin))
         second = (min(at.frame + gap, end), end)
-        if begin < patch.first or end > patch.first + len(patch.counts):
-            patch = chunk.patch(begin, end, region.rows, region.columns)
+        if begin < held.first or end > held.first + len(held.counts):
+            held = chunk.patch(begin, end, region.rows, region.columns)
+        patch = held.frames(begin, end)
         before, n_before, power_before = patch.window(*first)
         after, n_after, power_after = patch.window(*second)
         if not n_before or not n_after:
@@ -229,7 +234,7 @@ class TaskBuilder:
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
         known = self._added(step, neighbours, region, patch, pattern, image)
-        reach = self._stride + self._stride // 2 + 1
+        reach = self._search_reach
         search = (step.at.frame - reach, step.at.frame + reach + 1)
         return locate_step(
             patch, step.sign * image, search,

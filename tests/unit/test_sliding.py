@@ -26,6 +26,7 @@ from iscat_analysis.search.sliding import (
     measure_noise,
     sliding_maps,
 )
+from iscat_analysis.search.sliding.stored import StoredFrames
 
 SHAPE = (40, 44)
 SIGMAS = 4.0
@@ -107,7 +108,7 @@ def test_a_patch_holds_the_counts_of_its_region(
     stored: str, rows: tuple[int, int], columns: tuple[int, int]
 ) -> None:
     counts = np.random.default_rng(8).integers(0, 200, (20, *SHAPE)).astype(stored)
-    chunk = replace(_chunk(_movie(20, 3)), counts=counts)
+    chunk = replace(_chunk(_movie(20, 3)), counts=StoredFrames([counts]))
     for start, stop in ((0, 20), (3, 5), (4, 4), (19, 30), (-7, 2), (30, 40)):
         patch = chunk.patch(start, stop, rows, columns)
         held = slice(max(start, 0), max(stop, 0))
@@ -125,7 +126,7 @@ def test_a_patch_of_frames_that_are_a_part_of_others() -> None:
         np.random.default_rng(8).integers(0, 200, (20, 2 * SHAPE[0], 3 * SHAPE[1])).astype("u2")
     )
     part = counts[::2, 1::2, 2::3]
-    chunk = replace(_chunk(_movie(10, 3)), counts=part)
+    chunk = replace(_chunk(_movie(10, 3)), counts=StoredFrames([part]))
     patch = chunk.patch(2, 9, (5, 15), (7, 20))
     np.testing.assert_array_equal(patch.counts, part[2:9, 5:15, 7:20])
 

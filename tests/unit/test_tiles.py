@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,8 +21,11 @@ from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.search.sliding import chunks as chunks_module
-from iscat_analysis.search.sliding.tiles import cut_field
+from iscat_analysis.search.sliding.chunks import Reader
+from iscat_analysis.search.sliding.stored import frames_in_place
+from iscat_analysis.search.sliding.tiles import Tile, cut_field
 from iscat_analysis.study.simulate import Movie
+from iscat_analysis.threads import threads
 
 SIDE, FRAMES = 176, 130
 # of 2 × 2 tiles the seams are at 87.5: on them, beside them, where they cross, and bright ones
@@ -118,6 +122,34 @@ def test_tiles_change_nothing(
     _check(found, whole)
     places = (part.counts.sum(axis=1) for part in (found.empty, whole.empty))
     assert np.divide(*places) == pytest.approx(1.0, abs=0.05)  # none in two tiles
+
+
+def test_frames_of_several_files_lie_where_they_are(
+    counts: np.ndarray, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A tile sees them as one array; what does not fit into memory is not copied to a disk."""
+    for number, part in enumerate(np.split(counts, [3, 70])):
+        part.astype("<u2").tofile(tmp_path / f"movie_{number:04}.bin")
+    (tmp_path / "movie_settings.dat").write_text(
+        f"save/frame/shape\t({SIDE}, {SIDE})\nsave/frame/dtype\t<u2\nsave/saved\t{FRAMES}\n",
+        encoding="utf-8",
+    )
+    monkeypatch.setattr(chunks_module, "Scratch", None)
+    camera, box = Camera(), (slice(20, 90), slice(5, 60))
+    with open_stack(tmp_path / "movie_0000.bin") as movie, threads(1) as pool:
+        runs = frames_in_place(movie, 1, 120)
+        assert [len(run.counts) for run in runs] == [2, 67, 50]
+        reader = Reader(movie, camera, 1, 120, 40 * SIDE * SIDE * 2)
+        tile = Tile((20, 90), (5, 60), (20, 90), (5, 60), (SIDE, SIDE))
+        sums = reader.field_sums((60, 110), pool)
+        chunk = reader.tile_chunk(sums.part(box), tile, 20, pool)
+        np.testing.assert_allclose(sums.mean_e.sum(), counts[60:110].mean(axis=0).sum(), rtol=1e-6)
+        for (first, last), block in zip(pairwise((60, 80, 100, 110)), chunk.blocks_e, strict=True):
+            np.testing.assert_array_equal(block, counts[(slice(first, last), *box)].sum(axis=0))
+        region = chunk.patch(65, 75, (3, 9), (4, 20)).counts
+        np.testing.assert_array_equal(region, counts[65:75, 23:29, 9:25])
+    with open_stack(counts) as movie:
+        assert frames_in_place(movie, 0, 9) == []
 
 
 @pytest.mark.large

@@ -23,7 +23,6 @@ from iscat_analysis.records import (
     CountSource,
     FloatArray,
     Mapper,
-    PlacedSource,
 )
 from iscat_analysis.scratch import Scratch
 from iscat_analysis.search.sliding import (
@@ -37,7 +36,8 @@ from iscat_analysis.search.sliding import (
     sums_of,
     well_lit,
 )
-from iscat_analysis.search.sliding.tiles import FieldSums, Tile, cut_field
+from iscat_analysis.search.sliding.stored import StoredFrames, frames_in_place
+from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, FieldSums, Tile, cut_field
 from iscat_analysis.search.templates import LARGEST_IMAGE
 from iscat_analysis.threads import threads
 
@@ -78,13 +78,14 @@ class Reader:
         self.first, self.last = first, last
         self.shape = (movie.shape[1], movie.shape[2])
         self.frame_bytes = math.prod(self.shape) * movie.dtype.itemsize
-        self._placed = (
-            movie.in_place(first, last)
-            if isinstance(movie, PlacedSource) and first < last
-            else None
-        )
+        self._placed = frames_in_place(movie, first, last)
         # made at once, because growing copies; only what is written to takes memory
-        room = 0 if self._placed else min(max(last - first, 0), room_bytes // self.frame_bytes)
+        room = min(max(last - first, 0), room_bytes // self.frame_bytes)
+        if len(self._placed) > 1 and room == last - first:  # of several files, that all fit
+            self._placed = []
+        if self._placed:
+            room = 0
+            self._lying = StoredFrames([run.counts for run in self._placed])
         self._buffer = np.empty((room, *self.shape), dtype=movie.dtype)
         self._room_bytes = room_bytes
         self._scratch: Scratch | None = None  # frames that do not fit into memory
@@ -96,15 +97,15 @@ class Reader:
     @property
     def in_place(self) -> bool:
         """Whether frames stay where they lie in the file."""
-        return self._placed is not None
+        return bool(self._placed)
 
     @property
     def held_bytes(self) -> int:
-        """What a frame of a chunk counts for: half where it stays in the file.
+        """What a frame of a chunk counts for: half where it stays in one file.
 
         The system can take such pages back, but would have to read them again.
         """
-        return self.frame_bytes // 2 if self._placed else self.frame_bytes
+        return self.frame_bytes // 2 if len(self._placed) == 1 else self.frame_bytes
 
     @cached_property
     def sampled(self) -> Reader:
@@ -130,24 +131,28 @@ class Reader:
 
     def forget(self) -> None:
         """Release the memory of the frames."""
-        if self._placed:
-            self._placed.let_go()
+        self._let_go()
         self._buffer = self._buffer[:0].copy()
         self._scratch = None
         self._held = (self.first, self.first)
         self._summed = None
 
     def _let_go(self) -> None:
-        """Give back the memory of frames that lie in a file."""
-        if self._placed:
-            self._placed.let_go()
-        elif self._scratch is not None:
+        """Give back the memory of frames that lie in files."""
+        for run in self._placed:
+            run.let_go()
+        if self._scratch is not None:
             self._scratch.let_go()
+
+    def _check(self) -> None:
+        """Refuse files that have become shorter."""
+        for run in self._placed:
+            run.check()
 
     def _keep(self, kept: slice, room: int) -> None:
         """Leave only some of the frames, with room for more behind them."""
         if self._placed:
-            self._placed.let_go()
+            self._let_go()
             return
         frames, old = self._buffer[kept], self._buffer
         if room > len(old):
@@ -171,16 +176,26 @@ class Reader:
         return max(_FEWEST_AT_ONCE, _AT_ONCE_BYTES // self.frame_bytes)
 
     def _frames(self, start: int, stop: int) -> NDArray[Any]:
-        """Frames [start, stop) of those that are held."""
+        """Frames [start, stop) of those that are held, as one array."""
+        return self._stored(start, stop).array(0, stop - start)
+
+    def _stored(self, start: int, stop: int, box: Box = EVERYWHERE) -> StoredFrames:
+        """Frames [start, stop) of those that are held, where they lie."""
         if self._placed:
-            self._placed.check()
-            return self._placed.counts[start - self.first : stop - self.first]
-        return self._buffer[start - self._held[0] : stop - self._held[0]]
+            self._check()
+            return self._lying.views(start - self.first, stop - self.first, box)
+        first = self._held[0]
+        return StoredFrames([self._buffer]).views(start - first, stop - first, box)
 
     def counts(
         self, start: int, stop: int, mapper: Mapper = map
     ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
         """Frames [start, stop), which of them are good, and their light [e per pixel]."""
+        good, light = self._hold(start, stop, mapper)
+        return self._frames(start, stop), good, light
+
+    def _hold(self, start: int, stop: int, mapper: Mapper) -> tuple[BoolArray, FloatArray]:
+        """Hold frames [start, stop); tell which of them are good, and their light."""
         low, high = self._held
         if low != start or stop > high:  # a part of them stays with the others
             self._summed = None
@@ -195,8 +210,7 @@ class Reader:
                 if step < stop - start:
                     self._let_go()
         light = self._light[: stop - start]
-        good = np.isfinite(light) & ~self._repeats[: stop - start]
-        return self._frames(start, stop), good, light
+        return np.isfinite(light) & ~self._repeats[: stop - start], light
 
     def _append(self, end: int, mapper: Mapper) -> None:
         """Read on from the last frame that is in memory."""
@@ -236,25 +250,26 @@ class Reader:
         """Frames of a span, summed in blocks, once for all who ask for it one after the other."""
         if self._summed is not None and self._summed[:2] == (span, stride):
             return self._summed[2]
-        counts, good, light = self._lit(span, pool)
+        good, light = self._lit(span, pool)
         chunk = make_chunk(
-            span[0], counts, good, light, self.camera,
-            stride=stride, defects=find_defects, mapper=pool.map,
-            check=self._placed.check if self._placed else lambda: None,
+            span[0], self._frames(*span), good, light, self.camera,
+            stride=stride, defects=find_defects, mapper=pool.map, check=self._check,
         )  # fmt: skip
         self._summed = span, stride, chunk
         return chunk
 
     def field_sums(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> FieldSums:
         """Sum the frames of a span over the whole field, for all of its tiles."""
-        counts, good, light = self._lit(span, pool)
+        good, light = self._lit(span, pool)
+        counts = self._stored(*span)
         total, highest = np.zeros(self.shape), np.zeros(self.shape, dtype=self._movie.dtype)
         step = self._at_once(len(counts))
         step = max(1, step // _TOGETHER) if step < len(counts) else step
         starts = range(0, len(counts), step)
 
         def one(start: int) -> tuple[NDArray[np.float32], NDArray[Any]]:
-            lit = counts[start : start + step][good[start : start + step]]
+            frames, kept = counts.array(start, start + step), good[start : start + step]
+            lit = frames if kept.all() else frames[kept]
             return summed(lit) if len(lit) else (np.zeros(self.shape, np.float32), highest)
 
         for first in range(0, len(starts), _TOGETHER):
@@ -269,25 +284,21 @@ class Reader:
     ) -> Chunk:
         """Frames of one tile, summed in blocks."""
         if not self._placed:
-            self.counts(*sums.span, pool.map)
-        counts = self._frames(*sums.span)
+            self._hold(*sums.span, pool.map)
         return make_tile_chunk(
-            counts[(slice(None), *tile.here)], sums, self.camera.part(tile.here),
-            stride=stride, check=self._placed.check if self._placed else lambda: None,
-            let_go=self._let_go, mapper=pool.map,
+            self._stored(*sums.span, tile.here), sums, self.camera.part(tile.here),
+            stride=stride, check=self._check, let_go=self._let_go, mapper=pool.map,
         )  # fmt: skip
 
-    def _lit(
-        self, span: tuple[int, int], pool: ThreadPoolExecutor
-    ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
-        """Frames of a span, which of them are good, and their light; refused where none is."""
-        counts, good, light = self.counts(*span, pool.map)
+    def _lit(self, span: tuple[int, int], pool: ThreadPoolExecutor) -> tuple[BoolArray, FloatArray]:
+        """Tell which frames of a span are good, and their light; refused where none is."""
+        good, light = self._hold(*span, pool.map)
         if not good.any():
             raise DataError(
                 f"{self.name}: frames {span[0]}:{span[1]} hold no light that changes; every frame "
                 "is zero or repeats the one before it; analyse the others with fit.frames = [A, B]"
             )
-        return counts, good, light
+        return good, light
 
     def opening(self, mapper: Mapper = map) -> NDArray[Any]:
         """Good frames among the first, for judging the noise."""

@@ -13,6 +13,7 @@ from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.search.sliding.stored import StoredFrames
 from iscat_analysis.search.sliding.tiles import FieldSums
 
 HALF = 0.5
@@ -26,7 +27,7 @@ _LEAST_CHANGE_RATIO = 8.0
 # Of the light of a frame's first and last rows, and of these over the middle one's
 _LEAST_EDGE_LIGHT = 0.1
 _EDGE_E = 400.0  # photoelectrons of a row, without which it tells nothing
-_COPIED = 32  # frames of a region that are copied together from a file
+_COPIED = 256  # frames of a region that are copied together from a file
 _LIGHT_QUANTILE = 0.75  # quantile of the light of frames
 
 
@@ -35,7 +36,7 @@ class Chunk:
     """Consecutive frames in memory, with their power."""
 
     first: int
-    counts: NDArray[Any]
+    counts: StoredFrames
     good: BoolArray
     power: FloatArray
     camera: Camera
@@ -56,7 +57,7 @@ class Chunk:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows, columns."""
-        return int(self.counts.shape[1]), int(self.counts.shape[2])
+        return self.counts.shape[1], self.counts.shape[2]
 
     def cut(self, start: int, stop: int) -> slice:
         """Index of frames [start, stop), clipped to those held."""
@@ -154,7 +155,7 @@ class Patch:
         return replace(
             self,
             counts=_region(
-                self.counts,
+                StoredFrames([self.counts]),
                 slice(0, len(self.counts)),
                 (rows.start, rows.stop),
                 (columns.start, columns.stop),
@@ -276,12 +277,13 @@ def make_chunk(
 
     Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
-    edges, blocks, highest = _sum_blocks(counts, good, camera, stride, check, mapper)
+    stored = StoredFrames([counts])
+    edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper)
     sums = _judged(
         (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
         highest.max(axis=0), camera, defects,
     )  # fmt: skip
-    return _chunk(counts, sums, camera, edges, blocks, check, _nothing)
+    return _chunk(stored, sums, camera, edges, blocks, check, _nothing)
 
 
 def sums_of(
@@ -326,7 +328,7 @@ def _judged(
 
 
 def make_tile_chunk(
-    counts: NDArray[Any],
+    counts: StoredFrames,
     sums: FieldSums,
     camera: Camera,
     *,
@@ -350,7 +352,7 @@ def make_tile_chunk(
 
 
 def _chunk(
-    counts: NDArray[Any],
+    counts: StoredFrames,
     sums: FieldSums,
     camera: Camera,
     edges: NDArray[np.int64],
@@ -370,7 +372,7 @@ def _nothing() -> None:
 
 
 def _sum_blocks(
-    counts: NDArray[Any],
+    counts: StoredFrames,
     good: BoolArray,
     camera: Camera,
     stride: int,
@@ -389,12 +391,11 @@ def _sum_blocks(
 
     def one(k: int) -> None:
         check()
-        part = slice(edges[k], edges[k + 1])
-        start = int(np.argmax(good[part])) + int(edges[k])
-        highest[k] = counts[start]
-        block = np.ascontiguousarray(counts[part])
-        block_sums(block, good[part], _scratch(counts), blocks[k], highest[k])
-        blocks[k] -= np.count_nonzero(good[part]) * offset
+        block = np.ascontiguousarray(counts.array(int(edges[k]), int(edges[k + 1])))
+        lit = good[edges[k] : edges[k + 1]]
+        highest[k] = block[np.argmax(lit)]
+        block_sums(block, lit, _scratch(block), blocks[k], highest[k])
+        blocks[k] -= np.count_nonzero(lit) * offset
         blocks[k] *= camera.gain_e_per_adu
 
     for _ in mapper(one, range(edges.size - 1)):
@@ -403,13 +404,13 @@ def _sum_blocks(
 
 
 def _region(
-    counts: NDArray[Any], frames: slice, rows: tuple[int, int], columns: tuple[int, int]
+    counts: StoredFrames, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
 ) -> NDArray[Any]:
     """Copy a region of some frames."""
     ends = zip((rows, columns), counts.shape[1:], strict=True)
     if not all(0 <= low <= high <= size for (low, high), size in ends):
         raise IndexError(f"rows {rows} and columns {columns} of frames of shape {counts.shape[1:]}")
-    return counts[frames, slice(*rows), slice(*columns)].copy()
+    return counts.array(frames.start, frames.stop, (slice(*rows), slice(*columns))).copy()
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:

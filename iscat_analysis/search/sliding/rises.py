@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erfc, logsumexp
 
+from iscat_analysis._kernels.stepping import best_line
 from iscat_analysis.records import FloatArray
 
 IntArray = NDArray[np.int64]
@@ -66,13 +67,12 @@ def find_rise(
     y = heights[lit] - np.average(heights[lit], weights=w)
 
     def tried(rise: int, reach: int, every: int = 1, about: int = turn) -> tuple[float, int, int]:
-        centres = np.arange(about - reach, about + reach + 1, every)
-        centres = centres[(centres > rise // 2) & (centres < heights.size - rise // 2)]
-        if not centres.size or 2 * rise >= heights.size:
+        if 2 * rise >= heights.size:
             return 0.0, rise, turn
-        gains = _gains(line(lit, rise, centres[:, None]), w, y)
-        top = int(np.argmax(gains))
-        return float(gains[top]), rise, int(centres[top])
+        first, last = about - reach, min(about + reach + 1, heights.size - rise // 2)
+        first += max(math.ceil((rise // 2 + 1 - first) / every), 0) * every
+        gain, centre = best_line(lit, w, y, rise, (first, last, every), 0.0)
+        return gain, rise, centre or turn
 
     def judged(course: tuple[float, int, int]) -> float:
         return course[0] + _LEAST_GAIN * (course[1] == expected)
@@ -122,7 +122,7 @@ def _common(profiles: Sequence[tuple[float, ...]]) -> int:
     return best if total[best] > total[0] + _LEAST_GAIN else 0
 
 
-def line(frames: IntArray, rise: int, centre: int | IntArray) -> FloatArray:
+def line(frames: IntArray, rise: int, centre: int) -> FloatArray:
     """Share of the new light in frames during a linear rise."""
     return np.asarray(np.clip((frames + 0.5 - centre) / rise + 0.5, 0.0, 1.0))
 
