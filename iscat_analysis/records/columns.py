@@ -170,6 +170,12 @@ EVENTS = (
         "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
         optional=True,
     ),
+    Column(
+        "diameter_probability", "share",
+        "Posterior probability of diameter_nm among all diameters that were found, all in "
+        "fit.diameter_range_nm being as likely before",
+        optional=True,
+    ),
 )  # fmt: skip
 """The columns of ``fits.csv``, in order."""
 

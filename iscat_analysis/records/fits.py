@@ -109,6 +109,8 @@ class FitResult:
         All flags, worst first, including the status unless it is ok.
     alternatives : tuple of Alternative
         Other heights, best first.
+    size_probability : float
+        Posterior probability of the diameter among all that were found; NaN where it is not free.
     """
 
     x_nm: float
@@ -130,6 +132,7 @@ class FitResult:
     status: Status
     flags: tuple[Status, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
+    size_probability: float = math.nan
 
     def shifted(self, x_nm: float, y_nm: float) -> FitResult:
         """Give the same fit in coordinates with another origin."""

@@ -91,7 +91,8 @@ def of(scheme: str, **changes: Any) -> Config:
         "bounds": {"pixels": 25, "n_before": 50, "n_after": 50},
     }
     for section, keys in changes.items():
-        sections[section] = {k: v for k, v in (sections[section] | keys).items() if v is not None}
+        whole = sections.get(section, {}) | keys
+        sections[section] = {k: v for k, v in whole.items() if v is not None}
     return configure(sections)
 
 
@@ -284,6 +285,9 @@ BAD = [
     ({"particle": {"shell_nm": 5.0}}, 'needs model = "shell"'),
     ({"particle": {"model": "dipole"}}, "fits spheres"),
     ({"fit": {"mode": "mass"}}, "is for dipoles"),
+    ({"fit": {"mode": "track"}}, "needs a background that is known"),
+    ({"fit": {"mode": "track"}, "background": {"frames": "all"}}, "background that is known"),
+    ({"fit": {"mode": "track"}, "track": {"free": "mass"}}, 'needs track.free = "joint"'),
     ({"fit": {"diameter_range_nm": [300.0, 200.0]}}, "is empty"),
     ({"optics": {"calibrate": "always"}}, "is for dipoles"),
     ({"optics": {"n_sample": [1.33, 0.01]}}, "n_sample"),
