@@ -260,7 +260,7 @@ def _slopes(
 
 def _scoring_step(here: _Frames) -> tuple[FloatArray, FloatArray, float]:
     """Give the steps of c and of the places, and the gain that they are expected to bring."""
-    step: FloatArray = np.linalg.solve(here.known, here.pull)
+    step = np.asarray(np.linalg.solve(here.known, here.pull), dtype=np.float64)
     left = here.place_score - here.mixed @ step
     moves: FloatArray = np.einsum("fij,fj->fi", here.place_inverse, left)
     alone = float(np.einsum("fi,fij,fj->", here.place_score, here.place_inverse, here.place_score))

@@ -162,6 +162,11 @@ EVENTS = (
         "qcrb_diameter_nm", "positive", "Its quantum Cramér–Rao bound [nm]", "QCRB", optional=True
     ),
     Column(
+        "systematic_diameter_nm", "not_negative",
+        "Its error common to the movie, from inputs that were assumed [nm]", "systematic", "nm",
+        optional=True,
+    ),
+    Column(
         "other_diameter_nm", "positive",
         "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
         optional=True,
@@ -221,6 +226,7 @@ TRACKS = (
     Column(
         "refractive_index", "positive",
         "Refractive index of a sphere of that diameter that scatters like mass_kda of [particle]; "
+        "with particle.model = \"mie\" or \"shell\", from pictures and diffusion together; "
         "null for a material that absorbs", "index",
     ),
     Column(

@@ -23,8 +23,10 @@ from iscat_analysis.bounds.experiment import bounds_report, plan
 from iscat_analysis.config import Config, configure
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients
 from iscat_analysis.records import PARAMETERS
+from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
 from iscat_analysis.units import sphere_mass_kda
 
@@ -447,3 +449,20 @@ def test_contrasts_that_are_all_wrong_make_masses_of_spheres_wrong_by_more() -> 
     told = respond.to_contrast(90.0, float(truth[3]))
     assert told == pytest.approx(found, rel=0.02)
     assert found > 1.2  # that of a dipole is 1
+
+
+def test_the_error_of_an_assumed_index_is_in_the_diameter() -> None:
+    """A small sphere scatters like V (m² − 1)/(m² + 2), and the picture holds V L."""
+    config = of("iscat", particle={"diameter_nm": 40.0, "height_nm": "contact"})
+    mass = config.particle.nominal_mass_kda
+    rows = {"n_before": [1000], "n_after": [1000], "z_nm": [20.0], "mass_kda": [mass],
+            "status": ["ok"]}  # fmt: skip
+    share = assumed_error("index", config, pd.DataFrame(rows))["mass_kda"][0] / mass
+
+    def strength(n: float) -> float:
+        return math.log((n**2 - 1.33**2) / (n**2 + 2 * 1.33**2))
+
+    n = material(config.particle, config.optics.wavelength_nm).permittivity.real ** 0.5
+    expected = strength(n + config.uncertainty.index) - strength(n)
+    assert share == pytest.approx(expected, rel=0.06)
+    assert assumed_error("wavelength_nm", config, pd.DataFrame(rows))["mass_kda"][0] > 0

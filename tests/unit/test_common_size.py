@@ -30,7 +30,7 @@ Z_RANGE_NM = (0.0, 900.0)
 def model_of(diameter_nm: float, **particle: object) -> SizedModel:
     config = Config.model_validate(
         {
-            "optics": {"wavelength_nm": 525.0, "na": 1.42},
+            "optics": {"wavelength_nm": 525.0, "na": 1.42, "focus_nm": 0.0},
             "camera": {"pixel_size_nm": 100.0},
             "particle": {"kind": "silica", "model": "mie", "diameter_nm": diameter_nm, **particle},
             "fit": {"mode": "size", "roi_nm": 1900.0, "z_range_nm": Z_RANGE_NM,
