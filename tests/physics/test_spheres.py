@@ -24,7 +24,12 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients
+from iscat_analysis.optics.spheres import (
+    Sphere,
+    amplitudes,
+    coefficients,
+    scattering_length_nm,
+)
 from iscat_analysis.records import PARAMETERS
 from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
@@ -466,3 +471,13 @@ def test_the_error_of_an_assumed_index_is_in_the_diameter() -> None:
     expected = strength(n + config.uncertainty.index) - strength(n)
     assert share == pytest.approx(expected, rel=0.06)
     assert assumed_error("wavelength_nm", config, pd.DataFrame(rows))["mass_kda"][0] > 0
+
+
+def test_the_scattering_length_of_a_small_sphere_is_that_of_its_polarisability() -> None:
+    optics = ia.Optics()
+    m2 = (1.46 / optics.n_sample) ** 2
+    expected = 10.0 * ((m2 - 1) / (m2 + 2)) ** (1 / 3)
+    small = Sphere(sphere_mass_kda(10.0, 2200.0), 2200.0, SILICA)
+    assert scattering_length_nm(small, optics) == pytest.approx(expected, rel=1e-2)
+    large = small.of_mass(sphere_mass_kda(250.0, 2200.0))
+    assert scattering_length_nm(large, optics) < 20 * expected  # 25 times if it were small
