@@ -84,6 +84,7 @@ class Uncertainty(Section):
     wavelength_nm: NonNegative = Field(1.0, description="of optics.wavelength_nm")
     n_sample: NonNegative = Field(0.002, description="of optics.n_sample")
     n_glass: NonNegative = Field(0.002, description="of optics.n_glass")
+    index: NonNegative = Field(0.01, description="of particle.index, if particles are spheres")
     height_nm: NonNegative = Field(
         2.0, description="of the mean height of particles, if particle.height_nm is fixed"
     )

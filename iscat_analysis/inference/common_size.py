@@ -66,23 +66,29 @@ class CommonSize:
     information: FloatArray
     """Of each frame about (m) or (m, n), shape (frames, k, k)."""
 
+    prior: FloatArray
+    """Information of the motion about the same, shape (k, k)."""
+
     bias: FloatArray
     """Of (m) or (m, n); the estimates still have it."""
 
     converged: bool
 
-    def covariance(self, correlation: FloatArray | None = None) -> FloatArray:
+    def covariance(
+        self, correlation: FloatArray | None = None, *, excess: float = 1.0
+    ) -> FloatArray:
         """Covariance of (m) or (m, n).
 
         Frames that share a measured background share its noise: `correlation` (frames, frames).
+        `excess` is the variance of what pictures say over that of counting.
         """
-        inverse = np.linalg.inv(self.information.sum(axis=0))
+        inverse = np.linalg.inv(self.information.sum(axis=0) + self.prior)
         if correlation is None:
-            return np.asarray(inverse)
+            correlation = np.eye(len(self.information))
         sizes, axes = np.linalg.eigh(self.information)
         roots = axes * np.sqrt(np.maximum(sizes, 0.0))[:, None] @ np.swapaxes(axes, 1, 2)
         spread = np.einsum("fac,fg,gbc->ab", roots, correlation, roots)
-        return np.asarray(inverse @ spread @ inverse)
+        return np.asarray(inverse @ (excess * spread + self.prior) @ inverse)
 
 
 def common_sizes(
@@ -169,6 +175,7 @@ def fit_common_size(
         log_likelihood=here.value,
         log_weight=here.value + _log_volume(here),
         information=here.information,
+        prior=here.known - here.information.sum(axis=0),
         bias=_bias(likelihoods, model, rows, common, here),
         converged=converged,
     )
@@ -253,11 +260,10 @@ def _slopes(
 
 def _scoring_step(here: _Frames) -> tuple[FloatArray, FloatArray, float]:
     """Give the steps of c and of the places, and the gain that they are expected to bring."""
-    step = np.linalg.solve(here.known, here.pull)
+    step = np.asarray(np.linalg.solve(here.known, here.pull), dtype=np.float64)
     left = here.place_score - here.mixed @ step
-    moves = np.einsum("fij,fj->fi", here.place_inverse, left)
+    moves: FloatArray = np.einsum("fij,fj->fi", here.place_inverse, left)
     alone = float(np.einsum("fi,fij,fj->", here.place_score, here.place_inverse, here.place_score))
-    moves = np.asarray(moves, dtype=np.float64)
     return step, moves, 0.5 * (float(step @ here.pull) + alone)
 
 

@@ -28,7 +28,12 @@ from iscat_analysis.inference.heights import HeightPrior
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
 from iscat_analysis.inference.precision import precision
 from iscat_analysis.inference.reach import reach, reaches_far
-from iscat_analysis.inference.sizes import OTHER_SIZE_SHARE, has_other_size, size_starts
+from iscat_analysis.inference.sizes import (
+    OTHER_SIZE_SHARE,
+    has_other_size,
+    size_probability,
+    size_starts,
+)
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import (
@@ -156,7 +161,8 @@ def fit_particle(
         found = wider
     best, known, sigma, bias = found.best, found.known, found.sigma, found.bias
     model = likelihood.model
-    alternatives = _alternatives(optima, model)
+    optima = _distinct(optima, model)
+    alternatives = _alternatives(optima)
     flags = []
     if not best.converged or not known:
         flags.append(Status.NOT_CONVERGED)
@@ -166,6 +172,9 @@ def fit_particle(
         flags.append(Status.AMBIGUOUS_Z)
     if model.is_sized and has_other_size(alternatives, best, float(sigma[AMPLITUDE])):
         flags.append(Status.AMBIGUOUS_SIZE)
+    probability = math.nan
+    if model.is_sized and known and box.free[AMPLITUDE]:
+        probability = size_probability(likelihood, optima, box, float(sigma[AMPLITUDE]))
     if found.p_value < POOR_FIT_P:
         flags.append(Status.POOR_FIT)
     estimate = best.theta
@@ -195,6 +204,7 @@ def fit_particle(
         status=status,
         flags=noticed,
         alternatives=alternatives,
+        size_probability=probability,
     )
 
 
@@ -360,24 +370,32 @@ def _heights(likelihood: Likelihood, theta: FloatArray, box: Box) -> list[tuple[
     return starts
 
 
-def _alternatives(optima: list[Optimum], model: ForwardModel) -> tuple[Alternative, ...]:
-    """Optima at other heights, or of other sizes, than the best one and than each other."""
-    best = optima[0].log_likelihood
-    places = [
-        (float(o.theta[2]), max(best - o.log_likelihood, 0.0), float(o.theta[AMPLITUDE]))
-        for o in optima
-    ]
-    kept = places[:1]
-    for z, gap, amplitude in places[1:]:
+def _distinct(optima: list[Optimum], model: ForwardModel) -> list[Optimum]:
+    """Keep optima at other heights, or of other sizes, than better ones; the best is the first."""
+    kept = optima[:1]
+    for one in optima[1:]:
+        z, amplitude = one.theta[2], one.theta[AMPLITUDE]
         if all(
-            abs(z - other) > model.fringe_nm / 8
-            or (model.is_sized and abs(amplitude - size) > OTHER_SIZE_SHARE * size)
-            for other, _, size in kept
+            abs(z - other.theta[2]) > model.fringe_nm / 8
+            or (
+                model.is_sized
+                and abs(amplitude - other.theta[AMPLITUDE])
+                > OTHER_SIZE_SHARE * other.theta[AMPLITUDE]
+            )
+            for other in kept
         ):
-            kept.append((z, gap, amplitude))
-    return tuple(
-        sorted((Alternative(*one) for one in kept[1:]), key=lambda a: a.log_likelihood_gap)
-    )
+            kept.append(one)
+    return kept
+
+
+def _alternatives(optima: list[Optimum]) -> tuple[Alternative, ...]:
+    """Describe all optima but the first, which is the best."""
+    best = optima[0].log_likelihood
+    others = [
+        Alternative(float(o.theta[2]), max(best - o.log_likelihood, 0.0), float(o.theta[AMPLITUDE]))
+        for o in optima[1:]
+    ]
+    return tuple(sorted(others, key=lambda a: a.log_likelihood_gap))
 
 
 def _walls(theta: FloatArray, box: Box) -> list[bool]:

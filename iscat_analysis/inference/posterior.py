@@ -150,6 +150,8 @@ class _Proposal:
             if other.log_likelihood_gap < 15:
                 theta = np.array(fit.theta)
                 theta[2] = other.z_nm
+                if likelihood.model.is_sized:
+                    theta[3] = other.mass_kda
                 centres.append(theta[index])
                 gaps.append(other.log_likelihood_gap)
         weights = -np.minimum(gaps, 3.0)

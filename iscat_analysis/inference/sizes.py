@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from iscat_analysis.inference.likelihood import Likelihood, Optimum
 from iscat_analysis.optics.sized import SizedModel
@@ -108,3 +109,41 @@ def has_other_size(alternatives: Sequence[Alternative], best: Optimum, sigma_kda
         and abs(other.mass_kda - mass) > OTHER_SIZE * sigma_kda
         for other in alternatives
     )
+
+
+def size_probability(
+    likelihood: Likelihood, optima: Sequence[Optimum], box: Box, sigma_kda: float
+) -> float:
+    """Posterior probability of the diameter of the first optimum, flat in the diameter before.
+
+    Each optimum is a normal distribution, of which what lies inside the range of heights counts:
+    weight = likelihood · volume · dd/dm.
+    """
+    best = float(optima[0].theta[3])
+    weights, own = [], []
+    for one in optima:
+        if one.converged:
+            weights.append(_log_weight(likelihood, one, box))
+            own.append(
+                abs(one.theta[3] - best) <= max(OTHER_SIZE * sigma_kda, OTHER_SIZE_SHARE * best)
+            )
+    if not weights:
+        return math.nan
+    shares = np.exp(np.array(weights) - max(weights))
+    return float(shares[own].sum() / shares.sum())
+
+
+def _log_weight(likelihood: Likelihood, optimum: Optimum, box: Box) -> float:
+    """Logarithm of the posterior weight of an optimum, in its free parameters and the diameter."""
+    free = np.flatnonzero(box.free)
+    _, score, fisher = likelihood.score_fisher(optimum.theta)
+    covariance = np.linalg.inv(fisher[np.ix_(free, free)])
+    step = covariance @ score[free]  # to the top of the normal, which a wall may hide
+    value = optimum.log_likelihood + 0.5 * float(score[free] @ step)
+    value += 0.5 * float(np.linalg.slogdet(2 * math.pi * covariance)[1])
+    if box.free[2]:
+        at = int(np.flatnonzero(free == 2)[0])
+        z, spread = optimum.theta[2] + step[at], math.sqrt(covariance[at, at])
+        below, above = ndtr((np.array([box.lower[2], box.upper[2]]) - z) / spread)
+        value += math.log(max(above - below, 1e-300))
+    return value - 2 / 3 * math.log(optimum.theta[3])  # dd/dm, as d goes with m^(1/3)

@@ -30,7 +30,7 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.config import Particle
+from iscat_analysis.config import Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.units import sphere_diameter_nm, sphere_mass_kda
@@ -88,6 +88,18 @@ class Sphere:
         )
         unit = 1j / x**3
         return -direction * unit * s2, unit * s1
+
+
+def scattering_length_nm(sphere: Sphere, optics: Optics) -> float:
+    """Cube root of the light that a sphere scatters along the axis, d |pattern|^(1/3) [nm].
+
+    Of a small sphere it is d ((m² − 1)/(m² + 2))^(1/3), in proportion to the diameter.
+    """
+    direction = 1.0 if optics.scheme == "iscat" else -1.0
+    along = sphere.pattern(
+        np.ones(1, dtype=complex), direction, optics.n_sample, 2 * np.pi / optics.wavelength_nm
+    )[1]
+    return float(sphere.diameter_nm * np.cbrt(abs(along[0])))
 
 
 def sphere_of(particle: Particle, permittivity: complex, mass_kda: float) -> Sphere | None:

@@ -237,12 +237,13 @@ def _without_mass(model: SeatedModel, fit: FitResult, row: Mapping[str, Any]) ->
 
 
 def sizes_of(model: SizedModel, fit: FitResult) -> dict[str, float]:
-    """Give the next likely diameter and its odds; both are empty if there is none."""
+    """Give the probability of the diameter, and the next likely one with its odds, if any."""
+    own = {"diameter_probability": fit.size_probability}
     others = [other for other in fit.alternatives if math.isfinite(other.log_likelihood_gap)]
     if not others or "mass_kda" not in fit.free:
-        return {"other_diameter_nm": math.nan, "other_odds": math.nan}
+        return own | {"other_diameter_nm": math.nan, "other_odds": math.nan}
     sphere = model.sphere.of_mass(others[0].mass_kda)
-    return {
+    return own | {
         "other_diameter_nm": sphere.diameter_nm,
         "other_odds": math.exp(-others[0].log_likelihood_gap),
     }

@@ -173,12 +173,23 @@ EVENTS = (
     ),
     Column("sigma_refractive_index", "positive", "Its standard deviation", optional=True),
     Column(
+        "systematic_diameter_nm", "not_negative",
+        "Its error common to the movie, from inputs that were assumed [nm]", "systematic", "nm",
+        optional=True,
+    ),
+    Column(
         "other_diameter_nm", "positive",
         "Diameter of the next likely maximum of the likelihood, where there is another [nm]",
         optional=True,
     ),
     Column(
         "other_odds", "share", "Likelihood of that diameter over that of diameter_nm",
+        optional=True,
+    ),
+    Column(
+        "diameter_probability", "share",
+        "Posterior probability of diameter_nm among all diameters that were found, all in "
+        "fit.diameter_range_nm being as likely before",
         optional=True,
     ),
     Column(
@@ -261,6 +272,7 @@ TRACKS = (
     Column(
         "refractive_index", "positive",
         "Refractive index of a sphere of that diameter that scatters like mass_kda of [particle]; "
+        "with particle.model = \"mie\" or \"shell\", from pictures and diffusion together; "
         "null for a material that absorbs", "index",
     ),
     Column(

@@ -111,6 +111,8 @@ class FitResult:
         Other heights, best first.
     sigma_index : float
         Standard deviation of the refractive index of a sphere, where it was fitted.
+    size_probability : float
+        Posterior probability of the diameter among all that were found; NaN where it is not free.
     """
 
     x_nm: float
@@ -133,6 +135,7 @@ class FitResult:
     flags: tuple[Status, ...] = ()
     alternatives: tuple[Alternative, ...] = ()
     sigma_index: float = math.nan
+    size_probability: float = math.nan
 
     def shifted(self, x_nm: float, y_nm: float) -> FitResult:
         """Give the same fit in coordinates with another origin."""

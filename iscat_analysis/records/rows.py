@@ -49,7 +49,8 @@ def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:
     slope = diameter / (3 * np.abs(mass))
     columns = {"diameter_nm": diameter} | {
         f"{kind}_diameter_nm": slope * table[f"{kind}_mass_kda"]
-        for kind in ("sigma", "crb", "qcrb")
+        for kind in ("sigma", "crb", "qcrb", "systematic")
+        if f"{kind}_mass_kda" in table
     }
     return make_rows(table, columns)
 

@@ -21,6 +21,7 @@ from iscat_analysis.report.event_figures import scale_bar
 from iscat_analysis.report.field import field_axes
 from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.scales import display_range
+from iscat_analysis.report.size_plane import has_plane, size_plane
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, Sketch, new_figure
 from iscat_analysis.report.tracks import tracks_of
 
@@ -50,6 +51,8 @@ def track_figures(analysis: Analysis, fits: pd.DataFrame) -> Iterator[Sketch]:
     moving = tracks["d_um2_s"].to_numpy(float) > 0
     if (np.isfinite(size) & moving).any():
         yield "mass_d", partial(mass_d, analysis)
+    if has_plane(analysis):
+        yield "size_plane", partial(size_plane, analysis)
     if np.isfinite(size).any():
         yield "distributions", partial(distributions, analysis)
     yield "msd", partial(msd, analysis, fits)

@@ -182,8 +182,9 @@ def _record(
             "p_mass": mass.p_value,
         }
     known_share = exact.get("told", 1.0)
-    if all(np.isfinite(value) for value in exact.values()):
-        record |= {name: value for name, value in exact.items() if name != "told"}
+    record |= {
+        name: value for name, value in exact.items() if name != "told" and np.isfinite(value)
+    }
     scale = _scale_error(record, known_share)
     record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
     massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast

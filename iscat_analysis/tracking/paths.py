@@ -86,7 +86,7 @@ def path_shifts_at(
 def _heights(model: ForwardModel, z_nm: FloatArray) -> FloatArray:
     """Heights at which errors are computed, from the lowest to the highest."""
     count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * _PER_FRINGE) + 1)
-    return np.linspace(z_nm.min(), z_nm.max(), count)
+    return np.linspace(z_nm.min(), max(z_nm.max(), z_nm.min() + _STEP_NM), count)
 
 
 def path_covariance(

@@ -14,18 +14,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
-from iscat_analysis.inference.common_size import CommonSize, common_sizes
+from iscat_analysis.inference.common_size import CommonSize, common_sizes, fit_common_size
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
-from iscat_analysis.species.diffusion import estimate_diffusion
+from iscat_analysis.species.diffusion import estimate_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.tracks import Correlation
 from iscat_analysis.tracking.moving_field import exposure_of
 from iscat_analysis.tracking.paths import ALONG, path_shifts_at
+
+LEAST_ABSORPTION = 1e-6
+"""Imaginary part of an index from which a single index does not describe the material."""
+
+UNDETERMINED = 0.5
+"""Error of n − n_s, over its size, from which pictures and motion do not tell the index."""
+
+LEAST_APART = 0.25
+"""Logarithm of the ratio of two masses below which a maximum that was given up may be the best."""
 
 _SHOWS_SIZE = {Status.AMBIGUOUS_SIZE, Status.AMBIGUOUS_Z}
 """Flags of a frame that says something of the diameter all the same."""
@@ -43,6 +53,10 @@ class SphereTrack:
     shifts: FloatArray
     """Of the mass in each frame that is used, for one standard deviation of its path: (frames, 9),
     and for that of D: (frames,) in the last column."""
+
+    refraction: CommonSize | None = None
+    """Mass and index from pictures and motion together; none where the material absorbs light, or
+    D is not known."""
 
 
 def sphere_track(
@@ -86,7 +100,25 @@ def sphere_track(
         of_used = path_shifts_at(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
         wider = of_used[:, :3].sum(axis=1) / ALONG * (sigma_d / d_um2_s)
         shifts = np.column_stack([of_used, wider])
-    return SphereTrack(averaged, fitted, sizes, shifts)
+    refraction = None
+    if d_um2_s > 0 and abs(model.sphere.index.imag) < LEAST_ABSORPTION and sizes[0].converged:
+        refraction = fit_common_size(
+            [event.likelihood for event in used], averaged, sizes[0].places,
+            context.config.fit.z_range_nm,
+            mass_kda=sizes[0].mass_kda,
+            index=model.sphere.index.real,
+            motion=_motion(context.config, d_um2_s, sigma_d),
+        )  # fmt: skip
+    return SphereTrack(averaged, fitted, sizes, shifts, refraction)
+
+
+def _motion(config: Config, d_um2_s: float, sigma_d: float) -> tuple[float, float]:
+    """Give 1/d of the hydrodynamic diameter, which goes with D, and its error [1/nm]."""
+    track = config.track
+    diameter, _ = hydrodynamic_diameter(
+        d_um2_s, viscosity_mpa_s=track.viscosity_mpa_s, temperature_c=track.temperature_c
+    )
+    return 1 / float(diameter), sigma_d / d_um2_s / float(diameter)
 
 
 def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float, float]:
@@ -105,7 +137,8 @@ def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float
 def _range_around(model: SizedModel, sizes: Sequence[CommonSize]) -> tuple[float, float]:
     """Masses nearer to the best than to any other likely one [kDa]."""
     best, *others = (one.mass_kda for one in sizes)
-    middles = [math.sqrt(best * other) for other in others]
+    apart = [other for other in others if abs(math.log(other / best)) > LEAST_APART]
+    middles = [math.sqrt(best * other) for other in apart]
     low, high = model.mass_range_kda
     return (
         max([low, *(middle for middle in middles if middle < best)]),
@@ -139,10 +172,25 @@ def _record(track: SphereTrack, correlation: Correlation | None) -> dict[str, fl
     per_kda = diameter / (3 * mass)
     weights = [one.log_weight - best.log_weight for one in track.sizes if one.converged]
     known = math.nan if not best.converged else 1.0
-    return {
-        "mass_kda": mass, "sigma_mass_kda": known * sigma,
+    return _refraction(track, among, (own + paths) / own) | {
+        "mass_kda": known * mass, "sigma_mass_kda": known * sigma,
         "crb_mass_kda": known * math.sqrt(bound),
-        "optical_diameter_nm": diameter, "sigma_optical_diameter_nm": known * per_kda * sigma,
+        "optical_diameter_nm": known * diameter,
+        "sigma_optical_diameter_nm": known * per_kda * sigma,
         "crb_optical_diameter_nm": known * per_kda * math.sqrt(bound),
         "optical_probability": known / sum(map(math.exp, weights or [0.0])),
     }  # fmt: skip
+
+
+def _refraction(
+    track: SphereTrack, correlation: FloatArray | None, excess: float
+) -> dict[str, float]:
+    """Give the refractive index and its error, where pictures and motion tell them."""
+    found, n_sample = track.refraction, track.model.optics.n_sample
+    if found is None or not found.converged:
+        return {}
+    index = found.index - float(found.bias[1])
+    error = math.sqrt(found.covariance(correlation, excess=excess)[1, 1])
+    if not error < UNDETERMINED * abs(index - n_sample):
+        return {}
+    return {"refractive_index": index, "sigma_refractive_index": error}

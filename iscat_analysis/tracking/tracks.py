@@ -59,9 +59,12 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
     """Say what the frame rate, exposure and length of a movie leave unknown about its tracks."""
     rate, exposure = config.camera.frame_rate_hz, config.camera.exposure_ms
     if rate is None:
+        others = "positions and masses do not need it"
+        if config.fits_sizes:
+            others = "pictures of spheres are taken for sharp, and where they move diameters suffer"
         yield (
             "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, "
-            "as in camera.frame_rate_hz = 331.0; positions and masses do not need it"
+            f"as in camera.frame_rate_hz = 331.0; {others}"
         )
     elif exposure is None:
         yield (

@@ -11,6 +11,8 @@ its scale is from:
   contrast per kDa of this one, which the model turns amplitudes into with the wrong input,
   D − ∂ ln L/∂input, L the model's contrast per amplitude.  Nobody knows which: the larger counts.
 
+The mass of a sphere follows from its picture without standards, and what remains of it is D.
+
 Where optics were learned from pictures, with the wrong input, they are wrong as well: their shift
 is part of D, and of L where the gradient is taken at learned optics.
 """
@@ -28,6 +30,7 @@ import pandas as pd
 from iscat_analysis.bounds import peak_gradient
 from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, PixelGrid, forward_model, signed_peak
+from iscat_analysis.optics.materials import material
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.response import Response, at_standards, response_of
 
@@ -47,6 +50,7 @@ INPUTS = (
     Input("wavelength_nm", "wavelength", "measure the spectrum of the light"),
     Input("n_sample", "refractive index of the sample", "measure the index of the buffer"),
     Input("n_glass", "refractive index of the glass", "take the maker's value at this wavelength"),
+    Input("index", "refractive index of the spheres", "spheres that move, or of known diameter"),
     Input("height_nm", "mean height of the particles", "standards that bind at the same height"),
     Input("magnification", "magnification", "measure the pixel size with a graticule"),
 )
@@ -57,10 +61,12 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
     """Error of the masses of a movie that the uncertainty of one input makes."""
     sigma = float(getattr(config.uncertainty, key))
     line, optics = config.calibration, config.optics
+    if config.fits_sizes and sigma and not table.empty:
+        return _of_spheres(key, config, table, sigma)
     suited = optics.scheme != "darkfield" and optics.convention == "exact"
     suited = suited and optics.psf == "model" and config.camera.pixel_size_nm is not None
     fitted = "mass_kda" in FREE_PARAMETERS[config.fit.mode]
-    if not sigma or line is None or not (suited and fitted) or table.empty:
+    if not sigma or key == "index" or line is None or not (suited and fitted) or table.empty:
         return {}
     there = at_standards(config)
     recorded = line.optics is not None and not line.optics_assumed
@@ -77,6 +83,17 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
     else:
         share = math.hypot(here, _shift(key, there, table, sigma))
     return {"mass_kda": share * np.abs(mass)}
+
+
+def _of_spheres(
+    key: str, config: Config, table: pd.DataFrame, sigma: float
+) -> Mapping[str, FloatArray]:
+    """Error of the masses of spheres, which follow from their pictures without standards."""
+    mass = np.abs(table["mass_kda"].to_numpy(float))
+    if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
+        return {}
+    share = abs(_shift(key, config, table, sigma, float(np.nanmedian(mass))))
+    return {"mass_kda": share * mass}
 
 
 def _alike(here: Config, there: Config) -> bool:
@@ -166,7 +183,12 @@ def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> 
 def _moved(key: str, config: Config, step: float) -> Config:
     """Move an input, and leave the stage where it is."""
     update: dict[str, Any] = {"calibration": None}
-    if key == "height_nm":
+    if key == "index":
+        index = np.sqrt(material(config.particle, config.optics.wavelength_nm).permittivity) + step
+        permittivity = float((index**2).real), float((index**2).imag)
+        particle = config.particle.model_copy(update={"permittivity": permittivity, "index": None})
+        update |= {"particle": particle}
+    elif key == "height_nm":
         height, optics = config.particle.nominal_height_nm + step, config.optics
         # the oil, which the nominal height and the focus set together, stays
         focus = optics.focus_nm + step * (1 - optics.n_immersion / optics.n_sample)

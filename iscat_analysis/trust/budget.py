@@ -16,7 +16,7 @@ from iscat_analysis.trust.systematic import Contribution
 SCALE = "scale of the model", "measure standards (iscat calibrate mass)"
 """What nobody knows of masses without standards, and what tells it."""
 
-SPHERES = "index and density of the spheres", "measure spheres of known diameter"
+SPHERES = "density of the spheres", "weigh some: a diameter does not need it"
 """The same of spheres, whose masses follow from their pictures with these."""
 
 _LEAST_WIDTH = 0.25  # of σ: a width beneath it is not worth a line

@@ -23,8 +23,15 @@ from iscat_analysis.bounds.experiment import bounds_report, plan
 from iscat_analysis.config import Config, configure
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
-from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients
+from iscat_analysis.optics.materials import material
+from iscat_analysis.optics.spheres import (
+    Sphere,
+    amplitudes,
+    coefficients,
+    scattering_length_nm,
+)
 from iscat_analysis.records import PARAMETERS
+from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
 from iscat_analysis.units import sphere_mass_kda
 
@@ -91,7 +98,8 @@ def of(scheme: str, **changes: Any) -> Config:
         "bounds": {"pixels": 25, "n_before": 50, "n_after": 50},
     }
     for section, keys in changes.items():
-        sections[section] = {k: v for k, v in (sections[section] | keys).items() if v is not None}
+        whole = sections.get(section, {}) | keys
+        sections[section] = {k: v for k, v in whole.items() if v is not None}
     return configure(sections)
 
 
@@ -284,6 +292,9 @@ BAD = [
     ({"particle": {"shell_nm": 5.0}}, 'needs model = "shell"'),
     ({"particle": {"model": "dipole"}}, "fits spheres"),
     ({"fit": {"mode": "mass"}}, "is for dipoles"),
+    ({"fit": {"mode": "track"}}, "needs a background that is known"),
+    ({"fit": {"mode": "track"}, "background": {"frames": "all"}}, "background that is known"),
+    ({"fit": {"mode": "track"}, "track": {"free": "mass"}}, 'needs track.free = "joint"'),
     ({"fit": {"diameter_range_nm": [300.0, 200.0]}}, "is empty"),
     ({"optics": {"calibrate": "always"}}, "is for dipoles"),
     ({"optics": {"n_sample": [1.33, 0.01]}}, "n_sample"),
@@ -443,3 +454,30 @@ def test_contrasts_that_are_all_wrong_make_masses_of_spheres_wrong_by_more() -> 
     told = respond.to_contrast(90.0, float(truth[3]))
     assert told == pytest.approx(found, rel=0.02)
     assert found > 1.2  # that of a dipole is 1
+
+
+def test_the_error_of_an_assumed_index_is_in_the_diameter() -> None:
+    """A small sphere scatters like V (m² − 1)/(m² + 2), and the picture holds V L."""
+    config = of("iscat", particle={"diameter_nm": 40.0, "height_nm": "contact"})
+    mass = config.particle.nominal_mass_kda
+    rows = {"n_before": [1000], "n_after": [1000], "z_nm": [20.0], "mass_kda": [mass],
+            "status": ["ok"]}  # fmt: skip
+    share = assumed_error("index", config, pd.DataFrame(rows))["mass_kda"][0] / mass
+
+    def strength(n: float) -> float:
+        return math.log((n**2 - 1.33**2) / (n**2 + 2 * 1.33**2))
+
+    n = material(config.particle, config.optics.wavelength_nm).permittivity.real ** 0.5
+    expected = strength(n + config.uncertainty.index) - strength(n)
+    assert share == pytest.approx(expected, rel=0.06)
+    assert assumed_error("wavelength_nm", config, pd.DataFrame(rows))["mass_kda"][0] > 0
+
+
+def test_the_scattering_length_of_a_small_sphere_is_that_of_its_polarisability() -> None:
+    optics = ia.Optics()
+    m2 = (1.46 / optics.n_sample) ** 2
+    expected = 10.0 * ((m2 - 1) / (m2 + 2)) ** (1 / 3)
+    small = Sphere(sphere_mass_kda(10.0, 2200.0), 2200.0, SILICA)
+    assert scattering_length_nm(small, optics) == pytest.approx(expected, rel=1e-2)
+    large = small.of_mass(sphere_mass_kda(250.0, 2200.0))
+    assert scattering_length_nm(large, optics) < 20 * expected  # 25 times if it were small

@@ -14,7 +14,7 @@ from report_factory import make_analysis
 from walkers import EXPOSURE_MS, RATE_HZ, fits_of, walk
 
 from iscat_analysis.records import FREE_PARAMETERS, TRACK_COLUMNS, free_parameters
-from iscat_analysis.report import films, render_report, track_figures, write_report
+from iscat_analysis.report import films, render_report, size_plane, track_figures, write_report
 from iscat_analysis.report.headline import NOT_A_MASS
 from iscat_analysis.report.tracks import tracks_headline
 from iscat_analysis.result import Result
@@ -39,6 +39,36 @@ def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) ->
     assert f"{len(analysis.tracks)} tracks of 200 fitted positions" in page
     written = pd.read_csv(out / "tracks.csv")
     assert list(written.columns) == list(TRACK_COLUMNS)
+
+
+def test_spheres_lie_on_lines_of_constant_index() -> None:
+    """The configured one runs through spheres whose two diameters are equal."""
+    analysis = make_analysis(40, "track")
+    assert not size_plane.has_plane(analysis)
+    assert analysis.tracks is not None
+    sizes = np.linspace(60.0, 180.0, len(analysis.tracks))
+    tracks = analysis.tracks.assign(
+        diameter_nm=sizes, sigma_diameter_nm=5.0, optical_diameter_nm=sizes,
+        sigma_optical_diameter_nm=1.0,
+    )  # fmt: skip
+    toml = """
+[particle]
+kind = "silica"
+model = "mie"
+[background]
+frames = [0, 9]
+[fit]
+mode = "track"
+"""
+    spheres = replace(analysis, tracks=tracks, config_toml=toml)
+    assert size_plane.has_plane(spheres)
+    (axes,) = size_plane.size_plane(spheres).axes
+    lines = [line for line in axes.lines if len(line.get_xdata()) == 200]
+    own = np.asarray(lines[-1].get_xydata(), dtype=float)
+    dots = [np.asarray(line.get_xydata()) for line in axes.lines if line.get_marker() == "o"]
+    found = np.concatenate(dots)
+    assert len(found) == len(sizes)
+    assert np.abs(np.interp(found[:, 0], *own.T) - found[:, 1]).max() < 0.05
 
 
 def test_films_that_would_fill_the_page_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
