@@ -110,6 +110,16 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _spheres_are_seen(self) -> Config:
+        for kind in self.fit.spheres:
+            if isinstance(kind, float) and abs(kind / self.optics.n_sample - 1) < INVISIBLE:
+                raise ValueError(
+                    f"fit.spheres: {kind:g} is the index of the sample, optics.n_sample = "
+                    f"{self.optics.n_sample:g}: such a sphere scatters no light"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _median_has_frames(self) -> Config:
         background, tracked = self.background, self.fit.mode == "track"
         if background.frames == ALL and not (tracked and self.optics.scheme != "darkfield"):

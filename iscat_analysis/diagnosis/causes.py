@@ -20,7 +20,9 @@ from iscat_analysis.inference.cause import likely_cause
 from iscat_analysis.inference.fit import OUTWARD
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.records import FloatArray, Status, Windows
+from iscat_analysis.optics.seated import VESICLE
+from iscat_analysis.optics.spheres import has_shells
+from iscat_analysis.records import NO_MODEL, FloatArray, Status, Windows
 from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent
 from iscat_analysis.units import count, listed
@@ -237,6 +239,29 @@ def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
         f"{100 * abs(share):.2g} % too {'light' if share > 0 else 'heavy'}; systematic_mass_kda "
         "has that; calibrate with standards as heavy as these"
     )
+
+
+def large_warning(config: Config, table: pd.DataFrame) -> str:
+    """Say which particles are no dipoles, and which spheres they are."""
+    large = table[table["flags"].fillna("").str.split(";").map(lambda f: Status.LARGE.value in f)]
+    if not len(large):
+        return ""
+    each = large["model"].value_counts()
+    known = ", ".join(f"{number} {name}" for name, number in each.items() if name != NO_MODEL)
+    text = (
+        f"{count(len(large), 'particle')} of {len(table)} {'is' if len(large) == 1 else 'are'} no "
+        "dipole, flagged large, without a mass and in no species"
+    )
+    text += f": fitted as spheres on the coverslip, {known}" if known else ""
+    poor = int(large["flags"].str.contains(Status.POOR_FIT.value).sum())
+    if poor:
+        untried = VESICLE in config.fit.spheres and not has_shells()
+        shells = '; vesicles were not tried: pip install "iscat-analysis[shell]"' if untried else ""
+        text += (
+            f"; {poor} of them, flagged poor_fit, no sphere describes well: is it of another "
+            f"material (fit.spheres), no sphere, or off the coverslip (mode size)?{shells}"
+        )
+    return text
 
 
 def sign_warning(config: Config, table: pd.DataFrame) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
-from iscat_analysis.fitting.large import brightest_place, with_spheres, without_mass
+from iscat_analysis.fitting.large import IN_VAIN, brightest_place, with_spheres, without_mass
 from iscat_analysis.fitting.regions import (
     Region,
     noise_cumulants,
@@ -46,7 +46,6 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_par
 MAX_ROUNDS = 8
 """Rounds of search; each takes the particles found so far off the image."""
 
-_IN_VAIN = 8  # bright places, after which no others are tried if a sphere describes none
 _SWEEPS = 2  # fits of everything with everything else in place, after the last round; at least
 _MOST_SWEEPS = 16  # two fits that share the light of one particle converge slowly
 # Share of the χ² in excess that a particle explains which is tried among others
@@ -121,7 +120,7 @@ def _large_ones(
     shape = (windows.after_e.shape[0], windows.after_e.shape[1])
     seen: list[tuple[float, float]] = []
     vain = 0
-    while vain < _IN_VAIN:
+    while vain < IN_VAIN:
         explained = context.left(total_signal(context, shape, found))
         whole = search_likelihood(context, windows, explained)
         place = brightest_place(whole, explained, seen, context.roi_px / 4)

@@ -19,8 +19,10 @@ from iscat_analysis.records import FloatArray, Status, verdict
 
 AnyFitted = TypeVar("AnyFitted", bound=Fitted)
 
+IN_VAIN = 8
+"""Particles, the brightest first, after which no others are tried if none is a sphere."""
+
 _BRIGHT_SNR = 50.0  # below which no dipole leaves enough over of a sphere to be seen
-_IN_VAIN = 8  # particles, the brightest first, after which no others are tried if none is a sphere
 
 
 def with_spheres(
@@ -50,8 +52,8 @@ def with_spheres(
         and context.spheres_of(event.likelihood.model)
     ]
     doubtful.sort(key=lambda index: -events[index].snr)
-    for first in range(0, len(doubtful), _IN_VAIN):
-        batch = doubtful[first : first + _IN_VAIN]
+    for first in range(0, len(doubtful), IN_VAIN):
+        batch = doubtful[first : first + IN_VAIN]
         found = list(pool.map(tried, [events[i] for i in batch]))
         for index, event in zip(batch, found, strict=True):
             if event is not None:

@@ -21,7 +21,9 @@ from iscat_analysis.inference.pairs import pair_of
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.pieces.regions import line_of
 from iscat_analysis.records import (
+    DIPOLE,
     FRAME_COLUMN,
+    NO_MODEL,
     Clip,
     EventView,
     FloatArray,
@@ -132,9 +134,9 @@ def _line(
         quantum=None if event.sphere else quantum.get(event.fit.estimate[2]),
     )  # fmt: skip
     if context.spheres_of(context.model) and event.sphere is None:
-        line["model"] = "none" if Status.POOR_FIT in event.flags else "dipole"
+        line["model"] = NO_MODEL if Status.POOR_FIT in event.flags else DIPOLE
         if Status.LARGE in event.flags:
-            line |= {"model": "none"} | dict.fromkeys(MASSES, math.nan)
+            line |= {"model": NO_MODEL} | dict.fromkeys(MASSES, math.nan)
     if event.half_width is not None:
         line[FRAME_COLUMN] = event.half_width
     if context.config.fit.pairs:

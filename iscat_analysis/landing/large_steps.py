@@ -6,18 +6,19 @@ The search for dipoles would take the rings of a large particle for steps of the
 from __future__ import annotations
 
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.large import IN_VAIN
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.inference.recognition import may_be_large, recognised
+from iscat_analysis.inference.recognition import model_of, recognised
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.optics.seated import SeatedModel
-from iscat_analysis.records import Candidate, FitResult, Mapper
+from iscat_analysis.records import Candidate, Mapper
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
+from iscat_analysis.search.residue import Described
 from iscat_analysis.search.sliding import Chunk, StepFrame
 
-_MOST = 64  # bright steps of a chunk that are looked at
+_MISSED = 0.05  # share of the light of a sphere of 30 nm and more that a dipole does not describe
 _BRIGHT_SNR = 50.0  # below which no dipole leaves enough over of a sphere to be seen
 
 
@@ -33,27 +34,43 @@ def large_steps(
         roi_px=context.roi_px, most=0, mapper=mapper,
     )  # fmt: skip
     stride = int(chunk.edges[1] - chunk.edges[0])
-    steps = []
-    for step in bright[:_MOST]:
-        if step.snr < _BRIGHT_SNR:
+    steps: list[Step] = []
+    vain = 0
+    for step in bright:
+        if step.snr < _BRIGHT_SNR or vain == IN_VAIN:
+            break
+        vain += 1
+        landing = _likelihood_of(context, chunk, step, 1)
+        nominal = context.model.material.mass_kda
+        start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
+        z_range = context.config.fit.z_range_nm
+        dipole = fit_particle(landing, start, context.mode, z_range, level=True)
+        missed = Described.of(dipole.snr, dipole.chi2_reduced, landing.n_pixels).excess
+        if missed < _MISSED * dipole.snr**2:
             continue
         found = [
-            (*sphere, sign)
+            (sign, *sphere)
             for sign in (1, -1)
-            for sphere in [_sphere_of(context, chunk, step, sign)]
+            for likelihood in [landing if sign > 0 else _likelihood_of(context, chunk, step, sign)]
+            for sphere in [
+                recognised(
+                    likelihood, dipole, context.spheres_of(likelihood.model), z_range, level=True
+                )
+            ]
             if sphere is not None
         ]
         if found:
-            seated, fit, sign = max(found, key=lambda one: one[1].log_likelihood)
+            sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
             at = StepFrame.undated(step.frame, stride)
-            steps.append(neighbours.draw_sphere(sign, at, seated, fit))
+            steps.append(neighbours.draw_sphere(sign, at, model_of(seated), fit))
+            vain = 0
     return steps
 
 
-def _sphere_of(
+def _likelihood_of(
     context: AnalysisContext, chunk: Chunk, step: BrightStep, sign: int
-) -> tuple[SeatedModel, FitResult] | None:
-    """Fit a sphere that lands or leaves; None if a dipole describes the step as well."""
+) -> Likelihood:
+    """Make the likelihood of a step that lands or leaves."""
     grid = PixelGrid.region(step.rows, step.columns, context.pixel_nm)
     before, after, ratio = step.before_e, step.after_e, step.power_ratio
     frames = [step.n_before, step.n_after]
@@ -62,19 +79,8 @@ def _sphere_of(
         frames.reverse()
     read = chunk.camera.read_variance_e2(chunk.shape)[slice(*step.rows), slice(*step.columns)]
     place = step.x_px * context.pixel_nm, step.y_px * context.pixel_nm
-    likelihood: Likelihood = conditional(
+    return conditional(
         context.model_at(*place, step.frame), grid, before, after, ratio,
         read_variance_before_e2=frames[0] * read, read_variance_after_e2=frames[1] * read,
         masked=~step.usable,
     )  # fmt: skip
-    nominal = context.model.material.mass_kda
-    start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
-    z_range = context.config.fit.z_range_nm
-    fit = fit_particle(likelihood, start, context.mode, z_range, level=True)
-    if not may_be_large(likelihood, fit):
-        return None
-    models = context.spheres_of(likelihood.model)
-    found = recognised(likelihood, fit, models, z_range, level=True)
-    if found is None or not isinstance(found[0].model, SeatedModel):
-        return None
-    return found[0].model, found[1]

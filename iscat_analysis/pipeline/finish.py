@@ -14,6 +14,7 @@ from iscat_analysis.config import config_to_toml
 from iscat_analysis.diagnosis.causes import (
     fixed_height_warning,
     landing_rate_warning,
+    large_warning,
     line_warning,
     nonlinearity_warning,
     residue_warning,
@@ -94,6 +95,7 @@ def make_analysis(
         line_warning(config, table),
         nonlinearity_warning(scale, table),
         sign_warning(config, table),
+        large_warning(config, table),
         reference_warning(config, table),
         landing_rate_warning(table) if ready.background_mode == "sliding" else "",
         residue_warning(table, found.summary["window_frames"])

@@ -115,6 +115,9 @@ def reported_rows(
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)
     table = make_rows(fits, columns)
+    if mode == "mass":  # what is no dipole has no mass, and no error of one
+        kinds = table.columns.intersection(["repeat_mass_kda", "systematic_mass_kda"])
+        table[kinds] = table[kinds].where(table["mass_kda"].notna(), np.nan, axis=0)
     if config.fits_sizes:
         table = with_diameters(table, config.particle.density)
     unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None

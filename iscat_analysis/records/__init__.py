@@ -19,10 +19,12 @@ from iscat_analysis.records.arrays import (
 )
 from iscat_analysis.records.columns import (
     BUDGET_COLUMNS,
+    DIPOLE,
     EVENT_COLUMNS,
     EVENTS,
     FRAME_COLUMN,
     FREE_PARAMETERS,
+    NO_MODEL,
     PARAMETERS,
     REPEAT_COLUMNS,
     TRACK_COLUMNS,
@@ -51,10 +53,12 @@ from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdi
 
 __all__ = [
     "BUDGET_COLUMNS",
+    "DIPOLE",
     "EVENTS",
     "EVENT_COLUMNS",
     "FRAME_COLUMN",
     "FREE_PARAMETERS",
+    "NO_MODEL",
     "PARAMETERS",
     "REPEAT_COLUMNS",
     "SEVERITY",

@@ -80,6 +80,9 @@ def _of_each_parameter(
     )  # fmt: skip
 
 
+DIPOLE, NO_MODEL = "dipole", "none"
+"""Values of the column ``model`` beside the spheres of ``fit.spheres``."""
+
 _PIXEL = ", 0-based; an integer is a pixel's centre [px]"
 
 EVENTS = (
