@@ -25,7 +25,6 @@ from iscat_analysis.records import (
     make_rows,
     with_diameters,
 )
-from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
@@ -86,9 +85,12 @@ def reported_rows(
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    unfit = (
-        mass_error(found.optics) if mode == "track" else misfit_error(fits, found.context.roi_px**2)
-    )
+    if mode == "track":
+        from iscat_analysis.tracking.tracked_optics import mass_error
+
+        unfit = mass_error(found.optics)
+    else:
+        unfit = misfit_error(fits, found.context.roi_px**2)
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
     shared = contributions(
         config, fits, unfit, found.context.model.scale, shifts, camera, threshold
