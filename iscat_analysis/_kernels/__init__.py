@@ -81,10 +81,11 @@ def kernel(
 ) -> Callable[[Callable[..., Any]], Any]:
     """Compile a function with Numba at its first call, and store the compiled code.
 
-    The function runs without the interpreter's lock, and divides by zero like NumPy.
+    The function runs without the interpreter's lock, and divides by zero like NumPy.  No entry for
+    callers in C is compiled, which nobody calls and which takes a twentieth of the time.
     """
     decorator: Callable[[Callable[..., Any]], Any] = njit(
         cache=not NO_ROOM, nogil=True, error_model="numpy",
-        fastmath=fastmath, forceinline=forceinline, _nrt=_nrt,
+        fastmath=fastmath, forceinline=forceinline, _nrt=_nrt, no_cfunc_wrapper=True,
     )  # fmt: skip
     return decorator

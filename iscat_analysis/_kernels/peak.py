@@ -81,7 +81,7 @@ def largest_signal(
         for k in range(intervals):
             top = max(top, abs(rough[extreme, k]))
     fine, f = np.empty(padded(per_step)), np.empty((DISTANCE + 1, padded(per_step)))
-    at = best = 0
+    at = best = int(np.int64(0))  # a literal 0 has its own type, for which more is compiled
     least, top = _NEAR * top, -1.0
     for k in range(intervals):
         near = False

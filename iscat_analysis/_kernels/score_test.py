@@ -263,7 +263,7 @@ def mode_statistic(
     Shapes: `x, y` (nx,), `theta` (2 or more,), `free` (5,).
     """
     along, across = _hermite(x, theta[0], waist, order), _hermite(y, theta[1], waist, order)
-    fitted = 0
+    fitted = int(np.int64(0))  # a literal 0 has its own type, for which more is compiled
     for i in range(free.size):
         fitted += free[i]
     size = fitted + (order + 1) * (order + 2) // 2

@@ -18,8 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import fft, sparse
-from scipy.sparse.linalg import spsolve
+from scipy import fft
 
 from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.regions import Region
@@ -165,6 +164,9 @@ def ring_average(
     Shapes: `contrast, weight` (ny, nx), result (ny, nx).
     """
     y, x = (np.arange(n) - c for n, c in zip(contrast.shape, centre, strict=True))
+    from scipy import sparse
+    from scipy.sparse.linalg import spsolve
+
     radius = np.hypot(y[:, None], x[None, :]).ravel() / _KNOT_PX
     angle = np.arctan2(y[:, None], x[None, :] + 0 * y[:, None]).ravel()
     waves = [np.ones(angle.size)]

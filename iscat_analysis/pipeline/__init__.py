@@ -1,7 +1,7 @@
 """The main job: load → calibrate → background → detect → fit → posterior → bounds → report.
 
-`analyse` does it in this order.  `prepare` loads and calibrates.  One of `FINDERS`, chosen by
-``background.method`` alone (`background_mode`), measures the background, searches, fits, samples
+`analyse` does it in this order.  `prepare` loads and calibrates.  What `finder` gives, chosen
+by ``background.method`` alone (`background_mode`), measures the background, searches, fits, samples
 posteriors and computes bounds.  `make_analysis` makes the table, and describes tracks and species.
 
 An event is first a candidate, then `Fitted` while its neighbours are still being found, then an
@@ -11,7 +11,7 @@ of its errors depend on all of them (`rows`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -30,26 +30,28 @@ from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, notify_nobody
 from iscat_analysis.inference.checks import number_in, path_in
-from iscat_analysis.landing.find import find_landings
 from iscat_analysis.movie import Stack, open_stack, path_beside
-from iscat_analysis.pipeline.before_after import find_before_after
 from iscat_analysis.pipeline.finish import make_analysis
 from iscat_analysis.pipeline.injection import injected
 from iscat_analysis.pipeline.prepare import prepare
 from iscat_analysis.records import Analysis, Progress, silent
 from iscat_analysis.report import EVENT_FIGURES, write_report
 from iscat_analysis.report.output import check_output, claim_output
-from iscat_analysis.tracking.find import find_moving
-
-FINDERS: Mapping[BackgroundMode, Callable[[Prepared, Run], DetectionResult]] = {
-    "fixed": find_before_after,
-    "sliding": find_landings,
-    "tracks": find_moving,
-}
-"""Background, search and fits of a movie, by which of its frames stand against which."""
 
 FEW_FIGURES = 2
 """Events of a landing movie that are drawn for print; the page shows hundreds."""
+
+
+def finder(mode: BackgroundMode) -> Callable[[Prepared, Run], DetectionResult]:
+    """Import background, search and fits of one kind of movie; each takes a while to load."""
+    match mode:
+        case "fixed":
+            from iscat_analysis.pipeline.before_after import find_before_after as find
+        case "sliding":
+            from iscat_analysis.landing.find import find_landings as find
+        case "tracks":
+            from iscat_analysis.tracking.find import find_moving as find
+    return find
 
 
 def fit_stack(
@@ -162,7 +164,7 @@ def analyse(
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
         ready = prepare(movie, config, run)  # load, calibrate
         # background, detect, fit, posterior, bounds
-        found = FINDERS[ready.background_mode](ready, run)
+        found = finder(ready.background_mode)(ready, run)
         with parts_kept(None if ready.background_mode == "fixed" else partial):
             extra, stopped = injected(ready, run, found)
             stopped = stopped or found.interrupted

@@ -47,7 +47,6 @@ from iscat_analysis.records import (
     verdict,
 )
 from iscat_analysis.threads import threads
-from iscat_analysis.tracking.find import track_frames
 from iscat_analysis.units import count
 
 CHANGES = 4.0
@@ -66,6 +65,8 @@ def find_before_after(ready: Prepared, run: Run) -> DetectionResult:
     movie, camera = ready.steady, ready.camera
     with threads(context.config.compute.workers) as pool:
         if context.mode == "track":
+            from iscat_analysis.tracking.find import track_frames
+
             found = track_frames(
                 context, movie, camera, windows, summary,
                 check=checked(movie, camera), pool=pool, progress=run.progress,

@@ -41,8 +41,6 @@ from iscat_analysis.records import (
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
-from iscat_analysis.tracking.common_motion import warnings_of
-from iscat_analysis.tracking.tracks import make_films, tracks_of
 from iscat_analysis.trust.budget import explained_kda, width_warning
 from iscat_analysis.trust.empirical_spread import spread_verdict
 from iscat_analysis.trust.uneven_reference import reference_warning
@@ -124,6 +122,9 @@ def make_analysis(
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     if found.followed is not None:
+        from iscat_analysis.tracking.common_motion import warnings_of
+        from iscat_analysis.tracking.tracks import make_films, tracks_of
+
         followed = found.followed
         tracks, track_summary = tracks_of(
             context, table, followed.windows,

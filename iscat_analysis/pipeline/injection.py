@@ -30,7 +30,6 @@ from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run, notify_nobody
-from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.rows import reported_rows
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
@@ -169,6 +168,8 @@ def inject_and_recover(
     executor: Executor | None = None,
 ) -> dict[str, Any]:
     """Add known particles to a movie, analyse it again and compare."""
+    from iscat_analysis.landing.find import analyse_landings
+
     frames = fitted_frames(movie, config)
     window = int(result.summary["window_frames"])
     fixed = config.background.model_copy(update={"window_frames": window})

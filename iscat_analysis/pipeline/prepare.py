@@ -42,7 +42,6 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
 from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread
-from iscat_analysis.tracking.tracks import judge_times
 
 _FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field
 
@@ -60,6 +59,8 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     span = fitted_frames(movie, config, config.background.recorded)
     tracked = config.fit.mode == "track"
     if tracked:
+        from iscat_analysis.tracking.tracks import judge_times
+
         for note in judge_times(config, tracked_frames(movie, config), movie.name):
             run.warn(note)
     if config.optics.psf == "measured":

@@ -28,7 +28,6 @@ from iscat_analysis.records import (
     make_rows,
     with_diameters,
 )
-from iscat_analysis.tracking.tracked_optics import mass_error
 from iscat_analysis.trust.budget import SCALE, SPHERES, budget_of
 from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise, rise_message
 from iscat_analysis.trust.empirical_spread import measure_spread, measured_scale, repeat_columns
@@ -102,9 +101,12 @@ def reported_rows(
     columns: dict[str, pd.Series | FloatArray] = {
         name: fits[name] * factor for name, factor in scale.items()
     }
-    unfit = mass_error(optics)
-    if mode != "track":
-        unfit = max(unfit, misfit_error(fits, found.context.roi_px**2))
+    if mode == "track":
+        from iscat_analysis.tracking.tracked_optics import mass_error
+
+        unfit = mass_error(optics)
+    else:
+        unfit = misfit_error(fits, found.context.roi_px**2)
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
     doubt = None if learned or "doubt" not in optics else OpticsCovariance(**optics["doubt"])
     shared = contributions(

@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import ScaledTranslation
 
 from iscat_analysis.records import Analysis
 from iscat_analysis.report.style import BLUE, GREY, PURPLE, VERMILLION, new_figure
 
 _ROW, _EDGES = 0.72, 0.75  # height of a row, and what axis and legend take [inches]
+_NUMBERS = 0.7  # room for the numbers beside a row [inches]; to measure it takes half of drawing
 _NARROWEST = 0.004  # of the axis, of an interval that is seen
 
 Row = tuple[str, Callable[[Axes], None]]
@@ -37,11 +39,12 @@ def movie_figure(analysis: Analysis) -> Figure:
                 alpha=0.2 if hidden else 0.3, label="partly hidden" if hidden else "left out",
             )  # fmt: skip
         axes.set_ylabel(label, rotation=0, ha="right", va="center")
+        beside = ScaledTranslation(-_NUMBERS, 0, figure.dpi_scale_trans)
+        axes.yaxis.set_label_coords(0, 0.5, transform=axes.transAxes + beside)
         axes.yaxis.set_major_locator(MaxNLocator(3))
     panels[-1].yaxis.set_major_locator(MaxNLocator(3, integer=True))
     panels[-1].set(xlabel="frame", xlim=(first, last))
     panels[-1].xaxis.set_major_locator(MaxNLocator(7, integer=True))
-    figure.align_ylabels()
     marks: dict[str, Any] = {}
     for axes in panels:
         marks |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))

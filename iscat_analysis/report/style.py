@@ -91,6 +91,7 @@ def publish(
     with mpl.rc_context(STYLE):
         for name, figure in figures:
             if (engine := figure.get_layout_engine()) is not None:
+                _place_empty_names(figure)
                 engine.execute(figure)
                 # laid out once; with an engine, or "none", each file would be drawn twice
                 figure.set_layout_engine(None)
@@ -114,6 +115,14 @@ def _write_png(figure: Figure, path: Path, dpi: int) -> None:
     canvas.draw()
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     image.save(path, format="png", dpi=(dpi, dpi), compress_level=1)
+
+
+def _place_empty_names(figure: Figure) -> None:
+    """Put the names of axes without a name inside them, where Matplotlib looks for no place."""
+    for axes in figure.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if not axis.label.get_text():
+                axis.set_label_coords(0.5, 0.5)
 
 
 def _hold_labels(figure: Figure) -> None:
