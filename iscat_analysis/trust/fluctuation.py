@@ -135,9 +135,10 @@ class Fluctuation:
         """Message for the user; empty where it is not seen."""
         if not self.is_seen:
             return ""
+        frames = float(f"{self.frames:.2g}")
         return (
             f"contrasts fluctuate by {100 * self.relative:.2g} ± {100 * self.relative_se:.1g} % "
-            f"while particles are there, over some {self.frames:.2g} frames: sigma_mass_kda has "
+            f"while particles are there, over some {frames:g} frames: sigma_mass_kda has "
             "what is left of that in the mean of an event's frames, beyond the noise of the light"
         )
 

@@ -327,6 +327,7 @@ def test_a_fluctuation_slower_than_windows_shows_in_the_frames_after_them(tau: f
     for seed in range(12):
         found, errors = breathing(0.05, tau, (MASS_KDA,) * 16, seed)
         assert found.is_seen
+        assert "e+" not in found.message
         pulls.extend(errors / np.sqrt(9.0 + found.variance_kda2))
         without.extend(errors / 3.0)
     assert np.std(without) > 2.5  # the control
