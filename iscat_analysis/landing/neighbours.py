@@ -21,7 +21,7 @@ import numpy as np
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.pattern import MovingPattern
+from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, FloatArray
@@ -235,11 +235,12 @@ class Neighbours:
             )
         )
         reach = np.array([self._half(s.start) for s in steps]) + self._roi_px / 2 + 2
+        windows = SPAN if self._pattern is None else self._pattern.windows
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
-            near = (dt < 3 * self._window) & (np.maximum(dx, dy) < reach)
+            near = (dt < (1 + windows) * self._window) & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
             near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)

@@ -44,7 +44,9 @@ def _image(y_px: float, x_px: float, frames: tuple[float, float]) -> ParticleIma
     return replace(image, grid=grid, frames=frames, mass_kda=500.0, **place)
 
 
-@pytest.mark.parametrize("dark", [slice(0), slice(330, 380), slice(180, 200), slice(395, 421), slice(160, 172)])
+@pytest.mark.parametrize(
+    "dark", [slice(0), slice(330, 380), slice(180, 200), slice(395, 421), slice(160, 172)]
+)
 def test_the_frame_of_a_jump_is_found_with_dark_frames_around(dark: slice) -> None:
     movie: Any = _movie(dark)
     images = [
