@@ -110,9 +110,13 @@ class MovingPattern:
         self._centres = (edges[:-1] + edges[1:] - 1) / 2
         mover = Mover((chunk.shape[0], chunk.shape[1]))
         spectra = np.stack(list(mapper(partial(self._at_rest, mover), range(len(self._blocks)))))
-        self._slope_variance = 0.0
         self._slope_variance = self._variance_of_slopes(mover, spectra)
         self.contrast = self._contrasts(mover, spectra, mapper)
+
+    @property
+    def windows(self) -> int:
+        """Windows on either side of a step whose frames make the pattern."""
+        return SLOPE_SPAN if self._slope_variance else SPAN
 
     def shift(self, frames: slice) -> FloatArray:
         """Mean shift (y, x) of the light of frames relative to the chunk [pixels]."""

@@ -21,7 +21,7 @@ import numpy as np
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.pattern import MovingPattern
+from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.seated import SeatedModel
@@ -259,11 +259,13 @@ class Neighbours:
             )
         )
         reach = np.array([self.reach_px(s) for s in steps])
+        windows = SPAN if self._pattern is None else self._pattern.windows
         seen, bound = [], []
         for i in range(len(steps)):
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
-            near = (dt < max(3 * self._window, frames)) & (np.maximum(dx, dy) < reach)
+            close = dt < max((1 + windows) * self._window, frames)
+            near = close & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
             near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
