@@ -46,9 +46,6 @@ def find_stray_light(changes: Changes, window: int) -> float:
         parts: FloatArray = rows @ values @ columns.T
         return parts.reshape(*values.shape[:-2], -1)
 
-    sums = changes.sums_e
-    each = sums * (light.sum() / sums.sum(axis=(2, 3), keepdims=True)) - light
-    change = each[:, 1] - each[:, 0]
     held, once, twice = summed(light), summed(light * more), summed(light * more**2)
     pattern_power = np.maximum(twice - np.square(once) / np.where(held > 0, held, 1.0), 0.0)
     if not (pattern_power > 0).any():
@@ -65,8 +62,16 @@ def find_stray_light(changes: Changes, window: int) -> float:
         changes.noises
     ):
         return 0.0
-    even = summed(change)[:, lit]
-    seen = summed(change * more)[:, lit] - even * mean
+    bright = np.where(light > 0, light, 1.0)
+    levels, lifts, squares = [], [], []
+    for sums in changes.sums_e:  # one pair after the other, to save memory
+        each = sums * (light.sum() / sums.sum(axis=(1, 2), keepdims=True)) - light
+        levels.append(summed(each)[:, lit])
+        lifts.append(summed(each * more)[:, lit])
+        squares.append(summed(np.square(each[1] - each[0]) / bright)[lit])
+    level, lifted = np.array(levels), np.array(lifts)
+    even = level[:, 1] - level[:, 0]
+    seen = lifted[:, 1] - lifted[:, 0] - even * mean
     added = seen.sum(axis=1, keepdims=True) / pattern_power.sum()
     rest = seen - added * pattern_power
     spread = np.square(rest) / np.maximum(
@@ -82,11 +87,10 @@ def find_stray_light(changes: Changes, window: int) -> float:
         return 0.0
     # in variances of noise, of the pixels of a part
     noises = changes.noises[:, None]
-    squares = summed(np.square(change) / np.where(light > 0, light, 1.0))[:, lit] / noises
     gain = np.square(added) * pattern_power / noises
-    left = squares - np.square(even) / held[lit] / noises - gain - (pixels - 1)
+    left = np.array(squares) / noises - np.square(even) / held[lit] / noises - gain - (pixels - 1)
     doubt = _RESIDUAL_SIGMAS * math.sqrt(2 * float(pixels.mean()) / left.size)
     if np.median(left) > np.median(gain) + doubt:
         return 0.0
-    here = summed(each * more)[..., lit] - summed(each)[..., lit] * mean
+    here = lifted - level * mean
     return float(np.ptp(here.sum(axis=-1))) / float(pattern_power.sum())
