@@ -111,7 +111,8 @@ def common_sizes(
         best_height[f] = np.argmax(values, axis=1)
         total += values.max(axis=1)
     around = np.pad(total, 1, constant_values=-np.inf)
-    peaks = np.flatnonzero((total >= around[:-2]) & (total >= around[2:]))
+    tops = (total >= around[:-2]) & (total >= around[2:])
+    peaks = np.flatnonzero(tops & np.isfinite(total))
     found: list[CommonSize] = []
     for k in sorted(peaks.tolist(), key=lambda k: -total[k])[:FOLLOWED]:
         start = np.column_stack([places[:, :2], heights[best_height[:, k]]])
@@ -119,7 +120,9 @@ def common_sizes(
         one = fit_common_size(
             likelihoods, model, start, z_range_nm, mass_kda=float(masses[k]), least=best - GIVEN_UP
         )
-        if not any(abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found):
+        if one is not None and not any(
+            abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found
+        ):
             found.append(one)
     return sorted(found, key=lambda one: (not one.converged, -one.log_likelihood))
 
@@ -134,8 +137,10 @@ def fit_common_size(
     index: float | None = None,
     motion: tuple[float, float] | None = None,
     least: float = -math.inf,
-) -> CommonSize:
+) -> CommonSize | None:
     """Fit mass and places of all frames, from a start; the index too where one is given.
+
+    None where the start has no likelihood, as where light would be negative.
 
     `motion` is 1/d of the hydrodynamic diameter and its error [1/nm], a prior that is normal in D.
 
@@ -145,6 +150,8 @@ def fit_common_size(
     common = np.array([mass_kda, index] if index is not None else [mass_kda])
     rows = np.clip(places, [-np.inf, -np.inf, z_range_nm[0]], [np.inf, np.inf, z_range_nm[1]])
     here = _gathered(likelihoods, model, rows, common, z_range_nm, motion)
+    if not math.isfinite(here.value):
+        return None
     converged = False
     for _ in range(_PASSES):
         step, moves, gain = _scoring_step(here)

@@ -127,7 +127,7 @@ def size_probability(
             own.append(
                 abs(one.theta[3] - best) <= max(OTHER_SIZE * sigma_kda, OTHER_SIZE_SHARE * best)
             )
-    if not weights:
+    if not np.isfinite(weights).any():
         return math.nan
     shares = np.exp(np.array(weights) - max(weights))
     return float(shares[own].sum() / shares.sum())
@@ -137,10 +137,13 @@ def _log_weight(likelihood: Likelihood, optimum: Optimum, box: Box) -> float:
     """Logarithm of the posterior weight of an optimum, in its free parameters and the diameter."""
     free = np.flatnonzero(box.free)
     _, score, fisher = likelihood.score_fisher(optimum.theta)
+    sign, log_information = np.linalg.slogdet(fisher[np.ix_(free, free)] / (2 * math.pi))
+    if not (sign > 0 and math.isfinite(log_information)):
+        return -math.inf
     covariance = np.linalg.inv(fisher[np.ix_(free, free)])
     step = covariance @ score[free]  # to the top of the normal, which a wall may hide
     value = optimum.log_likelihood + 0.5 * float(score[free] @ step)
-    value += 0.5 * float(np.linalg.slogdet(2 * math.pi * covariance)[1])
+    value -= 0.5 * float(log_information)
     if box.free[2]:
         at = int(np.flatnonzero(free == 2)[0])
         z, spread = optimum.theta[2] + step[at], math.sqrt(covariance[at, at])

@@ -109,7 +109,11 @@ def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
 
 def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
     """Put the diameters of spheres in the place of their masses."""
-    names = [name for kind in ("sigma", "crb", "qcrb") if (name := f"{kind}_mass_kda") in table]
+    names = [
+        name
+        for kind in ("sigma", "crb", "qcrb", "systematic")
+        if (name := f"{kind}_mass_kda") in table
+    ]
     sizes = {name: table[name.replace("mass_kda", "diameter_nm")] for name in names}
     return table.assign(**sizes, mass_kda=table["diameter_nm"])
 

@@ -78,6 +78,8 @@ def sphere_track(
         np.array([event.place[:3] for event in used]),
         context.config.fit.z_range_nm,
     )
+    if not sizes:
+        return SphereTrack(averaged, [*events], [], np.zeros((0, 10)))
     near = replace(averaged, mass_range_kda=_range_around(averaged, sizes))
     start_kda = sizes[0].mass_kda
 

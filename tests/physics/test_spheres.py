@@ -28,7 +28,8 @@ from iscat_analysis.optics.spheres import (
     coefficients,
     scattering_length_nm,
 )
-from iscat_analysis.records import PARAMETERS
+from iscat_analysis.records import PARAMETERS, with_diameters
+from iscat_analysis.report.headline import as_diameters
 from iscat_analysis.trust.assumed import assumed_error
 from iscat_analysis.trust.response import response_of
 from iscat_analysis.units import sphere_mass_kda
@@ -413,3 +414,13 @@ def test_the_scattering_length_of_a_small_sphere_is_that_of_its_polarisability()
     assert scattering_length_nm(small, optics) == pytest.approx(expected, rel=1e-2)
     large = small.of_mass(sphere_mass_kda(250.0, 2200.0))
     assert scattering_length_nm(large, optics) < 20 * expected  # 25 times if it were small
+
+
+def test_no_error_of_a_mass_is_shown_as_that_of_a_diameter() -> None:
+    kinds = ("sigma", "crb", "qcrb", "systematic")
+    columns = {f"{kind}_mass_kda": [3e3] for kind in kinds} | {"mass_kda": [1e5]}
+    counted = {"frame": [0], "n_before": [9], "n_after": [9]}
+    table = with_diameters(pd.DataFrame(columns | counted), 2200.0)
+    shown = as_diameters(table)
+    for kind in kinds:  # 3 % of a mass is 1 % of a diameter
+        assert shown[f"{kind}_mass_kda"][0] == pytest.approx(0.01 * shown["mass_kda"][0])

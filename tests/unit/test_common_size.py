@@ -100,6 +100,7 @@ def test_index_and_diameter_need_the_motion_of_a_small_sphere() -> None:
     motion = 1 / 80.0, 0.02 / 80.0
     start = {"mass_kda": 1.1 * model.material.mass_kda, "index": 1.44}
     joint = fit_common_size(likelihoods, model, places, Z_RANGE_NM, **start, motion=motion)
+    assert joint is not None
     assert joint.converged
     sigma = math.sqrt(joint.covariance()[1, 1])
     assert abs(joint.index - 1.46) < 4 * sigma
