@@ -22,7 +22,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.seated import VESICLE
 from iscat_analysis.optics.spheres import has_shells
-from iscat_analysis.records import NO_MODEL, FloatArray, Status, Windows
+from iscat_analysis.records import FloatArray, Status, Windows
 from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent
 from iscat_analysis.units import count, listed
@@ -247,19 +247,19 @@ def large_warning(config: Config, table: pd.DataFrame) -> str:
     if not len(large):
         return ""
     each = large["model"].value_counts()
-    known = ", ".join(f"{number} {name}" for name, number in each.items() if name != NO_MODEL)
+    known = ", ".join(f"{number} {name}" for name, number in each.items())
     text = (
         f"{count(len(large), 'particle')} of {len(table)} {'is' if len(large) == 1 else 'are'} no "
-        "dipole, flagged large, without a mass and in no species"
+        f"dipole, flagged large, and fitted as spheres on the coverslip ({known}), without a mass "
+        "and in no species"
     )
-    text += f": fitted as spheres on the coverslip, {known}" if known else ""
     poor = int(large["flags"].str.contains(Status.POOR_FIT.value).sum())
     if poor:
         untried = VESICLE in config.fit.spheres and not has_shells()
         shells = '; vesicles were not tried: pip install "iscat-analysis[shell]"' if untried else ""
         text += (
-            f"; {poor} of them, flagged poor_fit, no sphere describes well: is it of another "
-            f"material (fit.spheres), no sphere, or off the coverslip (mode size)?{shells}"
+            f"; {poor} of them, flagged poor_fit, no sphere describes quite: another material "
+            f"(fit.spheres), no sphere, or not on the coverslip (mode size){shells}"
         )
     return text
 

@@ -83,10 +83,11 @@ class AnalysisContext:
         return likelihood if prior is None else replace(likelihood, prior=prior)
 
     def spheres_of(self, model: ForwardModel) -> tuple[SeatedModel, ...]:
-        """Give the spheres that a particle may be in the microscope of a dipole's model."""
+        """Give the spheres that a particle among proteins may be, in a model's microscope."""
         fit, optics = self.config.fit, self.config.optics
         absolute = optics.convention == "exact" and optics.emission == "reciprocal"
-        if fit.mode != "mass" or not absolute or model.is_measured or self.additive:
+        proteins = fit.mode == "mass" and self.config.particle.kind == "protein"
+        if not (proteins and absolute) or model.is_measured or self.additive:
             return ()
         if model is self.model:
             return self._near_spheres

@@ -18,7 +18,7 @@ import numpy as np
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
-from iscat_analysis.fitting.large import IN_VAIN, brightest_place, with_spheres, without_mass
+from iscat_analysis.fitting.large import IN_VAIN, brightest_place, with_spheres
 from iscat_analysis.fitting.regions import (
     Region,
     noise_cumulants,
@@ -100,7 +100,7 @@ def fit_field(
     if doubtful and not starts:
         lobes = _fit_all(context, windows, doubtful, kept, pool, first=len(kept))
         lobes = [e for e in lobes if e.snr > least and _wanted(context, e)]
-    judged = _judged(context, windows, [without_mass(context, e) for e in kept], lobes)
+    judged = _judged(context, windows, kept, lobes)
     progress("detect", MAX_ROUNDS, MAX_ROUNDS)
     return tuple(sorted(judged, key=lambda e: (e.fit.y_nm, e.fit.x_nm))), windows
 

@@ -14,8 +14,8 @@ from scipy.ndimage import gaussian_filter
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Fitted
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.recognition import is_too_heavy, may_be_large, recognised
-from iscat_analysis.records import FloatArray, Status, verdict
+from iscat_analysis.inference.recognition import may_be_large, recognised
+from iscat_analysis.records import FloatArray
 
 AnyFitted = TypeVar("AnyFitted", bound=Fitted)
 
@@ -88,12 +88,3 @@ def brightest_place(
     if energy[row, column] < _BRIGHT_SNR**2:
         return None
     return float(column), float(row)
-
-
-def without_mass(context: AnalysisContext, event: AnyFitted) -> AnyFitted:
-    """Flag a dipole that is too heavy to be one."""
-    heavy = "mass_kda" in event.fit.free and is_too_heavy(event.likelihood.model, event.fit)
-    if event.sphere or not heavy or not context.spheres_of(event.likelihood.model):
-        return event
-    status, flags = verdict([*event.fit.flags, Status.LARGE])
-    return replace(event, fit=replace(event.fit, status=status, flags=flags))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -34,9 +33,6 @@ from iscat_analysis.records import (
     make_rows,
 )
 from iscat_analysis.search.empty import EmptySpread
-
-MASSES = ("mass_kda", "sigma_mass_kda", "crb_mass_kda", "qcrb_mass_kda")
-"""Columns that a particle that is no dipole does not have."""
 
 
 @dataclass(frozen=True)
@@ -135,8 +131,6 @@ def _line(
     )  # fmt: skip
     if context.spheres_of(context.model) and event.sphere is None:
         line["model"] = NO_MODEL if Status.POOR_FIT in event.flags else DIPOLE
-        if Status.LARGE in event.flags:
-            line |= {"model": NO_MODEL} | dict.fromkeys(MASSES, math.nan)
     if event.half_width is not None:
         line[FRAME_COLUMN] = event.half_width
     if context.config.fit.pairs:

@@ -19,7 +19,7 @@ import numpy as np
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out
-from iscat_analysis.fitting.large import with_spheres, without_mass
+from iscat_analysis.fitting.large import with_spheres
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
@@ -412,7 +412,7 @@ class ChunkFitter:
             self._context, [own.fitted.event for own in finished], self._pool, level=True
         )
         finished = [
-            replace(own, fitted=replace(own.fitted, event=without_mass(self._context, event)))
+            replace(own, fitted=replace(own.fitted, event=event))
             for own, event in zip(finished, events, strict=True)
         ]
         steps = [*(own.fitted.step for own in finished), *beside]

@@ -42,7 +42,7 @@ _ADVICE = {
     Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.diameter_range_nm.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
-    "neighbours; particles of 40 nm and more need mode size.",
+    "neighbours; a large particle that fit.spheres does not describe needs mode size.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
     "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "
@@ -60,8 +60,7 @@ _ADVICE = {
     Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
     "particle.wiggle_nm, or has separate parts; its mass is too small.",
     Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
-    "says which sphere describes it, with its diameter; none: add its material to fit.spheres, or "
-    "use mode size.",
+    "says which sphere on the coverslip describes it, with its diameter.",
 }
 
 

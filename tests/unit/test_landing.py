@@ -132,7 +132,8 @@ def test_every_step_is_found_dated_and_weighed(plain: tuple[Any, list[str]]) -> 
     result, told = plain
     assert told == []
     table = result.fits
-    assert list(table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN]
+    assert list(table.columns) == [*EVENT_COLUMNS, FRAME_COLUMN, "model"]
+    assert set(table["model"]) == {"dipole"}
     _assert_all_found(table)
     assert set(table["status"]) == {"ok"}
     assert (table["contrast"] * table["mass_kda"] < 0).all()  # landing darkens here
