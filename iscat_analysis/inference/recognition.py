@@ -285,8 +285,9 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
             for step in (-_INDEX_STEP, _INDEX_STEP)
         )
         terms = seated.noise.terms(seated.data, signal, g)
-        signals = [*own, terms.by_level / terms.by_signal, (above - below) / (2 * _INDEX_STEP)]
-        return terms, (np.array(signals) * terms.by_signal).reshape(6, -1)
+        change = (above - below) / (2 * _INDEX_STEP)
+        rows = [*own * terms.by_signal, terms.by_level, change * terms.by_signal]
+        return terms, np.array(rows).reshape(6, -1)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
