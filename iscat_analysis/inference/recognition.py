@@ -202,9 +202,21 @@ def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
         x, y = (float(np.average(axis, weights=weight.sum(over)))
                 for axis, over in ((grid.x_nm, 0), (grid.y_nm, 1)))  # fmt: skip
     moved = theta.copy()
-    if math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM:
-        moved[:2] = x, y
-    return moved
+    moved[:2] = x, y
+    beside = math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM
+    return moved if beside and _is_in_reach(likelihood, moved) else theta
+
+
+def _is_in_reach(likelihood: Likelihood, theta: FloatArray) -> bool:
+    """Tell whether the model is known for all places that a fit from a start may reach."""
+    start = Candidate(*_place(likelihood, theta), float(theta[2]), 1.0, 0.0)
+    box = search_box(likelihood, start, "mass", likelihood.model.z_range_nm)
+    half = likelihood.grid.pixel_nm / 2
+    far = (
+        max(box.upper[k] - axis[0], axis[-1] - box.lower[k]) + half
+        for k, axis in enumerate((likelihood.grid.x_nm, likelihood.grid.y_nm))
+    )
+    return math.hypot(*far) <= likelihood.model.reach_nm
 
 
 def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
@@ -273,8 +285,9 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
             for step in (-_INDEX_STEP, _INDEX_STEP)
         )
         terms = seated.noise.terms(seated.data, signal, g)
-        signals = [*own, terms.by_level / terms.by_signal, (above - below) / (2 * _INDEX_STEP)]
-        return terms, (np.array(signals) * terms.by_signal).reshape(6, -1)
+        change = (above - below) / (2 * _INDEX_STEP)
+        rows = [*own * terms.by_signal, terms.by_level, change * terms.by_signal]
+        return terms, np.array(rows).reshape(6, -1)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])

@@ -70,17 +70,28 @@ def large_steps(
 def _likelihood_of(
     context: AnalysisContext, chunk: Chunk, step: BrightStep, sign: int
 ) -> Likelihood:
-    """Make the likelihood of a step that lands or leaves."""
-    grid = PixelGrid.region(step.rows, step.columns, context.pixel_nm)
-    before, after, ratio = step.before_e, step.after_e, step.power_ratio
+    """Make the likelihood of a step that lands or leaves, in the square that is fitted at most."""
+    rows, columns = (_middle(part, context.roi_px) for part in (step.rows, step.columns))
+    inside = (
+        slice(rows[0] - step.rows[0], rows[1] - step.rows[0]),
+        slice(columns[0] - step.columns[0], columns[1] - step.columns[0]),
+    )
+    grid = PixelGrid.region(rows, columns, context.pixel_nm)
+    before, after, ratio = step.before_e[inside], step.after_e[inside], step.power_ratio
     frames = [step.n_before, step.n_after]
     if sign < 0:
         before, after, ratio = after, before, 1 / ratio
         frames.reverse()
-    read = chunk.camera.read_variance_e2(chunk.shape)[slice(*step.rows), slice(*step.columns)]
+    read = chunk.camera.read_variance_e2(chunk.shape)[slice(*rows), slice(*columns)]
     place = step.x_px * context.pixel_nm, step.y_px * context.pixel_nm
     return conditional(
         context.model_at(*place, step.frame), grid, before, after, ratio,
         read_variance_before_e2=frames[0] * read, read_variance_after_e2=frames[1] * read,
-        masked=~step.usable,
+        masked=~step.usable[inside],
     )  # fmt: skip
+
+
+def _middle(span: tuple[int, int], most: int) -> tuple[int, int]:
+    """Give the middle of a range of pixels, as many as that at most."""
+    first = span[0] + max(span[1] - span[0] - most, 0) // 2
+    return first, first + min(span[1] - span[0], most)

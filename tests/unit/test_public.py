@@ -158,7 +158,7 @@ def test_named_arguments_win(movie, config) -> None:
 def test_the_table_is_a_frame(result) -> None:
     assert isinstance(result.table, pd.DataFrame)
     heavy = "systematic_mass_kda"  # of 1.5 MDa, on a line of light standards
-    assert tuple(result.table.columns) == (*ia.EVENT_COLUMNS, heavy, *REPEAT_COLUMNS)
+    assert tuple(result.table.columns) == (*ia.EVENT_COLUMNS, heavy, *REPEAT_COLUMNS, "model")
     assert len(result) == len(result.table) == 2
 
 
