@@ -66,12 +66,17 @@ def test_importing_the_package_imports_nothing_heavy() -> None:
     assert not any(f"'{name}'" in loaded for name in ("numpy", "pandas", "numba", "matplotlib"))
 
 
-def test_an_analysis_loads_no_statistics_that_it_does_not_need() -> None:
+def test_an_analysis_loads_nothing_that_it_does_not_need() -> None:
     """scipy.stats and scipy.signal, which loads it, would be a third of the time of the start."""
-    code = "import sys, iscat_analysis.pipeline; print(*sys.modules)"
-    loaded = _in_a_new_process(code).split()
-    assert "scipy.special" in loaded  # the trap is set
-    assert not {"scipy.stats", "scipy.signal"} & set(loaded)
+    code = (
+        "import sys; from iscat_analysis.pipeline import finder; "
+        "finder('fixed'); print(*sys.modules); "
+        "finder('sliding'), finder('tracks'); print(*sys.modules)"
+    )
+    fixed, every = (set(line.split()) for line in _in_a_new_process(code).splitlines())
+    assert {"scipy.special", "iscat_analysis.landing.find"} <= every  # the trap is set
+    assert not {"scipy.stats", "scipy.signal", "scipy.sparse.linalg", "matplotlib"} & every
+    assert not {name for name in fixed if name.startswith("iscat_analysis.tracking")}
 
 
 def test_every_public_name_is_there_and_documented() -> None:
