@@ -24,7 +24,7 @@ from iscat_analysis.schemas.base import (
     maybe,
     row_model,
 )
-from iscat_analysis.schemas.calibration import OpticsParameter, Twin
+from iscat_analysis.schemas.calibration import Learned
 from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.schemas.tracks import Motion, Track
 
@@ -327,38 +327,6 @@ class Fluctuation(Closed):
     relative: NotNegative = key("Standard deviation over the contrast, if they do")
     relative_se: NotNegative = key("Its standard error")
     frames: NotNegative = key("Correlation time [frames]")
-
-
-class Doubt(Closed):
-    """Errors of optics that were not learned."""
-
-    names: list[str] = key("Parameters, in the order of matrix")
-    matrix: list[list[float]] = key("Their covariance")
-
-
-class Learned(Closed):
-    """The test of the optics by ``optics.calibrate``, and the learned optics."""
-
-    tested: Count = maybe("Bright isolated particles, or tracks")
-    median_p: Share = maybe("Median p-value of the brightest with the configured optics")
-    log_bayes_factor: Number = maybe("Of other optics over the configured ones, by all images")
-    left_over: Number = maybe(
-        "What the configured optics leave over of the images, beyond the noise, over the images "
-        "(root mean square)"
-    )
-    doubt: Doubt | None = maybe("Errors that the configured optics may have")
-    left_over_then: Number = maybe(
-        "The same with learned optics that are used although images that were held out reject them"
-    )
-    calibrated: bool = key("Whether the analysis used learned optics")
-    reason: str = maybe("Why not, if the test asked for it or was not possible")
-    accepted: bool = maybe("Whether the learned optics could be used")
-    refusals: list[str] = maybe("Why not, one line each")
-    parameters: list[OpticsParameter] = maybe("Every parameter")
-    names: list[str] = maybe("Measured parameters, in the order of covariance")
-    covariance: list[list[float]] = maybe("Of the measured parameters")
-    twin: Twin | None = maybe("Second optics that are as likely")
-    notes: list[str] = maybe("What the user should know, one line each")
 
 
 class Distribution(Document):
