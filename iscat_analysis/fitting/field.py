@@ -114,6 +114,7 @@ def _large_ones(
     the light changes most, whatever the picture looks like.
     """
     found: list[Fitted] = []
+    dipoles: list[Fitted] = []  # whose rings are no places of their own
     if not context.spheres_of(context.model):
         return found, windows
     nominal = context.model.material.mass_kda
@@ -121,7 +122,8 @@ def _large_ones(
     seen: list[tuple[float, float]] = []
     vain = 0
     while vain < IN_VAIN:
-        explained = context.left(total_signal(context, shape, found))
+        known = [*found, *dipoles]
+        explained = context.left(total_signal(context, shape, known))
         whole = search_likelihood(context, windows, explained)
         place = brightest_place(whole, explained, seen, context.roi_px / 4)
         if place is None:
@@ -129,9 +131,12 @@ def _large_ones(
         seen.append(place)
         vain += 1
         starts = [Candidate(*place, 0.0, sign * nominal, 0.0) for sign in (1, -1)]
-        dipoles = _fit_all(context, windows, starts, found, pool, first=len(found))
-        best = max(dipoles, key=lambda one: one.fit.log_likelihood, default=None)
-        if best is None or not may_be_large(best.likelihood, best.fit):
+        either = _fit_all(context, windows, starts, known, pool, first=len(known))
+        best = max(either, key=lambda one: one.fit.log_likelihood, default=None)
+        if best is None:
+            continue
+        if not may_be_large(best.likelihood, best.fit):
+            dipoles.append(best)
             continue
         (large,) = with_spheres(context, [best], pool, level=False)
         if large.sphere:

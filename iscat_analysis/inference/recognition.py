@@ -27,7 +27,6 @@ from iscat_analysis.inference.sizes import (
     scanned_masses,
 )
 from iscat_analysis.inference.slow_scoring import maximize_slowly
-from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.seated import SeatedModel, largest_dipole_nm
 from iscat_analysis.records import (
     Alternative,
@@ -39,6 +38,9 @@ from iscat_analysis.records import (
     verdict,
 )
 from iscat_analysis.units import sphere_diameter_nm
+
+MISSED_SHARE = 0.05
+"""Share of the light of a sphere of 30 nm and more that a dipole does not describe."""
 
 LEFT_SHARE = 0.1
 """Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
@@ -80,12 +82,11 @@ class _Sphere(NamedTuple):
 
 
 def may_be_large(likelihood: Likelihood, fit: FitResult) -> bool:
-    """Tell whether a dipole does not describe a particle, or is too heavy to be one."""
-    return Status.POOR_FIT in fit.flags or is_too_heavy(likelihood.model, fit)
-
-
-def is_too_heavy(model: ForwardModel, fit: FitResult) -> bool:
-    """Tell whether a compact particle of the fitted mass would be no dipole."""
+    """Tell whether a dipole misses as much as of a sphere, or is too heavy to be a dipole."""
+    missed = (fit.chi2_reduced - 1) * likelihood.n_pixels
+    if Status.POOR_FIT in fit.flags and missed > MISSED_SHARE * fit.snr**2:
+        return True
+    model = likelihood.model
     diameter = sphere_diameter_nm(abs(fit.mass_kda), model.material.density_kg_m3)
     return diameter > largest_dipole_nm(model.optics)
 

@@ -6,20 +6,16 @@ The search for dipoles would take the rings of a large particle for steps of the
 from __future__ import annotations
 
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.large import IN_VAIN
+from iscat_analysis.fitting.large import BRIGHT_SNR, IN_VAIN
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
-from iscat_analysis.inference.recognition import model_of, recognised
+from iscat_analysis.inference.recognition import may_be_large, model_of, recognised
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, Mapper
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
-from iscat_analysis.search.residue import Described
 from iscat_analysis.search.sliding import Chunk, StepFrame
-
-_MISSED = 0.05  # share of the light of a sphere of 30 nm and more that a dipole does not describe
-_BRIGHT_SNR = 50.0  # below which no dipole leaves enough over of a sphere to be seen
 
 
 def large_steps(
@@ -37,7 +33,7 @@ def large_steps(
     steps: list[Step] = []
     vain = 0
     for step in bright:
-        if step.snr < _BRIGHT_SNR or vain == IN_VAIN:
+        if step.snr < BRIGHT_SNR or vain == IN_VAIN:
             break
         vain += 1
         landing = _likelihood_of(context, chunk, step, 1)
@@ -45,8 +41,7 @@ def large_steps(
         start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
         z_range = context.config.fit.z_range_nm
         dipole = fit_particle(landing, start, context.mode, z_range, level=True)
-        missed = Described.of(dipole.snr, dipole.chi2_reduced, landing.n_pixels).excess
-        if missed < _MISSED * dipole.snr**2:
+        if not may_be_large(landing, dipole):
             continue
         found = [
             (sign, *sphere)
