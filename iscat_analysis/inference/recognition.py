@@ -19,12 +19,13 @@ import numpy as np
 
 from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
-from iscat_analysis.inference.noise_models import PixelTerms
 from iscat_analysis.inference.sizes import (
     OTHER_SIZE,
     OTHER_SIZE_SHARE,
     SURE_ODDS,
+    highest_maxima,
     scanned_masses,
+    slopes_with_index,
 )
 from iscat_analysis.inference.slow_scoring import maximize_slowly
 from iscat_analysis.optics.model import ForwardModel
@@ -47,7 +48,6 @@ _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
 _REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
-_INDEX_STEP = 1e-4  # for the derivative along the index
 _TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
@@ -235,18 +235,11 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
         for j, strength in enumerate(strengths.tolist()):
             signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
             values[i, j] = seated.noise.terms(seated.data, signal, g).value
-    around = np.pad(values, 1, constant_values=-np.inf)
-    inner = slice(1, -1)
-    higher = [around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:]]
-    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(higher, axis=0)))
     optima: list[_Sphere] = []
-    for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
+    for i, j in highest_maxima(values, _FOLLOWED):
         begin = np.array([x, y, 0.0, masses[i], g])
         if model.fits_index:
-            there = replace(
-                seated,
-                model=model.of_strength(float(strengths[j])),
-            )
+            there = replace(seated, model=model.of_strength(float(strengths[j])))
             found = _with_index(there, begin, least, level=level)
         else:
             box = _box(seated, begin, level=level)
@@ -275,29 +268,19 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
     def index_of(point: FloatArray) -> float:
         return min(max(model.index_of(point[5] / point[AMPLITUDE]), low), high)
 
-    def by_index(point: FloatArray, index: float) -> tuple[PixelTerms, FloatArray]:
-        """Give pixels and their derivatives along θ and the index, shape (6, n)."""
+    def along_index(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood, score and information in θ and the index."""
         x, y, gap, mass, g = (float(value) for value in point[:5])
-        place = (seated.grid, x, y, gap, mass)
-        signal, own = model.of_index(index).amplitude_gradient(*place)
-        below, above = (
-            model.of_index(index + step).amplitude_image(*place)
-            for step in (-_INDEX_STEP, _INDEX_STEP)
-        )
-        terms = seated.noise.terms(seated.data, signal, g)
-        change = (above - below) / (2 * _INDEX_STEP)
-        rows = [*own * terms.by_signal, terms.by_level, change * terms.by_signal]
-        return terms, np.array(rows).reshape(6, -1)
+        signal, slopes = slopes_with_index(model, seated.grid, (x, y, gap), mass, index_of(point))
+        return seated.score_of_signal(signal, slopes, g)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood, score and information in θ and the light."""
         mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
-        terms, rows = by_index(point, index_of(point))
-        if not math.isfinite(terms.value):
-            return -np.inf, np.full(6, np.nan), np.full((6, 6), np.nan)
-        rows[5] *= model.index_slope(strength) / mass  # per light, at the same mass
-        rows[AMPLITUDE] -= strength * rows[5]  # at the same light
-        score = rows @ terms.score.ravel()
-        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
+        change = np.eye(6)
+        change[5, [AMPLITUDE, 5]] = model.index_slope(strength) / mass * np.array([-strength, 1.0])
+        value, score, fisher = along_index(point)
+        return value, score @ change, change.T @ fisher @ change
 
     light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
     lower, upper = np.append(box.lower, 0.0), np.append(box.upper, np.inf)
@@ -307,8 +290,6 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
         score_fisher, np.clip(np.append(theta, light), lower, upper), np.append(box.free, True),
         lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=least,
     )  # fmt: skip
-    index = index_of(end)
-    terms, rows = by_index(end, index)
-    information = (rows * terms.information.ravel()) @ rows.T
+    information = along_index(end)[2]
     optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
-    return _Sphere(replace(seated, model=model.of_index(index)), optimum, information)
+    return _Sphere(replace(seated, model=model.of_index(index_of(end))), optimum, information)
