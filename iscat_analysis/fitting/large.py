@@ -22,7 +22,8 @@ AnyFitted = TypeVar("AnyFitted", bound=Fitted)
 IN_VAIN = 8
 """Particles, the brightest first, after which no others are tried if none is a sphere."""
 
-_BRIGHT_SNR = 50.0  # below which no dipole leaves enough over of a sphere to be seen
+BRIGHT_SNR = 50.0
+"""Signal-to-noise ratio below which a sphere differs too little from a dipole to be seen."""
 
 
 def with_spheres(
@@ -85,6 +86,6 @@ def brightest_place(
     for x, y in seen:
         energy[np.hypot(rows - y, columns - x) < apart_px] = 0.0
     row, column = np.unravel_index(np.argmax(energy), energy.shape)
-    if energy[row, column] < _BRIGHT_SNR**2:
+    if energy[row, column] < BRIGHT_SNR**2:
         return None
     return float(column), float(row)

@@ -85,7 +85,7 @@ class CommonSize:
         """Covariance of (m) or (m, n).
 
         Frames that share a measured background share its noise: `correlation` (frames, frames).
-        `excess` is the variance of what pictures say over that of counting.
+        `excess` is the variance of the estimates from images over that of counting.
         """
         inverse = np.linalg.inv(self.information.sum(axis=0) + self.prior)
         if correlation is None:

@@ -42,17 +42,17 @@ from iscat_analysis.records import (
 from iscat_analysis.units import sphere_diameter_nm
 
 LEFT_SHARE = 0.1
-"""Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
+"""Share of the dipole's excess of χ² that a sphere may have if it does not describe all."""
 
 _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
-_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
+_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
 _TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
 class _Sphere(NamedTuple):
-    """A sphere at a maximum of its likelihood, and the information there, of the index too."""
+    """A sphere at a maximum of its likelihood, with the information in its parameters."""
 
     likelihood: Likelihood
     optimum: Optimum
@@ -158,7 +158,7 @@ def fit_seated(
     start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
     fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
     flags = [*fit.flags, Status.LARGE]
-    if information is not None:  # the index is known from this picture alone, with an error
+    if information is not None:  # which depends on the error of the index as well
         free = np.append(fit.box.free, True)
         try:
             variance = np.diag(np.linalg.inv(information[np.ix_(free, free)]))
@@ -189,7 +189,7 @@ def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
 
 
 def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Move θ to the centre of the picture's energy, if the dipole is on a part of a ring."""
+    """Move θ to the centre of the image's energy, if the dipole lies on a part of a ring."""
     signal = np.nan_to_num(likelihood.measured_signal())
     energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
     grid = likelihood.grid
@@ -220,9 +220,10 @@ def _is_in_reach(likelihood: Likelihood, theta: FloatArray) -> bool:
 
 
 def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
-    """Maximise the likelihood of a sphere from the best diameters of a scan, as far as it counts.
+    """Maximise the likelihood of a sphere from the best diameters of a scan.
 
-    Where the index is fitted, so much more or less light is scanned too.
+    Where the index is fitted, the light of a sphere is scanned too.  Maxima below `least` are left
+    out.
     """
     model = model_of(seated)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
@@ -259,8 +260,8 @@ def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
 def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
     """Maximise over the index too.
 
-    The picture says well how much light there is, and less well of how large a sphere: the last
-    parameter is the light of a small sphere, which is the same along the likelihood's ridge.
+    The image determines the light of a sphere well and its diameter less well.  The last parameter
+    is therefore the light of a small sphere, which is constant along the ridge of the likelihood.
     """
     model, box = model_of(seated), _box(seated, theta, level=level)
     low, high = model.indices

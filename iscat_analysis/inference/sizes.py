@@ -1,7 +1,7 @@
 """Starts of a fit of a sphere: every branch of its diameter and height.
 
 The contrast of a sphere rises with the diameter, turns, and may change its sign, so that several
-diameters have about the same picture, each at a height of its own.  Diameters and heights are
+diameters have about the same image, each at a height of its own.  Diameters and heights are
 therefore scanned together, and every local maximum of the likelihood starts a fit.
 """
 

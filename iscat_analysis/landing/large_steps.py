@@ -6,7 +6,7 @@ The search for dipoles would take the rings of a large particle for steps of the
 from __future__ import annotations
 
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.large import IN_VAIN
+from iscat_analysis.fitting.large import BRIGHT_SNR, IN_VAIN
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional
@@ -19,7 +19,6 @@ from iscat_analysis.search.residue import Described
 from iscat_analysis.search.sliding import Chunk, StepFrame
 
 _MISSED = 0.05  # share of the light of a sphere of 30 nm and more that a dipole does not describe
-_BRIGHT_SNR = 50.0  # below which no dipole leaves enough over of a sphere to be seen
 
 
 def large_steps(
@@ -37,7 +36,7 @@ def large_steps(
     steps: list[Step] = []
     vain = 0
     for step in bright:
-        if step.snr < _BRIGHT_SNR or vain == IN_VAIN:
+        if step.snr < BRIGHT_SNR or vain == IN_VAIN:
             break
         vain += 1
         landing = _likelihood_of(context, chunk, step, 1)
@@ -48,17 +47,13 @@ def large_steps(
         missed = Described.of(dipole.snr, dipole.chi2_reduced, landing.n_pixels).excess
         if missed < _MISSED * dipole.snr**2:
             continue
-        found = [
-            (sign, *sphere)
-            for sign in (1, -1)
-            for likelihood in [landing if sign > 0 else _likelihood_of(context, chunk, step, sign)]
-            for sphere in [
-                recognised(
-                    likelihood, dipole, context.spheres_of(likelihood.model), z_range, level=True
-                )
-            ]
-            if sphere is not None
-        ]
+        found = []
+        for sign in (1, -1):
+            likelihood = landing if sign > 0 else _likelihood_of(context, chunk, step, sign)
+            spheres = context.spheres_of(likelihood.model)
+            sphere = recognised(likelihood, dipole, spheres, z_range, level=True)
+            if sphere is not None:
+                found.append((sign, *sphere))
         if found:
             sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
             at = StepFrame.undated(step.frame, stride)

@@ -37,7 +37,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.records import BoolArray, FloatArray, Status
+from iscat_analysis.records import BoolArray, FloatArray, Status, has_only
 from iscat_analysis.trust.response import response_of
 
 FEWEST = 6
@@ -104,11 +104,9 @@ class Extension:
         learned_optics: bool = False,
     ) -> Extension | None:
         """Estimate the extension from all rows, beyond a known wiggle; None without evidence."""
-        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
         known = np.isfinite(q) & np.isfinite(se) & np.isfinite(evidence.sigma_across_nm2)
-        many = good & known
+        many = has_only(table, _JUDGED) & known
         if not many.any():
             return None
         left, per_mass = _beside_learned_optics(config, table) if learned_optics else (1.0, None)

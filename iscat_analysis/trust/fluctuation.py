@@ -35,7 +35,7 @@ from scipy.special import logsumexp
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import MODES, spectra_of
-from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status, has_only
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
 _ALONE = 0.05  # probability that an event changes on its own
@@ -94,9 +94,7 @@ class Fluctuation:
         before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
         there = np.where(mass > 0, after, before)
         one = crb**2 * before * after / (before + after)  # variance of a single frame
-        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
-        good &= np.isfinite(mass**2 / one) & ~shared_place
+        good = has_only(table, _JUDGED) & np.isfinite(mass**2 / one) & ~shared_place
         if not good.any():
             return None
         spectra = spectra_of(np.stack(repeats)[good])
