@@ -51,7 +51,7 @@ _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of man
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
 _WIDER_PRIOR = 2.0  # standard deviation of the prior over a √v that is clear
-_LEAST_LEFT = 1e-3  # share of a width that learned optics leave over, beneath which it is rounding
+_LEAST_LEFT = 1e-3  # share of a width that learned optics do not imitate; less is rounding
 _STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
 
 LogLikelihood = Callable[[FloatArray], FloatArray]
@@ -219,7 +219,7 @@ def _normal(mean: float, error: float) -> LogLikelihood:
 
 
 def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float | None]:
-    """Share of a width that learned optics leave over, and the share of mass lost per variance."""
+    """Share of a width that learned optics do not imitate, and the mass lost per variance."""
     errors = config.optics.covariance
     if errors is None:
         return 1.0, None
