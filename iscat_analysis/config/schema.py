@@ -209,7 +209,7 @@ def sphere_refusal(config: Config) -> str:
     particle, optics, fit = config.particle, config.optics, config.fit
     if fit.mode not in ("size", "localize", "track"):
         return (
-            f'fit.mode = "{fit.mode}" is for dipoles, whose picture has one shape, and '
+            f'fit.mode = "{fit.mode}" is for dipoles, whose image has one shape, and '
             f'particle.model is "{particle.model}": use fit.mode = "size", "track" for spheres '
             'that move, or "localize" for a known diameter'
         )

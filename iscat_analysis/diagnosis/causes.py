@@ -250,16 +250,17 @@ def large_warning(config: Config, table: pd.DataFrame) -> str:
     known = ", ".join(f"{number} {name}" for name, number in each.items())
     text = (
         f"{count(len(large), 'particle')} of {len(table)} {'is' if len(large) == 1 else 'are'} no "
-        f"dipole, flagged large, and fitted as spheres on the coverslip ({known}), without a mass "
-        "and in no species"
+        f"dipole: fitted as spheres on the coverslip ({known}), flagged large, these have no mass "
+        "and belong to no species"
     )
     poor = int(large["flags"].str.contains(Status.POOR_FIT.value).sum())
     if poor:
         untried = VESICLE in config.fit.spheres and not has_shells()
         shells = '; vesicles were not tried: pip install "iscat-analysis[shell]"' if untried else ""
         text += (
-            f"; {poor} of them, flagged poor_fit, no sphere describes quite: another material "
-            f"(fit.spheres), no sphere, or not on the coverslip (mode size){shells}"
+            f"; no sphere describes {poor} of them well (flagged poor_fit): add their material to "
+            "fit.spheres; if they are not on the coverslip, use mode size; what is no sphere has "
+            f"no diameter{shells}"
         )
     return text
 

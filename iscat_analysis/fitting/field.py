@@ -110,8 +110,8 @@ def _large_ones(
 ) -> tuple[list[Fitted], Windows]:
     """Find spheres before anything else, the brightest first.
 
-    The search for dipoles would take the rings of their pictures for particles.  A place is where
-    the light changes most, whatever the picture looks like.
+    The search for dipoles would take the rings of their images for particles.  A place is where the
+    light changes most, whatever the shape of the image.
     """
     found: list[Fitted] = []
     dipoles: list[Fitted] = []  # whose rings are no places of their own

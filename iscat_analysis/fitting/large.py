@@ -23,7 +23,7 @@ IN_VAIN = 8
 """Particles, the brightest first, after which no others are tried if none is a sphere."""
 
 BRIGHT_SNR = 50.0
-"""Below it no dipole leaves enough over of a sphere to be seen."""
+"""Signal-to-noise ratio below which a sphere differs too little from a dipole to be seen."""
 
 
 def with_spheres(

@@ -29,7 +29,13 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.scoring import LARGEST_GAIN_RATIO
 from iscat_analysis.inference.likelihood import Likelihood
-from iscat_analysis.inference.sizes import scan_sizes, scanned_heights, scanned_masses
+from iscat_analysis.inference.sizes import (
+    highest_maxima,
+    scan_sizes,
+    scanned_heights,
+    scanned_masses,
+    slopes_with_index,
+)
 from iscat_analysis.optics.sized import SizedModel
 
 FloatArray = NDArray[np.float64]
@@ -47,7 +53,6 @@ TOLERANCE = 1e-3
 _PASSES = 40
 _GROWTH = 0.2  # largest relative change of the mass in a step, and of n − n_s
 _HALVINGS = 12
-_INDEX_STEP = 1e-4  # of differences along the index; their error is 1e-6 of the derivative
 
 
 @dataclass(frozen=True)
@@ -80,7 +85,7 @@ class CommonSize:
         """Covariance of (m) or (m, n).
 
         Frames that share a measured background share its noise: `correlation` (frames, frames).
-        `excess` is the variance of what pictures say over that of counting.
+        `excess` is the variance of the estimates from images over that of counting.
         """
         inverse = np.linalg.inv(self.information.sum(axis=0) + self.prior)
         if correlation is None:
@@ -110,11 +115,8 @@ def common_sizes(
         values = scan_sizes(likelihood, model, theta, masses, heights)
         best_height[f] = np.argmax(values, axis=1)
         total += values.max(axis=1)
-    around = np.pad(total, 1, constant_values=-np.inf)
-    tops = (total >= around[:-2]) & (total >= around[2:])
-    peaks = np.flatnonzero(tops & np.isfinite(total))
     found: list[CommonSize] = []
-    for k in sorted(peaks.tolist(), key=lambda k: -total[k])[:FOLLOWED]:
+    for (k,) in highest_maxima(total, FOLLOWED):
         start = np.column_stack([places[:, :2], heights[best_height[:, k]]])
         best = max((one.log_likelihood for one in found if one.converged), default=-math.inf)
         one = fit_common_size(
@@ -254,15 +256,11 @@ def _slopes(
     likelihood: Likelihood, model: SizedModel, place: FloatArray, common: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Signal of a frame, and its derivatives in (x, y, z, m) or (x, y, z, m, n)."""
-    (x, y, z), mass = place.tolist(), float(common[0])
-    signal, own = _model_of(model, common).amplitude_gradient(likelihood.grid, x, y, z, mass)
-    if common.size == 1:
-        return signal, own
-    below, above = (
-        model.of_index(float(common[1]) + step).amplitude_image(likelihood.grid, x, y, z, mass)
-        for step in (-_INDEX_STEP, _INDEX_STEP)
-    )
-    return signal, np.concatenate([own, (above - below)[None] / (2 * _INDEX_STEP)])
+    x, y, z = place.tolist()
+    mass, *index = common.tolist()
+    if not index:
+        return model.amplitude_gradient(likelihood.grid, x, y, z, mass)
+    return slopes_with_index(model, likelihood.grid, (x, y, z), mass, index[0])
 
 
 def _scoring_step(here: _Frames) -> tuple[FloatArray, FloatArray, float]:

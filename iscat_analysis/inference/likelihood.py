@@ -237,10 +237,22 @@ class Likelihood:
         """`score_fisher` of a model whose picture is not proportional to the amplitude."""
         x, y, z, amplitude, level = (float(value) for value in point)
         signal, own = self.model.amplitude_gradient(self.grid, x, y, z, amplitude)
-        terms = self.noise.terms(self.data, signal, level)
+        return self.score_of_signal(signal, own, level)
+
+    def score_of_signal(
+        self, signal: FloatArray, slopes: FloatArray, level: float
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood of a signal, its gradient and the expected information.
+
+        Parameters are those of the slopes, with the level at its place in θ.
+
+        Shapes: `signal` (ny, nx), `slopes` (n, ny, nx), `score` (n + 1,), `fisher` (n + 1, n + 1).
+        """
+        terms, count = self.noise.terms(self.data, signal, level), len(slopes) + 1
         if not math.isfinite(terms.value):
-            return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
-        rows = np.concatenate([own * terms.by_signal, terms.by_level[None]]).reshape(5, -1)
+            return -np.inf, np.full(count, np.nan), np.full((count, count), np.nan)
+        rows = np.insert(slopes * terms.by_signal, LEVEL, terms.by_level, axis=0)
+        rows = rows.reshape(count, -1)
         score = rows @ terms.score.ravel()
         return terms.value, score, (rows * terms.information.ravel()) @ rows.T
 

@@ -1,14 +1,14 @@
-"""A particle of two equal halves: their distance and direction, and the mass that a point loses.
+"""A particle of two equal halves: its mass, and the distance and direction of the halves.
 
-With half of the light from x + h and half from x − h the picture is [s(x + h) + s(x − h)]/2, s that
+With half of the light from x + h and half from x − h the image is [s(x + h) + s(x − h)]/2, s that
 of a point of the whole mass.  Both fields add up, so that only the square of the scattered light
 |e(x + h) − e(x − h)|²/4 is missing, which is less than 1e-4 of the light for proteins.  For small h
-the picture is s + ½ hhᵀ·∇∇s: a covariance of places of one direction, which starts the fit.  ±h are
+the image is s + ½ hhᵀ·∇∇s: a covariance of places of one direction, which starts the fit.  ±h are
 one particle.
 
-Twice the gain in log-likelihood over the point tests whether a picture asks for it.  All
-covariances of places have three parameters, and those of pairs are some of them, so that by chance
-the gain is at most χ² of three degrees of freedom.
+Twice the gain in log-likelihood over a point tests for two halves.  Pairs are special cases of a
+covariance of places, which has three parameters, so that by chance the gain is at most χ² of three
+degrees of freedom.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Pair(NamedTuple):
 def pair_of(likelihood: Likelihood, fit: FitResult, evidence: Evidence) -> Pair:
     """Fit two halves beside a point; all is NaN where the fit does not converge.
 
-    `evidence` has the width and length of the picture, as the fit of the point leaves it.
+    `evidence` has the width and elongation of the image beside the fit of a point.
     """
     wide, across, along = evidence.spread_nm2, evidence.across_nm2, evidence.along_nm2
     covariance_nm2 = np.array([[wide + across, along], [along, wide - across]])
@@ -83,9 +83,7 @@ def pair_of(likelihood: Likelihood, fit: FitResult, evidence: Evidence) -> Pair:
         return Pair()
     kept = np.flatnonzero(free)
     covariance = np.zeros(fisher.shape)
-    scale = 1 / np.sqrt(np.diag(fisher)[kept])
-    scaled = fisher[np.ix_(kept, kept)] * np.outer(scale, scale)
-    covariance[np.ix_(kept, kept)] = np.linalg.inv(scaled) * np.outer(scale, scale)
+    covariance[np.ix_(kept, kept)] = np.linalg.inv(fisher[np.ix_(kept, kept)])
     apart = math.hypot(theta[5], theta[6])
     along = theta[5:] / apart
     sigma_along, sigma_across = (
@@ -128,10 +126,4 @@ def _score_fisher(
     """
     rows, along = _rows(likelihood, theta)
     signal, *own = np.moveaxis(rows, 1, 0)[:5]
-    terms = likelihood.noise.terms(likelihood.data, signal, float(theta[LEVEL]))
-    if not math.isfinite(terms.value):
-        return -math.inf, np.full(7, np.nan), np.full((7, 7), np.nan)
-    by_signal = [each * terms.by_signal for each in (*own, *along)]
-    every = np.array([*by_signal[:4], terms.by_level, *by_signal[4:]]).reshape(7, -1)
-    score = every @ terms.score.ravel()
-    return terms.value, score, (every * terms.information.ravel()) @ every.T
+    return likelihood.score_of_signal(signal, np.array([*own, *along]), float(theta[LEVEL]))

@@ -19,12 +19,13 @@ import numpy as np
 
 from iscat_analysis.inference.fit import AMPLITUDE, POOR_FIT_P, fit_particle, search_box
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood, Optimum
-from iscat_analysis.inference.noise_models import PixelTerms
 from iscat_analysis.inference.sizes import (
     OTHER_SIZE,
     OTHER_SIZE_SHARE,
     SURE_ODDS,
+    highest_maxima,
     scanned_masses,
+    slopes_with_index,
 )
 from iscat_analysis.inference.slow_scoring import maximize_slowly
 from iscat_analysis.optics.seated import SeatedModel, largest_dipole_nm
@@ -43,18 +44,17 @@ MISSED_SHARE = 0.05
 """Share of the light of a sphere of 30 nm and more that a dipole does not describe."""
 
 LEFT_SHARE = 0.1
-"""Share of the excess of χ² over the dipole's that a sphere may leave if it is not quite right."""
+"""Share of the dipole's excess of χ² that a sphere may have if it does not describe all."""
 
 _FOLLOWED = 3  # maxima of the likelihood over the diameter, of each material
 _STRENGTHS = np.geomspace(0.007, 0.25, 10)  # light per volume of a sphere whose index is fitted
-_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # in which the centre of a picture is found, in turn
+_REACHES_NM = (900.0, 700.0, 600.0, 500.0)  # around an image's centre, which each improves
 _BESIDE_NM = 100.0  # from it, within which a dipole is in the middle
-_INDEX_STEP = 1e-4  # for the derivative along the index
 _TOLERANCE, _PASSES = 2e-4, 60  # as `Likelihood.maximize`
 
 
 class _Sphere(NamedTuple):
-    """A sphere at a maximum of its likelihood, and the information there, of the index too."""
+    """A sphere at a maximum of its likelihood, with the information in its parameters."""
 
     likelihood: Likelihood
     optimum: Optimum
@@ -159,7 +159,7 @@ def fit_seated(
     start = Candidate(*_place(seated, theta), float(theta[2]), float(theta[AMPLITUDE]), 0.0)
     fit = fit_particle(seated, start, "mass", seated.model.z_range_nm, level=level)
     flags = [*fit.flags, Status.LARGE]
-    if information is not None:  # the index is known from this picture alone, with an error
+    if information is not None:  # which depends on the error of the index as well
         free = np.append(fit.box.free, True)
         try:
             variance = np.diag(np.linalg.inv(information[np.ix_(free, free)]))
@@ -190,7 +190,7 @@ def _place(likelihood: Likelihood, theta: FloatArray) -> tuple[float, float]:
 
 
 def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
-    """Move θ to the centre of the picture's energy, if the dipole is on a part of a ring."""
+    """Move θ to the centre of the image's energy, if the dipole lies on a part of a ring."""
     signal = np.nan_to_num(likelihood.measured_signal())
     energy = np.maximum(signal**2 * likelihood.signal_information() - 1, 0.0)
     grid = likelihood.grid
@@ -221,9 +221,10 @@ def _is_in_reach(likelihood: Likelihood, theta: FloatArray) -> bool:
 
 
 def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
-    """Maximise the likelihood of a sphere from the best diameters of a scan, as far as it counts.
+    """Maximise the likelihood of a sphere from the best diameters of a scan.
 
-    Where the index is fitted, so much more or less light is scanned too.
+    Where the index is fitted, the light of a sphere is scanned too.  Maxima below `least` are left
+    out.
     """
     model = model_of(seated)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
@@ -236,18 +237,11 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
         for j, strength in enumerate(strengths.tolist()):
             signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
             values[i, j] = seated.noise.terms(seated.data, signal, g).value
-    around = np.pad(values, 1, constant_values=-np.inf)
-    inner = slice(1, -1)
-    higher = [around[:-2, inner], around[2:, inner], around[inner, :-2], around[inner, 2:]]
-    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(higher, axis=0)))
     optima: list[_Sphere] = []
-    for i, j in sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])[:_FOLLOWED]:
+    for i, j in highest_maxima(values, _FOLLOWED):
         begin = np.array([x, y, 0.0, masses[i], g])
         if model.fits_index:
-            there = replace(
-                seated,
-                model=model.of_strength(float(strengths[j])),
-            )
+            there = replace(seated, model=model.of_strength(float(strengths[j])))
             found = _with_index(there, begin, least, level=level)
         else:
             box = _box(seated, begin, level=level)
@@ -267,8 +261,8 @@ def _box(seated: Likelihood, theta: FloatArray, *, level: bool) -> Box:
 def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: bool) -> _Sphere:
     """Maximise over the index too.
 
-    The picture says well how much light there is, and less well of how large a sphere: the last
-    parameter is the light of a small sphere, which is the same along the likelihood's ridge.
+    The image determines the light of a sphere well and its diameter less well.  The last parameter
+    is therefore the light of a small sphere, which is constant along the ridge of the likelihood.
     """
     model, box = model_of(seated), _box(seated, theta, level=level)
     low, high = model.indices
@@ -276,29 +270,19 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
     def index_of(point: FloatArray) -> float:
         return min(max(model.index_of(point[5] / point[AMPLITUDE]), low), high)
 
-    def by_index(point: FloatArray, index: float) -> tuple[PixelTerms, FloatArray]:
-        """Give pixels and their derivatives along θ and the index, shape (6, n)."""
+    def along_index(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood, score and information in θ and the index."""
         x, y, gap, mass, g = (float(value) for value in point[:5])
-        place = (seated.grid, x, y, gap, mass)
-        signal, own = model.of_index(index).amplitude_gradient(*place)
-        below, above = (
-            model.of_index(index + step).amplitude_image(*place)
-            for step in (-_INDEX_STEP, _INDEX_STEP)
-        )
-        terms = seated.noise.terms(seated.data, signal, g)
-        change = (above - below) / (2 * _INDEX_STEP)
-        rows = [*own * terms.by_signal, terms.by_level, change * terms.by_signal]
-        return terms, np.array(rows).reshape(6, -1)
+        signal, slopes = slopes_with_index(model, seated.grid, (x, y, gap), mass, index_of(point))
+        return seated.score_of_signal(signal, slopes, g)
 
     def score_fisher(point: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-likelihood, score and information in θ and the light."""
         mass, strength = float(point[AMPLITUDE]), float(point[5] / point[AMPLITUDE])
-        terms, rows = by_index(point, index_of(point))
-        if not math.isfinite(terms.value):
-            return -np.inf, np.full(6, np.nan), np.full((6, 6), np.nan)
-        rows[5] *= model.index_slope(strength) / mass  # per light, at the same mass
-        rows[AMPLITUDE] -= strength * rows[5]  # at the same light
-        score = rows @ terms.score.ravel()
-        return terms.value, score, (rows * terms.information.ravel()) @ rows.T
+        change = np.eye(6)
+        change[5, [AMPLITUDE, 5]] = model.index_slope(strength) / mass * np.array([-strength, 1.0])
+        value, score, fisher = along_index(point)
+        return value, score @ change, change.T @ fisher @ change
 
     light = float(theta[AMPLITUDE]) * model.strength_of(model.sphere.index.real)
     lower, upper = np.append(box.lower, 0.0), np.append(box.upper, np.inf)
@@ -308,8 +292,6 @@ def _with_index(seated: Likelihood, theta: FloatArray, least: float, *, level: b
         score_fisher, np.clip(np.append(theta, light), lower, upper), np.append(box.free, True),
         lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=least,
     )  # fmt: skip
-    index = index_of(end)
-    terms, rows = by_index(end, index)
-    information = (rows * terms.information.ravel()) @ rows.T
+    information = along_index(end)[2]
     optimum = Optimum(end[:5], value, passes, converged, information[:5, :5])
-    return _Sphere(replace(seated, model=model.of_index(index)), optimum, information)
+    return _Sphere(replace(seated, model=model.of_index(index_of(end))), optimum, information)

@@ -1,7 +1,7 @@
 """Starts of a fit of a sphere: every branch of its diameter and height.
 
 The contrast of a sphere rises with the diameter, turns, and may change its sign, so that several
-diameters have about the same picture, each at a height of its own.  Diameters and heights are
+diameters have about the same image, each at a height of its own.  Diameters and heights are
 therefore scanned together, and every local maximum of the likelihood starts a fit.
 """
 
@@ -13,9 +13,11 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import generate_binary_structure, maximum_filter
 from scipy.special import ndtr
 
 from iscat_analysis.inference.likelihood import Likelihood, Optimum
+from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Alternative, Box
 
@@ -41,6 +43,7 @@ OTHER_SIZE_SHARE = 0.02
 """Share of the mass by which two maxima at one height differ at least."""
 
 _FOLLOWED = 6  # local maxima that are followed
+_INDEX_STEP = 1e-4  # of differences along the index; their error is 1e-6 of the derivative
 
 
 def size_starts(
@@ -50,20 +53,45 @@ def size_starts(
     masses = scanned_masses(model, float(box.lower[3]), float(box.upper[3]))
     heights = scanned_heights(model, float(box.lower[2]), float(box.upper[2]))
     values = scan_sizes(likelihood, model, theta, masses, heights)
-    around = np.pad(values, 1, constant_values=-np.inf)
-    neighbours = [
-        around[1 + i : 1 + i + masses.size, 1 + j : 1 + j + heights.size]
-        for i in (-1, 0, 1)
-        for j in (-1, 0, 1)
-    ]
-    peaks = np.argwhere(np.isfinite(values) & (values >= np.max(neighbours, axis=0)))
-    ranked = sorted(peaks.tolist(), key=lambda at: -values[at[0], at[1]])
     starts = []
-    for i, j in ranked[:_FOLLOWED]:
+    for i, j in highest_maxima(values, _FOLLOWED, diagonal=True):
         begin = theta.copy()
         begin[2], begin[3] = heights[j], masses[i]
         starts.append(begin)
     return starts or [theta.copy()]
+
+
+def highest_maxima(
+    values: FloatArray, most: int, *, diagonal: bool = False
+) -> list[tuple[int, ...]]:
+    """Find the local maxima of a scan, the highest first, at most so many.
+
+    Neighbours are next along one axis, or along several at once (`diagonal`).
+    """
+    known = np.where(np.isfinite(values), values, -np.inf)
+    neighbours = generate_binary_structure(values.ndim, values.ndim if diagonal else 1)
+    highest = maximum_filter(known, footprint=neighbours, mode="constant", cval=-np.inf)
+    peaks = np.argwhere(np.isfinite(values) & (values >= highest)).tolist()
+    return sorted(map(tuple, peaks), key=lambda at: -values[at])[:most]
+
+
+def slopes_with_index(
+    model: SizedModel,
+    grid: PixelGrid,
+    place: tuple[float, float, float],
+    mass_kda: float,
+    index: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Signal of a sphere of an index, and its derivatives in (x, y, z, m, n).
+
+    Shapes: results (ny, nx), (5, ny, nx).
+    """
+    at = grid, *place, mass_kda
+    signal, own = model.of_index(index).amplitude_gradient(*at)
+    below, above = (
+        model.of_index(index + step).amplitude_image(*at) for step in (-_INDEX_STEP, _INDEX_STEP)
+    )
+    return signal, np.concatenate([own, (above - below)[None] / (2 * _INDEX_STEP)])
 
 
 def scan_sizes(

@@ -18,7 +18,7 @@ BoolArray = NDArray[np.bool_]
 Score = Callable[[FloatArray], tuple[float, FloatArray, FloatArray]]
 
 LARGEST_GROWTH = 0.5
-"""Largest relative change of the amplitude in one step: the picture of a sphere changes with it."""
+"""Largest relative change of the amplitude in one step: the image of a sphere changes with it."""
 
 _AMPLITUDE = 3
 _LARGEST_DAMPING = 1e6

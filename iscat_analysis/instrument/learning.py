@@ -64,7 +64,7 @@ from iscat_analysis.units import count
 LEAST_TESTED = 4
 """Bright particles without which the optics are not even tested."""
 
-_AGREEING = 2  # pictures that can disagree; of one it is not known whether it shows a particle
+_AGREEING = 2  # images, of which one alone may show something that is no particle
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 NOISE = "its noise is not what the camera's numbers predict"
@@ -143,22 +143,22 @@ class Tested:
     """Over the field or in time, that they ask for."""
 
     together: ScoreTest | None = None
-    """What they say together; None where each has a height of its own, which focus imitates."""
+    """Test of all together; None where each has a height of its own, which focus imitates."""
 
     @property
     def rejected(self) -> bool:
-        """Whether the configured optics do not describe them, one by one or together."""
+        """Whether the configured optics fail to describe them, one by one or together."""
         return self.median_p < REJECTED_P or (self.together is not None and self.together.rejected)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Give what the summary says of the test."""
+        """Describe the test in the summary."""
         said: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
         return said if self.together is None else said | _doubted(self.together)
 
 
 def _doubted(together: ScoreTest) -> dict[str, Any]:
-    """Give what the summary says of optics that are not learned."""
+    """Describe the doubt about optics that are not learned in the summary."""
     return {
         "log_bayes_factor": together.log_bayes_factor,
         "left_over": together.left_over,
@@ -167,7 +167,7 @@ def _doubted(together: ScoreTest) -> dict[str, Any]:
 
 
 class _TooFewError(DataError):
-    """The optics are not tested; what the few particles say of them together."""
+    """Too few particles to test the optics one by one, with the test of all together."""
 
     def __init__(self, text: str, together: ScoreTest | None) -> None:
         super().__init__(text)
@@ -180,7 +180,7 @@ def _of_few(
     others: Sequence[ParticleImage],
     pool: ThreadPoolExecutor,
 ) -> ScoreTest | None:
-    """Ask particles that are too few to be tested one by one."""
+    """Test particles together that are too few to be tested one by one."""
     fitted = median_p(images, config, others, pool.map)[1] if images else ()
     return _together(fitted, config, pool)
 
@@ -246,7 +246,7 @@ def _together(
     pool: ThreadPoolExecutor,
     terms: Sequence[str] = (),
 ) -> ScoreTest | None:
-    """Ask all pictures together whether the configured optics are right."""
+    """Test all images together against the configured optics."""
     if heights_free(config):
         return None
     build = microscopes(config, max(map(reach_nm, fitted), default=0.0))
@@ -418,7 +418,7 @@ def _verdict(tested: Tested | None) -> str:
         return "the optics cannot be learned from this movie"
     why = f"median p-value {tested.median_p:.1g}"
     if tested.median_p >= REJECTED_P and tested.together is not None:
-        why = f"log Bayes factor of others {tested.together.log_bayes_factor:.3g}"
+        why = f"log Bayes factor {tested.together.log_bayes_factor:.3g} for other optics"
     return (
         f"the configured optics do not describe the brightest {min(tested.particles, TESTED)} "
         f"particles ({why}), and they cannot be learned from them"

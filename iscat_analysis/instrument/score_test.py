@@ -1,18 +1,19 @@
-"""Whether all pictures together speak against the configured optics: the sum of their scores.
+"""Test of the configured optics by the sum of the scores of all images.
 
-Each picture has a score and an information of the optics, with what is its own (place, mass, level)
-eliminated.  Nobody knows how far the optics are off: each parameter by its usual error, with a
-prior P that is normal.  For scores that sum to S with information I, the change of the optics has
-the posterior mean CS with C = (P⁻¹ + I)⁻¹, and optics that are off are by the factor
+Each image has a score and an information of the optics, with its own parameters (place, mass,
+level) eliminated.  The prior of the change of the optics is normal with covariance P, the square of
+the usual error of each parameter.  For scores that sum to S with information I, the change has the
+posterior mean CS with C = (P⁻¹ + I)⁻¹, and optics that are off are by the factor
 
     B = exp(½ SᵀCS) / √det(1 + PI)
 
 likelier than those that are right (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90, 773 (1995)).
-What is not ruled out by the pictures is an error of all masses: the configured optics are right
-with probability 1/(1 + B), and otherwise off by a change of covariance C + CS(CS)ᵀ.
+The remaining doubt about the optics is an error of all masses: the configured optics are right with
+probability 1/(1 + B), and otherwise off by a change of mean square C + CS(CS)ᵀ.
 
-Pictures that show something else, such as two particles at once, disagree among each other: they
-count for less by how much more their scores scatter than their information says.
+Images that show something else, such as two particles at once, disagree with each other.  Scores
+and information are divided by the ratio of the scatter of the scores to that expected from the
+information.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from iscat_analysis.trust.systematic import REJECTED_SHARE
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """What the sum of scores says of the optics.
+    """Change of the optics that the sum of scores asks for, and the evidence for it.
 
     Shapes: `change` (n,), `covariance` (n, n).
     """
@@ -51,11 +52,11 @@ class ScoreTest:
     change: FloatArray
     covariance: FloatArray
     log_bayes_factor: float
-    """That of optics which are off."""
+    """Of optics that are off, over the configured ones."""
 
     left_over: float
-    """Root mean square of what the change would explain of the pictures, over the pictures, times
-    its probability."""
+    """Part of the images that the change explains, over the images (root mean square), with the
+    probability of a change as a factor of its square."""
 
     @property
     def rejected(self) -> bool:
@@ -64,7 +65,7 @@ class ScoreTest:
 
     @property
     def doubt(self) -> OpticsCovariance:
-        """Errors that the configured optics may have, after all that the pictures say."""
+        """Errors that the configured optics may still have after the test."""
         off = float(expit(self.log_bayes_factor))
         matrix = off * (self.covariance + np.outer(self.change, self.change))
         return OpticsCovariance(names=self.names, matrix=tuple(map(tuple, matrix.tolist())))
@@ -77,9 +78,9 @@ def score_test(
     terms: Sequence[str] = (),
     mapper: Mapper = map,
 ) -> ScoreTest:
-    """Add up the scores of pictures, each fitted with the configured optics.
+    """Test the optics by images that were each fitted with the configured optics.
 
-    `terms` are coefficients of the field that are looked at beside the optics.
+    `terms` are coefficients of the field that are tested beside the optics.
     """
     names = (*free_names(tuple(FREE), settings, PRIMARY), *terms)
     usual = np.array([PARAMETERS[name].usual_error for name in names])
@@ -97,7 +98,7 @@ def score_test(
         information *= np.outer(usual, usual)
     total, asks = information.sum(axis=0), score.sum(axis=0)
     change = np.linalg.solve(np.eye(size) + total, asks)
-    # what pictures leave over that no change of the optics explains in all of them
+    # residual scores, which no common change of the optics explains
     disagreement = excess(total, score - information @ change, np.arange(count))
     widened = max(disagreement, 1.0)
     total, asks = total / widened, asks / widened

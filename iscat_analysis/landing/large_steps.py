@@ -43,17 +43,13 @@ def large_steps(
         dipole = fit_particle(landing, start, context.mode, z_range, level=True)
         if not may_be_large(landing, dipole):
             continue
-        found = [
-            (sign, *sphere)
-            for sign in (1, -1)
-            for likelihood in [landing if sign > 0 else _likelihood_of(context, chunk, step, sign)]
-            for sphere in [
-                recognised(
-                    likelihood, dipole, context.spheres_of(likelihood.model), z_range, level=True
-                )
-            ]
-            if sphere is not None
-        ]
+        found = []
+        for sign in (1, -1):
+            likelihood = landing if sign > 0 else _likelihood_of(context, chunk, step, sign)
+            spheres = context.spheres_of(likelihood.model)
+            sphere = recognised(likelihood, dipole, spheres, z_range, level=True)
+            if sphere is not None:
+                found.append((sign, *sphere))
         if found:
             sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
             at = StepFrame.undated(step.frame, stride)

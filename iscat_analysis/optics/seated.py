@@ -1,9 +1,9 @@
 """Images of spheres that stand on the coverslip: one number gives their size and their height.
 
-The picture of a small sphere says how bright it is and, by its phase, how high its centre is.  A
+The image of a small sphere shows its brightness and, by its phase, the height of its centre.  A
 sphere that touches the coverslip has its centre one radius above it, so that a known refractive
 index leaves the diameter as the only parameter beside the place, as the mass is of a dipole.  Which
-of several materials it is follows from the picture: each brightness goes with one height.
+of several materials it is follows from the image: each brightness goes with one height.
 
 The parameter z of these models is the gap between the sphere and the coverslip.
 """

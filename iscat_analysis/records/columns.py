@@ -151,7 +151,7 @@ EVENTS = (
     ),
     Column(
         "model", "text",
-        "What describes the picture, in mode mass: dipole, a sphere of fit.spheres, or none",
+        "What describes the image, in mode mass: dipole, a sphere of fit.spheres, or none",
         optional=True,
     ),
     Column(
@@ -275,7 +275,7 @@ TRACKS = (
     Column(
         "refractive_index", "positive",
         "Refractive index of a sphere of that diameter that scatters like mass_kda of [particle]; "
-        "with particle.model = \"mie\" or \"shell\", from pictures and diffusion together; "
+        "with particle.model = \"mie\" or \"shell\", from images and diffusion together; "
         "null for a material that absorbs", "index",
     ),
     Column(
@@ -324,7 +324,7 @@ TRACKS = (
            "systematic [kDa]", optional=True),
     Column(
         "optical_diameter_nm", "positive",
-        "Diameter of the sphere that the pictures of all frames show; of spheres, which have "
+        "Diameter of the sphere that the images of all frames show; of spheres, which have "
         "mass_kda from it [nm]", "optical diameter [nm]", optional=True,
     ),
     Column("sigma_optical_diameter_nm", "positive", "Its standard error [nm]", "σ [nm]",
@@ -333,7 +333,7 @@ TRACKS = (
            optional=True),
     Column(
         "optical_probability", "share",
-        "Posterior probability of that diameter among all that the pictures allow",
+        "Posterior probability of that diameter among all that the images allow",
         optional=True,
     ),
 )  # fmt: skip

@@ -55,6 +55,16 @@ def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:
     return make_rows(table, columns)
 
 
+def has_only(table: pd.DataFrame, known: frozenset[str]) -> BoolArray:
+    """Tell which rows have no status and no flag but these.
+
+    Shapes: result (rows,).
+    """
+    marks = zip(table["status"], table["flags"].fillna(""), strict=True)
+    return np.array([{status, *str(flags).split(";")} - {""} <= known for status, flags in marks],
+                    dtype=bool)  # fmt: skip
+
+
 def flagged(
     table: pd.DataFrame, flag: Status | TrackStatus, which: BoolArray | None = None
 ) -> pd.DataFrame:

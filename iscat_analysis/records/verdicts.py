@@ -58,7 +58,8 @@ _ADVICE = {
     "bleaches, blinks or moves, or another one is at the same place; the mass is that of the mean "
     "change.",
     Status.EXTENDED: "The image is wider than that of a point: the particle wiggles by more than "
-    "particle.wiggle_nm, or has separate parts; its mass is too small.",
+    "particle.wiggle_nm, or has separate parts, or the optics are not those configured; its mass "
+    "is too small.",
     Status.LARGE: "It is no dipole, so that its contrast does not give its mass: the column model "
     "says which sphere on the coverslip describes it, with its diameter.",
 }

@@ -1,7 +1,7 @@
 """The diameter of each sphere that moves, from all its frames together.
 
-fits of single frames → D of each track → pictures averaged along its path → one diameter for all
-frames → fits of single frames with those pictures, near that diameter
+fits of single frames → D of each track → images averaged along its path → one diameter for all
+frames → fits of single frames with those images, near that diameter
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LEAST_ABSORPTION = 1e-6
 """Imaginary part of an index from which a single index does not describe the material."""
 
 UNDETERMINED = 0.5
-"""Error of n − n_s, over its size, from which pictures and motion do not tell the index."""
+"""Error of n − n_s, over its size, from which images and motion do not determine the index."""
 
 LEAST_APART = 0.25
 """Logarithm of the ratio of two masses below which a maximum that was given up may be the best."""
@@ -55,7 +55,7 @@ class SphereTrack:
     and for that of D: (frames,) in the last column."""
 
     refraction: CommonSize | None = None
-    """Mass and index from pictures and motion together; none where the material absorbs light, or
+    """Mass and index from images and motion together; none where the material absorbs light, or
     D is not known."""
 
 
@@ -187,7 +187,7 @@ def _record(track: SphereTrack, correlation: Correlation | None) -> dict[str, fl
 def _refraction(
     track: SphereTrack, correlation: FloatArray | None, excess: float
 ) -> dict[str, float]:
-    """Give the refractive index and its error, where pictures and motion tell them."""
+    """Give the refractive index and its error, where images and motion determine them."""
     found, n_sample = track.refraction, track.model.optics.n_sample
     if found is None or not found.converged:
         return {}

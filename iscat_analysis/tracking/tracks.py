@@ -61,7 +61,7 @@ def judge_times(config: Config, frames: int, name: str) -> Iterator[str]:
     if rate is None:
         others = "positions and masses do not need it"
         if config.fits_sizes:
-            others = "pictures of spheres are taken for sharp, and where they move diameters suffer"
+            others = "spheres are fitted as if they rested, and if they move, diameters are wrong"
         yield (
             "camera.frame_rate_hz is not known, so that there is no diffusion coefficient: add it, "
             f"as in camera.frame_rate_hz = 331.0; {others}"

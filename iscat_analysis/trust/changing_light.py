@@ -5,10 +5,10 @@ change is found as a step.  A second particle at exactly the same place is rare,
 from that.  A particle that moves by a few nanometres, or wiggles, leaves a faint step beside it,
 within the distance that the microscope resolves.
 
-If particles take several frames to land, the rise of a faint one drowns in the noise of single
-frames.  The steps of a chunk of the movie tell together how they rise, and all are fitted with that
-rise.  Where they do not agree, a faint one may be fitted as a step, and its mass is too small.
-Bright ones show that this happens.
+If particles take several frames to land, noise hides the rise of a faint one.  The duration of the
+rise is therefore estimated from all steps of a chunk of the movie, and all are fitted with it.  If
+their durations differ, a faint particle may still be fitted as a step, and its mass is too small;
+the rises of bright particles show whether this may happen.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LEAST_MASS_RATIO = 3.0
 # ever is exceeded: four of a difference of two.
 _LARGEST_CHANGE = 4 * math.sqrt(2)
 # Mass of a particle over that of a step beside it, from which on it may have moved: 20 nm change a
-# picture by a fifth.
+# image by a fifth.
 _LEAST_MASS_RATIO_BESIDE = 5.0
 _BESIDE = 0.61  # λ/NA within which that is
 # Ratio of masses up to which two steps close in time may be two halves of one landing.
@@ -126,8 +126,8 @@ def may_rise(
 ) -> tuple[BoolArray, float]:
     """Flag steps that may rise slowly without showing it, and give the duration of rises.
 
-    Steps at the place of a particle that is there tell nothing of landings.  If many of the visible
-    rises go on rising after the end of their lines, all steps may.  A line over r frames and the
+    Steps at the place of a particle that is there are no landings, and are left out.  If many
+    rises continue after the end of their lines, all steps may.  A line over r frames and the
     nearest step differ by r/12 times the squared signal-to-noise ratio of one frame, half of which
     is the gain in log-likelihood.
 
@@ -156,8 +156,10 @@ def rise_message(frames: float, unseen: int, rising: int, rows: int) -> str:
     """Say that particles take several frames to land; empty where they do not."""
     if not frames:
         return ""
-    also = f"; {unseen} that may rise on unseen are flagged changing" if unseen else ""
+    also = ""
+    if unseen:
+        also = f"; {unseen} steps may rise unseen: their masses may be too small, flagged changing"
     return (
         f"the light of {rising} of {rows} steps rises over some {math.ceil(frames)} frames, which "
-        f"stay out of their fits{also}"
+        f"are left out of their fits{also}"
     )

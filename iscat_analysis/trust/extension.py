@@ -1,24 +1,23 @@
-"""Particles whose pictures are wider than a point's: they wiggle, or have parts that are apart.
+"""Particles whose images are wider than a point's: they wiggle, or have parts that are apart.
 
-Three things tell the variance v of a particle's places along each axis.  The width of its pictures,
-which is weak, since a wider picture is nearly a fainter one.  Their length, for particles that lie
-at random: parts that are apart make pictures long, each its own way, and a covariance of places has
-a mean variance v at least as large as half of what one axis has beyond the other.  And time:
-particles that wiggle from frame to frame have positions that scatter from frame to frame by more
-than the noise of places without a particle, on the side of the step where they are.  What moves
-within a frame does not scatter from frame to frame.
+Three measurements estimate v, the variance of a particle's places along each axis:
 
-Before the movie, √v is positive and normal with the standard deviation `uncertainty.wiggle_nm`.
-Length and time show a share of v: nothing in half of all cases (a wiggle has no direction, parts
-that are apart do not move), any share with the same probability in the others.  With the width,
-this gives the posterior of v.  A mass that was fitted with a point is too small by its derivative
-times v.  Nothing is added to it, so that its error is this derivative times the root mean square of
-v (GUM, F.2.4.5).
+- The width of its images.  It is weak, since a wider image is nearly a fainter one.
+- Their elongation.  Parts that are apart elongate every image in its own direction, and v is at
+  least half of the difference between the variances along the long and the short axis.
+- Time.  Particles that wiggle from frame to frame have positions that scatter from frame to frame
+  by more than the noise at places without a particle.  Motion within a frame does not show so.
 
-Optics that were learned from the same pictures imitate a part of the width.  With R the correlation
-of v and the optics, the pictures show (1 − R²) v, and masses change by what they do when the optics
-follow.  The noise of what is shown is taken as large as without learning: at most it is that, and
-it falls to the root of 1 − R² only where optics were learned from the very same light.
+The prior of √v is a half-normal law with the standard deviation `uncertainty.wiggle_nm`.
+Elongation and time show a share of v: with probability one half none (a wiggle has no direction,
+parts that are apart do not move), otherwise any share with equal probability.  With the width, this
+gives the posterior of v.  A mass that was fitted with a point is too small by its derivative times
+v.  Masses are not corrected, so that their error is this derivative times the root mean square of v
+(GUM, F.2.4.5).
+
+Optics that were learned from the same images imitate a part of the width.  With R the correlation
+of v and the optics, the images show (1 − R²) v, and masses change by what they do when the optics
+follow.  The noise of the width is taken as large as without learning, which is its upper limit.
 """
 
 from __future__ import annotations
@@ -31,27 +30,28 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from scipy.integrate import cumulative_trapezoid
+from scipy.optimize import brentq
 from scipy.special import chdtrc, chdtri, ndtri
 
 from iscat_analysis.config import Config
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
 from iscat_analysis.optics.forward import forward_model
-from iscat_analysis.records import BoolArray, FloatArray, Status
+from iscat_analysis.records import BoolArray, FloatArray, Status, has_only
 from iscat_analysis.trust.response import response_of
 
 FEWEST = 6
 """Events without which no spread is called common to all particles."""
 
 _SIGNIFICANT = 4.0  # standard errors of the mean variance beyond which all particles have it
-_CHANCE = 1e-5  # of one event that is flagged with no spread
+_CHANCE = 1e-5  # probability that the image of a point is flagged
 # Shift of a mass, in σ, from which on its row is flagged where all particles are extended.
 _LEAST_SHIFT_SIGMAS = 0.5
 _OUTLIER_SIGMAS = 4.0  # standard errors beyond which an event is not one of many
 _JUDGED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 _HIDDEN = 0.5  # probability that length, or time, shows nothing of a spread
 _WIDER_PRIOR = 2.0  # standard deviation of the prior over a √v that is clear
-_LEAST_LEFT = 1e-3  # share of a width that learned optics leave over, beneath which it is rounding
+_LEAST_LEFT = 1e-3  # share of a width that learned optics do not imitate; less is rounding
 _STEPS, _REACH_SIGMAS = 1000, 6.0  # of the √v over which the posterior is summed
 
 LogLikelihood = Callable[[FloatArray], FloatArray]
@@ -59,27 +59,27 @@ LogLikelihood = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Extension:
-    """What all events say of the width of their pictures.
+    """Width of the images of all events, beyond that of the model.
 
     Attributes
     ----------
     variance_nm2, variance_se_nm2 : float
-        Mean variance of places along each axis beyond what the model has, as the widths of the
-        pictures alone show it, and its error [nm²].
+        Mean variance of places along each axis beyond that of the model, estimated from the widths
+        of the images alone, and its error [nm²].
     mean_nm2, sd_nm2 : float
         Mean and standard deviation of its posterior [nm²].
     is_common : bool
         Whether all particles are extended.
     is_long : bool
-        Whether their pictures are long, each in its own direction.
+        Whether their images are elongated, each in its own direction.
     long : ndarray of bool
-        Rows whose own picture is.
+        Rows whose own image is elongated.
     flagged : ndarray of bool
         Rows whose masses are too small because of it.
     mass_shift_kda : ndarray
-        By how much every mass may be too small [kDa].
+        Amount by which every mass may be too small [kDa].
     paired : int
-        Rows that have the mass of two halves instead.
+        Number of rows whose mass is that of two halves.
     """
 
     variance_nm2: float
@@ -104,11 +104,9 @@ class Extension:
         learned_optics: bool = False,
     ) -> Extension | None:
         """Estimate the extension from all rows, beyond a known wiggle; None without evidence."""
-        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
         q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
         known = np.isfinite(q) & np.isfinite(se) & np.isfinite(evidence.sigma_across_nm2)
-        many = good & known
+        many = has_only(table, _JUDGED) & known
         if not many.any():
             return None
         left, per_mass = _beside_learned_optics(config, table) if learned_optics else (1.0, None)
@@ -124,7 +122,7 @@ class Extension:
         clear = [variance for variance, sigmas in found if sigmas > _SIGNIFICANT]
         is_common = bool(clear and many.sum() >= FEWEST)
         prior_sd = config.uncertainty.wiggle_nm
-        if is_common:  # a prior that knew nothing of what is clear would hold it down
+        if is_common:  # a narrow prior would pull a clear width towards zero
             prior_sd = max(prior_sd, _WIDER_PRIOR * math.sqrt(max(clear)))
         middle, sd = _posterior(
             (mean, error), prior_sd, length.log_likelihood, _normal(moved, moved_se)
@@ -157,23 +155,25 @@ class Extension:
 
     @property
     def message(self) -> str:
-        """Message for the user; empty where pictures are as wide as the model's."""
+        """Message for the user; empty where images are as wide as the model's."""
         if not self.is_common:
             return ""
         two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         wide = math.sqrt(self.mean_nm2)
         error = self.sd_nm2 / (2 * wide)
         return (
-            f"pictures are wider than a point's, as of particles that wiggle by {wide:.1f} ± "
-            f"{error:.1f} nm along each axis beyond particle.wiggle_nm, or have parts that are "
-            "apart: masses are too small, flagged extended where by more than half of σ; set "
-            "particle.wiggle_nm to it (adding squares), if all particles may move alike, or "
-            f"fit.pairs = true, if they may be two halves{two}"
+            f"images are wider than a point's by a variance of ({wide:.1f} ± {error:.1f} nm)² "
+            "along each axis: particles wiggle or have parts that are apart, or wavelength, NA, "
+            "focus or pixel size are not those configured, or the illumination is a cone, or "
+            "pixels were averaged; masses are too small, and rows are flagged extended where by "
+            "more than half of σ; check the optics first; then set particle.wiggle_nm to it "
+            "(adding squares) if all particles wiggle alike, or fit.pairs = true if they may be "
+            f"two halves{two}"
         )
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """What ``summary.json`` says."""
+        """The section of ``summary.json``."""
         return {
             "variance_nm2": self.variance_nm2,
             "variance_se_nm2": self.variance_se_nm2,
@@ -187,7 +187,7 @@ class Extension:
 def _posterior(
     width: tuple[float, float], prior_sd_nm: float, *shares: LogLikelihood
 ) -> tuple[float, float]:
-    """Mean and standard deviation of v, given its width and what a share of it shows [nm²]."""
+    """Mean and standard deviation of v from the width and from measurements of a share [nm²]."""
     mean, error = width
     reach = math.sqrt(max(mean, 0.0) + _REACH_SIGMAS * error)
     root = np.linspace(0.0, min(reach, _REACH_SIGMAS * prior_sd_nm), _STEPS)
@@ -203,7 +203,7 @@ def _posterior(
 
 
 def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
-    """Likelihood of v of which nothing is shown, or any share.
+    """Likelihood of v if a measurement shows nothing of it, or any share.
 
     Shapes: `v` (n,), which rises from 0; result (n,).
     """
@@ -219,7 +219,7 @@ def _normal(mean: float, error: float) -> LogLikelihood:
 
 
 def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float | None]:
-    """Share of a width that learned optics leave over, and the share of mass lost per variance."""
+    """Share of a width that learned optics do not imitate, and the mass lost per variance."""
     errors = config.optics.covariance
     if errors is None:
         return 1.0, None
@@ -232,20 +232,30 @@ def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, 
 def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
     """Weighted mean and its error, without those far from the median.
 
+    Particles that differ by more than their errors have a scatter τ of their own, and the weight
+    1/(σ² + τ²), so that the brightest ones weigh no more than others (R. C. Paule and J. Mandel,
+    J. Res. NBS 87, 377, 1982).
+
     Shapes: `q, se` (n,).
     """
     away = np.abs(q - np.median(q))
-    wide = np.sqrt((1.48 * np.median(away)) ** 2 + se**2)
-    kept = away <= _OUTLIER_SIGMAS * wide
-    weight = se[kept] ** -2.0
-    mean = float(np.average(q[kept], weights=weight))
-    chi2_reduced = float(np.sum(weight * (q[kept] - mean) ** 2)) / max(int(kept.sum()) - 1, 1)
-    return mean, math.sqrt(max(chi2_reduced, 1.0) / float(weight.sum()))
+    kept = away <= _OUTLIER_SIGMAS * np.hypot(1.48 * np.median(away), se)
+    q, variance = q[kept], se[kept] ** 2
+
+    def excess(scatter: float) -> float:
+        mean = np.average(q, weights=1 / (variance + scatter))
+        return float(np.sum((q - mean) ** 2 / (variance + scatter))) - (q.size - 1)
+
+    scatter = 0.0
+    if excess(0.0) > 0:
+        scatter = float(brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
+    weight = 1 / (variance + scatter)
+    return float(np.average(q, weights=weight)), 1 / math.sqrt(float(weight.sum()))
 
 
 @dataclass(frozen=True)
 class _Length:
-    """How long pictures are, each in its own direction; what all have in common is of the optics.
+    """Elongation of images, each in its own direction; a common elongation comes from the optics.
 
     Attributes
     ----------
@@ -265,7 +275,7 @@ class _Length:
 
         Shapes: `across, along, sigma` (n,).
         """
-        parts = [part - np.average(part, weights=sigma**-2.0) for part in (across, along)]
+        parts = [part - _mean(part, sigma)[0] for part in (across, along)]
         squares = (parts[0] ** 2 + parts[1] ** 2) / sigma**2
         kept = squares <= np.median(squares) * _OUTLIER_SIGMAS**2
         n = int(kept.sum())
@@ -275,18 +285,18 @@ class _Length:
 
     @property
     def variance_nm2(self) -> float:
-        """Half of what the variance along one axis has beyond the other [nm²]."""
+        """Half of the difference between the variances along both axes [nm²]."""
         return math.sqrt(max(self.squares - self.dof, 0.0) / self.precision)
 
     @property
     def significance(self) -> float:
-        """Standard deviations of a normal law that are as rare as pictures so long by chance."""
+        """Significance of the elongation, in standard deviations of a normal law."""
         return -float(ndtri(chdtrc(self.dof, self.squares))) if self.dof else 0.0
 
     def log_likelihood(self, variance: FloatArray) -> FloatArray:
-        """Of half of what the variance along one axis has beyond the other.
+        """Log-likelihood of half the difference between the variances along both axes.
 
-        The sum of squares is of a noncentral χ² law, which is normal for many events.
+        The sum of squares follows a noncentral χ² law, which is normal for many events.
 
         Shapes: `variance` (n,), result (n,).
         """

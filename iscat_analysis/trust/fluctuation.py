@@ -1,4 +1,4 @@
-"""Contrast of particles that fluctuates slowly while they are there, and what is left in the mean.
+"""Contrast of particles that fluctuates while they are there, and the error of its mean.
 
 Particles breathe, turn or move in the light, so that the contrast of event i in frame t is
 a_i (1 + ε_t), with ε of variance s² and correlation exp(−t/τ), the same law for all particles of a
@@ -35,11 +35,11 @@ from scipy.special import logsumexp
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.split_frames import MODES, spectra_of
-from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, BoolArray, FloatArray, Status, has_only
 
 _PRIOR = 0.1  # probability that a movie fluctuates, before its frames are looked at
 _ALONE = 0.05  # probability that an event changes on its own
-_SEEN = 0.75  # probability from which it is told; one event alone gives 0.69
+_SEEN = 0.75  # probability for a message; one event alone gives 0.69
 _RELATIVE = np.geomspace(0.01, 0.3, 60)
 _CORRELATIONS = np.geomspace(2.0, 1000.0, 20)  # frames
 _SLOWEST = 4.0  # correlation time over the frames that show it; slower is a course
@@ -54,7 +54,7 @@ class Fluctuation:
     Attributes
     ----------
     probability : float
-        Of that there is one.
+        Probability that contrasts fluctuate.
     relative : float
         Standard deviation over the contrast, if there is one.
     relative_se : float
@@ -62,7 +62,7 @@ class Fluctuation:
     frames : float
         Correlation time [frames].
     variance_kda2 : ndarray
-        What it adds to the variance of every mass [kDa²].
+        Its contribution to the variance of every mass [kDa²].
     """
 
     probability: float
@@ -80,7 +80,7 @@ class Fluctuation:
         achieved: Mapping[str, EmpiricalSpread],
         shared_place: BoolArray,
     ) -> Fluctuation | None:
-        """Look for it in the frames of all events; None where the frames speak against it.
+        """Estimate it from the frames of all events; None where steady contrasts are likelier.
 
         A small step at the place of another particle shows the fluctuation of that one, too large
         for the mass of its own, and is left out.
@@ -94,9 +94,7 @@ class Fluctuation:
         before, after = (table[name].to_numpy(float) for name in ("n_before", "n_after"))
         there = np.where(mass > 0, after, before)
         one = crb**2 * before * after / (before + after)  # variance of a single frame
-        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= _JUDGED for s, f in marks], dtype=bool)
-        good &= np.isfinite(mass**2 / one) & ~shared_place
+        good = has_only(table, _JUDGED) & np.isfinite(mass**2 / one) & ~shared_place
         if not good.any():
             return None
         spectra = spectra_of(np.stack(repeats)[good])
@@ -127,7 +125,7 @@ class Fluctuation:
 
     @property
     def is_seen(self) -> bool:
-        """Whether it is probable enough to be told."""
+        """Whether it is probable enough for a message."""
         return self.probability > _SEEN
 
     @property
@@ -138,13 +136,13 @@ class Fluctuation:
         frames = float(f"{self.frames:.2g}")
         return (
             f"contrasts fluctuate by {100 * self.relative:.2g} ± {100 * self.relative_se:.1g} % "
-            f"while particles are there, over some {frames:g} frames: sigma_mass_kda has "
-            "what is left of that in the mean of an event's frames, beyond the noise of the light"
+            f"while particles are there, over some {frames:g} frames: masses have the error that "
+            "remains in the mean over an event's frames, and sigma_mass_kda contains it"
         )
 
     @property
     def summary(self) -> Mapping[str, Any]:
-        """What ``summary.json`` says."""
+        """The section of ``summary.json``."""
         return {
             "probability": self.probability, "relative": self.relative,
             "relative_se": self.relative_se, "frames": self.frames,

@@ -14,7 +14,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.inference.height_spread import HeightSpread, spread_of_heights
 from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.inference.nuisances import Evidence
-from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.records import FloatArray, Status, has_only
 
 _DESCRIBED = frozenset({Status.OK.value, Status.POOR_FIT.value})
 """Verdicts with which a height can still be read; a height that is held makes fits poor itself."""
@@ -35,9 +35,8 @@ class Heights:
     ) -> Heights | None:
         """Estimate the heights from all rows; None where there are too few."""
         held = not has_prior(config)
-        kinds = _DESCRIBED if held else {Status.OK.value}
-        marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-        good = np.array([{s, *str(f).split(";")} - {""} <= kinds for s, f in marks])
+        kinds = _DESCRIBED if held else frozenset({Status.OK.value})
+        good = has_only(table, kinds)
         spread = spread_of_heights(evidence.z_nm[good], evidence.sigma_z_nm[good])
         if spread is None:
             return None

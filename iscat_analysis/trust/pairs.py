@@ -1,9 +1,9 @@
-"""Particles that are wider than points get the mass of two halves, where the halves are told.
+"""Particles of two halves get the mass of two halves, where their light shows that they are two.
 
-Halves are told where pictures are long, each in its own direction: what wiggles makes them wide.
-That is known of the whole movie, or of a picture that is clearly long.  So is the distance by which
-it is decided whether the light of a row tells it: a rule about the distance that each picture shows
-would choose those that noise has made longer.
+Two halves make elongated images, each in its own direction; wiggling makes images only wider.
+A row counts as two halves if its own image is clearly elongated, or if the images of the movie are
+and the error of the distance in this row is small beside the distance of the movie.  The distance
+that the row itself shows is no criterion: it would select rows that noise has made longer.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from iscat_analysis.inference.fit import POOR_FIT_P
 from iscat_analysis.records import BoolArray, Status
 from iscat_analysis.trust.extension import Extension
 
-_TOLD_SIGMAS = 2.0  # of the square of the distance, beyond which its error is nearly normal
+_SURE_SIGMAS = 2.0  # of the square of the distance, beyond which its error is nearly normal
 _REPLACED = {
     "mass_kda": "pair_mass_kda",
     "sigma_mass_kda": "sigma_pair_mass_kda",
@@ -26,11 +26,11 @@ _REPLACED = {
 
 
 def told_as_pairs(table: pd.DataFrame, extension: Extension) -> BoolArray:
-    """Tell which extended rows get the mass of two halves."""
+    """Select the extended rows that get the mass of two halves."""
     square_sigma = 2 * table["separation_nm"] * table["sigma_separation_nm"]
     of_movie = 8 * extension.mean_nm2 if extension.is_long else 0.0  # v is d²/8
-    told = (of_movie > _TOLD_SIGMAS * square_sigma) | extension.long
-    return np.asarray(told & table["pair_mass_kda"].notna() & extension.flagged)
+    two = (of_movie > _SURE_SIGMAS * square_sigma) | extension.long
+    return np.asarray(two & table["pair_mass_kda"].notna() & extension.flagged)
 
 
 def with_masses_of_pairs(table: pd.DataFrame, which: BoolArray) -> pd.DataFrame:
@@ -39,10 +39,8 @@ def with_masses_of_pairs(table: pd.DataFrame, which: BoolArray) -> pd.DataFrame:
     for name, by in _REPLACED.items():
         out.loc[which, name] = table.loc[which, by]
     for row in out.index[which & (table["pair_p_value"] >= POOR_FIT_P).to_numpy()]:
-        flags = [f for f in str(out.at[row, "flags"] or "").split(";") if f not in ("", _POOR)]
+        known = str(out.at[row, "flags"] or "").split(";")
+        flags = [flag for flag in known if flag not in ("", Status.POOR_FIT)]
         out.at[row, "flags"] = ";".join(flags)
         out.at[row, "status"] = flags[0] if flags else Status.OK.value
     return out
-
-
-_POOR = Status.POOR_FIT.value

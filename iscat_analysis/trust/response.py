@@ -34,7 +34,7 @@ _UNDETERMINED = 1e-7  # of the information, below which pictures do not tell a p
 
 
 class Shifts(NamedTuple):
-    """What a picture that differs from the model does to a fit.
+    """Shifts of a fit whose image differs from the model.
 
     Attributes
     ----------
@@ -43,7 +43,7 @@ class Shifts(NamedTuple):
     optics : ndarray
         Shifts of the learned optics, (k,).
     left : float
-        Share of the information about the difference that learned optics leave over.
+        Share of the information about the difference that learned optics do not imitate.
     """
 
     amplitude: float

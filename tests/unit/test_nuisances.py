@@ -218,6 +218,26 @@ def test_positions_that_scatter_from_frame_to_frame_are_a_wiggle() -> None:
     assert not Extension.of(CONFIG, rows(40), told, in_time(0.0)).flagged.any()
 
 
+@pytest.mark.parametrize("bright", [1, 2])
+def test_a_few_bright_wide_particles_do_not_make_all_particles_wide(bright: int) -> None:
+    """Their errors are thirty times smaller than those of forty proteins, which are points."""
+    rng = np.random.default_rng(14)
+    events = 40 + bright
+    wide = np.arange(events) >= 40
+    width, across, along = np.where(wide, 1000.0, 300.0 * rng.normal(size=(3, events)))
+    error = np.where(wide, 10.0, 300.0)
+    told = of_many(width, 1.0, across, along)._replace(
+        sigma_spread_nm2=error, sigma_across_nm2=error, chi2_spread=np.where(wide, 1e4, 3.0)
+    )
+    table = rows(events).assign(status=np.where(wide, "poor_fit", "ok"))
+    found = Extension.of(CONFIG, table, told, {})
+    assert not found.is_common
+    assert not found.is_long
+    assert np.array_equal(found.flagged, wide)
+    assert found.variance_nm2 < SIGMAS * found.variance_se_nm2
+    assert found.variance_se_nm2 < 2 * 300.0 / 40**0.5  # proteins still say how wide they are
+
+
 # ---- what a movie does not know of widths ------------------------------------------------------
 
 
