@@ -88,9 +88,11 @@ class Config(Section):
                 raise ValueError(refusal)
         elif self.fit.mode == "size":
             raise ValueError(
-                'fit.mode = "size" fits spheres, and particle.model is "dipole": set '
-                'particle.model = "mie" or "shell"'
+                'fit.mode = "size" fits spheres, and particle.model is '
+                f'"{self.particle.model}": set particle.model = "mie" or "shell"'
             )
+        elif self.particle.is_rod and (refusal := rod_refusal(self)):
+            raise ValueError(refusal)
         return self
 
     @model_validator(mode="after")
@@ -202,6 +204,47 @@ class Config(Section):
 INVISIBLE = 1e-3
 """Relative difference between the indices of a particle and of the sample below which the particle
 is not seen."""
+
+
+ROD_PER_WAVE = 1 / 8
+"""Longest rod over the wavelength in the sample.
+
+The light that the two halves of an upright rod scatter back is out of phase by then, and the rod
+scatters 6 % less than its dipole, (k L)²/10."""
+
+
+def rod_refusal(config: Config) -> str:
+    """Say why a configuration does not go together with a rod; else nothing."""
+    particle, optics = config.particle, config.optics
+    for key, is_set in (
+        ('optics.psf = "measured"', optics.psf == "measured"),
+        ('optics.convention = "dong2021"', optics.convention == "dong2021"),
+        ('optics.emission = "dong2021"', optics.emission == "dong2021"),
+        ('optics.calibrate = "always"', optics.calibrate == "always"),
+        ("[calibration]", config.calibration is not None),
+        ("particle.wiggle_nm", particle.wiggle_nm > 0),
+        ("particle.height_sd_nm", particle.height_sd_nm > 0),
+        (f'particle.height_nm = "{particle.height_nm}"', isinstance(particle.height_nm, str)),
+    ):
+        if is_set:
+            return (
+                f'{key} is for round particles, and particle.model is "rod": leave it out, or set '
+                'particle.model = "dipole"'
+            )
+    index, longest = particle.given_index, optics.wavelength_nm / optics.n_sample * ROD_PER_WAVE
+    if index is not None and abs(index / optics.n_sample - 1) < INVISIBLE:
+        return (
+            f"the refractive index of the particle is that of the sample, optics.n_sample = "
+            f"{optics.n_sample:g}: such a particle scatters no light"
+        )
+    if particle.nominal_length_nm > longest:
+        return (
+            f"a rod of particle.aspect_ratio = {particle.aspect_ratio:g} and the volume of a "
+            f"sphere of {particle.nominal_diameter_nm:.4g} nm is {particle.nominal_length_nm:.4g} "
+            f"nm long, and rods are dipoles, which is true up to {longest:.3g} nm, an eighth of "
+            "the wavelength in the sample: give a smaller mass, or a smaller aspect ratio"
+        )
+    return ""
 
 
 def sphere_refusal(config: Config) -> str:
