@@ -21,6 +21,7 @@ from iscat_analysis.config.instrument import CameraConfig, Optics, Particle
 from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.units import sphere_diameter_nm
 
 
@@ -245,6 +246,15 @@ def rod_refusal(config: Config) -> str:
             "the wavelength in the sample: give a smaller mass, or a smaller aspect ratio"
         )
     return ""
+
+
+def refuse_rod(config: Config, what: str) -> None:
+    """Refuse what a rod does not go together with, because its direction is not fitted."""
+    if config.particle.is_rod:
+        raise ConfigError(
+            f'particle.model = "rod": {what}; rods have pictures and bounds (psf, crb, '
+            "iscat simulate, iscat bounds)"
+        )
 
 
 def sphere_refusal(config: Config) -> str:

@@ -237,10 +237,19 @@ class Likelihood:
         """`score_fisher` of a model whose picture is not proportional to the amplitude."""
         x, y, z, amplitude, level = (float(value) for value in point)
         signal, own = self.model.amplitude_gradient(self.grid, x, y, z, amplitude)
-        terms = self.noise.terms(self.data, signal, level)
+        return self.score_of(signal, own, level)
+
+    def score_of(
+        self, signal: FloatArray, slopes: FloatArray, level: float
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """`score_fisher` of any signal; its slopes are along x, y, z, a and what follows the level.
+
+        Shapes: `signal` (ny, nx), `slopes` (n, ny, nx), results (), (n + 1,), (n + 1, n + 1).
+        """
+        terms, size = self.noise.terms(self.data, signal, level), len(slopes) + 1
         if not math.isfinite(terms.value):
-            return -np.inf, np.full(5, np.nan), np.full((5, 5), np.nan)
-        rows = np.concatenate([own * terms.by_signal, terms.by_level[None]]).reshape(5, -1)
+            return -np.inf, np.full(size, np.nan), np.full((size, size), np.nan)
+        rows = np.insert(slopes * terms.by_signal, LEVEL, terms.by_level, axis=0).reshape(size, -1)
         score = rows @ terms.score.ravel()
         return terms.value, score, (rows * terms.information.ravel()) @ rows.T
 

@@ -128,10 +128,4 @@ def _score_fisher(
     """
     rows, along = _rows(likelihood, theta)
     signal, *own = np.moveaxis(rows, 1, 0)[:5]
-    terms = likelihood.noise.terms(likelihood.data, signal, float(theta[LEVEL]))
-    if not math.isfinite(terms.value):
-        return -math.inf, np.full(7, np.nan), np.full((7, 7), np.nan)
-    by_signal = [each * terms.by_signal for each in (*own, *along)]
-    every = np.array([*by_signal[:4], terms.by_level, *by_signal[4:]]).reshape(7, -1)
-    score = every @ terms.score.ravel()
-    return terms.value, score, (every * terms.information.ravel()) @ every.T
+    return likelihood.score_of(signal, np.array([*own, *along]), float(theta[LEVEL]))
