@@ -249,11 +249,11 @@ def rod_refusal(config: Config) -> str:
 
 
 def refuse_rod(config: Config, what: str) -> None:
-    """Refuse what a rod does not go together with, because its direction is not fitted."""
+    """Refuse what does not know the direction of a rod as a parameter."""
     if config.particle.is_rod:
         raise ConfigError(
-            f'particle.model = "rod": {what}; rods have pictures and bounds (psf, crb, '
-            "iscat simulate, iscat bounds)"
+            f'particle.model = "rod": {what}; there are pictures, bounds and fits of '
+            "rods (psf, crb, fit_rods, iscat simulate, iscat bounds)"
         )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis.config import Config, refuse_rod
+from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import BoolArray, array_of, number_in, real_array, truth_in
 from iscat_analysis.inference.counts import KNOWN, MEAN, choose_noise, counts_likelihood
@@ -89,7 +89,6 @@ def gather(
 
     Shapes: `before, after` (n, y, x).
     """
-    refuse_rod(config, "directions are not fitted")
     frames_before = int(number_in("n_before", n_before, least=0, whole=True))
     frames_after = int(number_in("n_after", n_after, least=1, whole=True))
     events = real_array("after", after)

@@ -159,7 +159,7 @@ def analyse(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
             "numpy.save, and give its path; or leave `scheduler` out"
         )
-    refuse_rod(config, "directions are not fitted")
+    refuse_rod(config, "iscat-fit does not fit directions")
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)
