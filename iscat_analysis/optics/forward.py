@@ -34,9 +34,9 @@ from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.sized import sized
-from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.optics.spheres import Sphere, sphere_of
 from iscat_analysis.optics.waves import RadialField, check_table, field_of
 from iscat_analysis.units import KILODALTON_KG, NM

@@ -92,7 +92,7 @@ def depolarisation(aspect_ratio: float) -> float:
 
 
 def _basis(optics: Optics) -> ComplexArray:
-    """Unit vectors along the polarisation, across it and along the optical axis, as rows."""
+    """Give unit vectors along the polarisation, across it and along the axis of light, as rows."""
     if optics.polarization == "circular":
         return np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, math.sqrt(2)]]) / math.sqrt(2)
     c, s = (f(math.radians(optics.polarization_deg)) for f in (math.cos, math.sin))

@@ -27,4 +27,13 @@ from iscat_analysis.pieces.limits import crb, qcrb
 from iscat_analysis.pieces.regions import fit_rois
 from iscat_analysis.pieces.rods import fit_rods
 
-__all__ = ["Camera", "LogLikelihood", "crb", "fit_rods", "fit_rois", "log_likelihood", "psf", "qcrb"]
+__all__ = [
+    "Camera",
+    "LogLikelihood",
+    "crb",
+    "fit_rods",
+    "fit_rois",
+    "log_likelihood",
+    "psf",
+    "qcrb",
+]

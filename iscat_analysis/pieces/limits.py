@@ -83,8 +83,8 @@ def crb(
     Returns
     -------
     dict of str to ndarray
-        Standard deviations [nm, kDa, degrees] of the free parameters, by name, each of the shape of the
-        broadcast arguments; NaN where the image does not determine the parameter.
+        Standard deviations [nm, kDa, degrees] of the free parameters, by name, each of the shape of
+        the broadcast arguments; NaN where the image does not determine the parameter.
 
     Raises
     ------

@@ -82,8 +82,8 @@ def fit_rods(
         `maxima`, the number of directions with a maximum of their own; `other_azimuth_deg`,
         `other_tilt_deg`, `other_mass_kda` and `other_odds` of the next best, its likelihood over
         that of the best; `chi2_reduced` and `p_value`; and `status`, which is ``"ok"``,
-        ``"not_converged"``, ``"poor_fit"`` or ``"ambiguous_direction"``: another direction is likely with odds above
-        1 : 1000, or the direction is known to no better than 15 degrees.
+        ``"not_converged"``, ``"poor_fit"`` or ``"ambiguous_direction"``: another direction is
+        likely with odds above 1 : 1000, or the direction is known to no better than 15 degrees.
 
     Raises
     ------

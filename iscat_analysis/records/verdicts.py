@@ -86,8 +86,8 @@ SEVERITY = (
 )
 """Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; no
 dipole and so no mass; a model that does not describe the data, their change in time or their width;
-one of several diameters, heights or directions; a mass shared with a neighbour; pixels left out; a mass on the
-scale of other optics; counts that are not in proportion to the light; frames that were
+one of several diameters, heights or directions; a mass shared with a neighbour; pixels left out; a
+mass on the scale of other optics; counts that are not in proportion to the light; frames that were
 processed."""
 
 
