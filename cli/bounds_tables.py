@@ -46,9 +46,11 @@ def print_bounds(report: Mapping[str, Any]) -> None:
         at_once = {name: report["holevo"][name] for name in report["at"]["free"]}
         print_result(_bounds_table("for these photons", {**report["actual"], "holevo": at_once}))
         print_result(_information(report))
+        if "rod" in report:
+            print_result(_bounds_table("direction of the rod unknown", report["rod"]))
         if "detection" in report:
             print_result(_detection_table(report["detection"]))
-    for line in report["unidentifiable"]:
+    for line in (*report["unidentifiable"], *report.get("rod", {}).get("unidentifiable", ())):
         print_result(f"unidentifiable: {line}")
 
 

@@ -93,6 +93,7 @@ if TYPE_CHECKING:
     from iscat_analysis.pieces import Camera as Camera
     from iscat_analysis.pieces import LogLikelihood as LogLikelihood
     from iscat_analysis.pieces import crb as crb
+    from iscat_analysis.pieces import fit_rods as fit_rods
     from iscat_analysis.pieces import fit_rois as fit_rois
     from iscat_analysis.pieces import log_likelihood as log_likelihood
     from iscat_analysis.pieces import psf as psf
@@ -136,6 +137,7 @@ _HOME = {
     "Camera": "pieces",
     "Calibration": "config",
     "psf": "pieces",
+    "fit_rods": "pieces",
     "fit_rois": "pieces",
     "log_likelihood": "pieces",
     "LogLikelihood": "pieces",
@@ -247,6 +249,7 @@ __all__ = [
     "fit_kd",
     "fit_kinetics",
     "fit_movie",
+    "fit_rods",
     "fit_rois",
     "fit_stack",
     "forecast_optics",

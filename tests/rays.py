@@ -1,4 +1,4 @@
-"""Pictures of spheres as sums over all rays of the pupil, each field followed as a vector."""
+"""Pictures of spheres and dipoles: sums over all rays of the pupil, each field a vector."""
 
 from __future__ import annotations
 
@@ -37,8 +37,13 @@ def picture_of_rays(
     focused_nm: float,
     grid: PixelGrid,
     place_nm: tuple[float, float],
+    tensor: ComplexArray | None = None,
+    incident: tuple[complex, complex] = (1.0, 0.0),
 ) -> NDArray[np.float64]:
-    """Contrast of a sphere at a height; the focus is that of a particle at another height."""
+    """Contrast of a sphere at a height; the focus is that of a particle at another height.
+
+    With a `tensor` of polarisability [nm³] it is that of a dipole in light of any polarisation.
+    """
     o = optics
     k, ns, n = 2 * math.pi / o.wavelength_nm, o.n_sample, o.n_immersion
     x = ns * k * diameter_nm / 2
@@ -68,6 +73,9 @@ def picture_of_rays(
              * np.array([zeros, zeros, ahead + zeros]))  # fmt: skip
     assert np.abs(np.einsum("icj,icj->ij", along, ray)).max() < 1e-12
     far = 1j / (ns * k) * (s2[:, None, None] * along * c - s1[:, None, None] * across * s)
+    if tensor is not None:
+        dipole = tensor[:, :2] @ np.array(incident)
+        far = (ns * k) ** 2 / (4 * math.pi) * dipole[None, :, None] * np.ones_like(far)
     # the coverslip: p along the vector that lies in the plane of incidence, s across it
     p_vector = np.stack([cos_s[:, None] * c, cos_s[:, None] * s, sin_s[:, None] + 0 * c], 1)
     p = np.einsum("icj,icj->ij", far, p_vector)
@@ -91,4 +99,4 @@ def picture_of_rays(
             grid.y_nm.size, -1), along_x.reshape(grid.x_nm.size, -1), optimize=True)
         for e in (ex, ey)
     )  # fmt: skip
-    return np.asarray(np.abs(1 + ex) ** 2 + np.abs(ey) ** 2 - 1)
+    return np.asarray(np.abs(incident[0] + ex) ** 2 + np.abs(incident[1] + ey) ** 2 - 1)

@@ -25,6 +25,7 @@ class Pupil:
     weight: FloatArray
     transverse: FloatArray
     t_p_cos: ComplexArray
+    t_p_sin: ComplexArray
     t_s: ComplexArray
     axial: ComplexArray
     oil: FloatArray
@@ -104,6 +105,7 @@ def make_pupil(
         weight=weight,
         transverse=n_immersion * wavenumber * sin,
         t_p_cos=t_p * cos_s,
+        t_p_sin=t_p * (n_immersion * sin / n_sample),
         t_s=t_s,
         axial=wavenumber * n_sample * (cos_s + direction),
         oil=wavenumber * n_immersion * (cos - 1),

@@ -98,22 +98,25 @@ def event_bounds(
 
 
 def bounds_from_matrices(
-    fisher: FloatArray, quantum: FloatArray, free: tuple[str, ...]
+    fisher: FloatArray,
+    quantum: FloatArray,
+    free: tuple[str, ...],
+    names: tuple[str, ...] = PARAMETERS,
 ) -> EventBounds:
     """Turn a Fisher matrix and a quantum one into bounds.
 
-    Shapes: `fisher` (4, 4), `quantum` (4, 4).
+    Shapes: `fisher` (n, n), `quantum` (n, n), n = len(names).
     """
-    index = [i for i, name in enumerate(PARAMETERS) if name in free]
+    index = [i for i, name in enumerate(names) if name in free]
     seen = np.diag(fisher).copy()
     limit = np.diag(quantum)
     seen[~(seen > LEAST_INFORMATION_SHARE * limit)] = np.nan
-    single, joint, qcrb = (np.full(4, np.nan) for _ in range(3))
+    single, joint, qcrb = np.full((3, len(names)), np.nan)
     single[index] = 1 / np.sqrt(seen[index])
     positive = [i for i in index if limit[i] > 0]
     qcrb[positive] = 1 / np.sqrt(limit[positive])
     unidentifiable = [
-        Unidentifiable((PARAMETERS[i],), (1.0,)) for i in index if not math.isfinite(seen[i])
+        Unidentifiable((names[i],), (1.0,)) for i in index if not math.isfinite(seen[i])
     ]
     visible = [i for i in index if math.isfinite(seen[i])]
     if not visible:
@@ -129,14 +132,14 @@ def bounds_from_matrices(
         first = step[parts[0]]
         unidentifiable.append(
             Unidentifiable(
-                tuple(PARAMETERS[visible[k]] for k in parts),
+                tuple(names[visible[k]] for k in parts),
                 tuple(float(step[k] / first) for k in parts),
             )
         )
     involved = np.any(np.abs(vectors[:, null]) > LEAST_COMPONENT, axis=1)
     variance = np.sum(vectors[:, ~null] ** 2 / values[~null], axis=1)
     joint[visible] = np.where(involved, np.nan, scale * np.sqrt(variance))
-    weakest = np.full(4, 0.0)
+    weakest = np.zeros(len(names))
     weakest[visible] = vectors[:, 0]
     inflation = math.nan if unidentifiable else 1 / math.sqrt(values[0])
     return EventBounds(

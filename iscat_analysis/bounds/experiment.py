@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.classical import EventBounds, bounds_from_matrices, event_bounds
 from iscat_analysis.bounds.holevo import natural_bound
+from iscat_analysis.bounds.orientation import ROD_PARAMETERS, rod_bounds
 from iscat_analysis.bounds.quantum import (
     NAMES,
     incompatible_pairs,
@@ -23,8 +24,10 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
+from iscat_analysis.inference.orientation import rod_in
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
+from iscat_analysis.optics.rods import ANGLES, Rod
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
 
 FloatArray = NDArray[np.float64]
@@ -216,7 +219,7 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         alone = z_nm_phase_free(model, z_nm)
         per_photon["qcrb"]["z_nm_phase_free"] = alone
         actual["qcrb"]["z_nm_phase_free"] = alone / root_light
-    optics = config.optics
+    optics, rod = config.optics, rod_in(model)
     return {
         "at": {
             "scheme": optics.scheme,
@@ -254,6 +257,22 @@ def report_of(experiment: Experiment) -> dict[str, Any]:
         "convention": optics.convention,
         "emission": optics.emission,
         "warnings": warnings_of(experiment),
+        **({} if rod is None else {"rod": _with_angles(experiment, rod)}),
+    }
+
+
+def _with_angles(experiment: Experiment, rod: Rod) -> dict[str, Any]:
+    """Bounds of a rod whose direction is unknown beside the free parameters of the mode."""
+    free = (*FREE_PARAMETERS[experiment.config.fit.mode], *ANGLES)
+    found = rod_bounds(experiment.likelihood, experiment.theta, rod, free)
+    index = [ROD_PARAMETERS.index(name) for name in free]
+    return {
+        "aspect_ratio": experiment.config.particle.aspect_ratio,
+        "azimuth_deg": rod.azimuth_deg,
+        "tilt_deg": rod.tilt_deg,
+        "crb_single": _named(free, found.crb_single[index]),
+        "crb_joint": _named(free, found.crb_joint[index]),
+        "unidentifiable": [str(direction) for direction in found.unidentifiable],
     }
 
 

@@ -20,7 +20,7 @@ import pandas as pd
 from iscat_analysis.bounds.classical import event_bounds
 from iscat_analysis.bounds.experiment import detector, expected_likelihood
 from iscat_analysis.bounds.shared import displacement, eliminated, joint_information, shared_sigma
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.inference.likelihood import Likelihood
@@ -171,6 +171,7 @@ def forecast_optics(
     config: Config, *, events: int = EVENTS, free: str | Sequence[str] | None = None
 ) -> OpticsForecast:
     """Foresee what particles would tell of the microscope."""
+    refuse_rod(config, "optics are learned from round particles")
     names = _names(config, free)
     number_in("`events`", events, least=1, whole=True)
     model, grid = _model(config)

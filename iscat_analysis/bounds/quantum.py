@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.aperture import Aperture, aperture
 from iscat_analysis.optics.forward import ForwardModel
+from iscat_analysis.optics.rods import Rod
 from iscat_analysis.optics.sized import MASS_STEP, SizedModel
 
 FloatArray = NDArray[np.float64]
@@ -86,8 +87,9 @@ def quantum_information(
             out[i, j] = 4 * np.sum(slopes[i].conj() * slopes[j] * weight)
             out[j, i] = out[i, j].conj()
     out[np.diag_indices(4)] = out.diagonal().real
-    # the pupil is symmetric under reflection through its centre: exact zeros, not rounding
-    out[:2, 2:] = out[2:, :2] = 0.0
+    if not isinstance(opening.scatterer, Rod):
+        # the light is symmetric under reflection through the centre: exact zeros, not rounding
+        out[:2, 2:] = out[2:, :2] = 0.0
     return out
 
 
@@ -172,7 +174,7 @@ def _light(
 def _opening(model: ForwardModel, amplitude: float | None) -> Aperture:
     """Pupil with the light of a particle; the nominal one without an amplitude."""
     there = model.at(model.nominal_amplitude if amplitude is None else amplitude)
-    return aperture(model.optics, NODES, NODES, there.aperture.sphere)
+    return aperture(model.optics, NODES, NODES, there.aperture.scatterer)
 
 
 def _seen(opening: Aperture, light: Light) -> ComplexArray:

@@ -36,7 +36,7 @@ from iscat_analysis.config.instrument import (
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
-from iscat_analysis.config.schema import Config
+from iscat_analysis.config.schema import Config, refuse_rod
 from iscat_analysis.config.synthetic import (
     SIMULATED,
     BoundsConfig,
@@ -99,6 +99,7 @@ __all__ = [
     "parse_config",
     "plausible_pixel",
     "read_optics_file",
+    "refuse_rod",
     "toml_value",
     "with_absolute_paths",
 ]

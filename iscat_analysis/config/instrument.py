@@ -292,9 +292,10 @@ class Particle(Section):
     kind: Literal["gold", "silica", "polystyrene", "protein", "custom"] = Field(
         "protein", description='"gold" | "silica" | "polystyrene" | "protein" | "custom"'
     )
-    model: Literal["dipole", "mie", "shell"] = Field(
+    model: Literal["dipole", "mie", "shell", "rod"] = Field(
         "dipole",
-        description='"dipole" | "mie": a sphere of any size | "shell": a sphere in a shell',
+        description='"dipole" | "mie": a sphere of any size | "shell": a sphere in a shell | '
+        '"rod": a spheroid that is small',
     )
     permittivity: tuple[float, float] | None = Field(
         None, description="relative, [re, im]; replaces that of the kind"
@@ -304,6 +305,15 @@ class Particle(Section):
         None, description="thickness of the shell, a part of the diameter; for model shell"
     )
     shell_index: Index | None = Field(None, description="refractive index of the shell")
+    aspect_ratio: Annotated[float, Field(ge=1, le=20)] | None = Field(
+        None, description="length of a rod over its width; for model rod"
+    )
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] | None = Field(
+        None, description="direction of a rod in the image, from x towards y; for model rod"
+    )
+    tilt_deg: Annotated[float, Field(ge=0, le=180)] | None = Field(
+        None, description="angle between a rod and the optical axis; for model rod"
+    )
     density_kg_m3: Positive | None = Field(
         None,
         description="replaces that of the kind; for model shell, of core and shell together",
@@ -360,6 +370,12 @@ class Particle(Section):
                 raise ValueError(f'model = "shell" needs {name}')
             if self.model != "shell" and name != "density_kg_m3" and value is not None:
                 raise ValueError(f'{name} = {value:g} needs model = "shell"')
+        for name in ("aspect_ratio", "azimuth_deg", "tilt_deg"):
+            value = getattr(self, name)
+            if self.model == "rod" and value is None:
+                raise ValueError(f'model = "rod" needs {name}')
+            if self.model != "rod" and value is not None:
+                raise ValueError(f'{name} = {value:g} needs model = "rod"')
         if self.shell_nm is not None and self.shell_nm > self.nominal_diameter_nm / 2:
             raise ValueError(
                 f"shell_nm = {self.shell_nm:g} is more than the radius of a particle of "
@@ -387,9 +403,9 @@ class Particle(Section):
         """Mass that is given, as a mass or a diameter, else a typical one."""
         if self.mass_kda is not None:
             return self.mass_kda
-        if self.diameter_nm is None and self.kind == "protein" and self.model == "dipole":
+        if self.diameter_nm is None and self.kind == "protein" and not self.is_sphere:
             return TYPICAL_PROTEIN_KDA
-        typical = TYPICAL_DIAMETER_NM if self.model == "dipole" else TYPICAL_SPHERE_NM
+        typical = TYPICAL_SPHERE_NM if self.is_sphere else TYPICAL_DIAMETER_NM
         return sphere_mass_kda(self.diameter_nm or typical, self.density)
 
     @property
@@ -407,7 +423,17 @@ class Particle(Section):
     @property
     def is_sphere(self) -> bool:
         """Whether it is a sphere of any size, and no dipole."""
-        return self.model != "dipole"
+        return self.model in ("mie", "shell")
+
+    @property
+    def is_rod(self) -> bool:
+        """Whether it is a rod, whose dipole does not point along the light."""
+        return self.model == "rod"
+
+    @property
+    def nominal_length_nm(self) -> float:
+        """Length of a particle of the nominal mass along its longest axis [nm]."""
+        return self.nominal_diameter_nm * (self.aspect_ratio or 1.0) ** (2 / 3)
 
     @property
     def nominal_height_nm(self) -> float:

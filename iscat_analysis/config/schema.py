@@ -21,6 +21,7 @@ from iscat_analysis.config.instrument import CameraConfig, Optics, Particle
 from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
+from iscat_analysis.errors import ConfigError
 from iscat_analysis.units import sphere_diameter_nm
 
 
@@ -88,9 +89,11 @@ class Config(Section):
                 raise ValueError(refusal)
         elif self.fit.mode == "size":
             raise ValueError(
-                'fit.mode = "size" fits spheres, and particle.model is "dipole": set '
-                'particle.model = "mie" or "shell"'
+                'fit.mode = "size" fits spheres, and particle.model is '
+                f'"{self.particle.model}": set particle.model = "mie" or "shell"'
             )
+        elif self.particle.is_rod and (refusal := rod_refusal(self)):
+            raise ValueError(refusal)
         return self
 
     @model_validator(mode="after")
@@ -202,6 +205,56 @@ class Config(Section):
 INVISIBLE = 1e-3
 """Relative difference between the indices of a particle and of the sample below which the particle
 is not seen."""
+
+
+ROD_PER_WAVE = 1 / 8
+"""Longest rod over the wavelength in the sample.
+
+The light that the two halves of an upright rod scatter back is out of phase by then, and the rod
+scatters 6 % less than its dipole, (k L)²/10."""
+
+
+def rod_refusal(config: Config) -> str:
+    """Say why a configuration does not go together with a rod; else nothing."""
+    particle, optics = config.particle, config.optics
+    for key, is_set in (
+        ('optics.psf = "measured"', optics.psf == "measured"),
+        ('optics.convention = "dong2021"', optics.convention == "dong2021"),
+        ('optics.emission = "dong2021"', optics.emission == "dong2021"),
+        ('optics.calibrate = "always"', optics.calibrate == "always"),
+        ("[calibration]", config.calibration is not None),
+        ("particle.wiggle_nm", particle.wiggle_nm > 0),
+        ("particle.height_sd_nm", particle.height_sd_nm > 0),
+        (f'particle.height_nm = "{particle.height_nm}"', isinstance(particle.height_nm, str)),
+    ):
+        if is_set:
+            return (
+                f'{key} is for round particles, and particle.model is "rod": leave it out, or set '
+                'particle.model = "dipole"'
+            )
+    index, longest = particle.given_index, optics.wavelength_nm / optics.n_sample * ROD_PER_WAVE
+    if index is not None and abs(index / optics.n_sample - 1) < INVISIBLE:
+        return (
+            f"the refractive index of the particle is that of the sample, optics.n_sample = "
+            f"{optics.n_sample:g}: such a particle scatters no light"
+        )
+    if particle.nominal_length_nm > longest:
+        return (
+            f"a rod of particle.aspect_ratio = {particle.aspect_ratio:g} and the volume of a "
+            f"sphere of {particle.nominal_diameter_nm:.4g} nm is {particle.nominal_length_nm:.4g} "
+            f"nm long, and rods are dipoles, which is true up to {longest:.3g} nm, an eighth of "
+            "the wavelength in the sample: give a smaller mass, or a smaller aspect ratio"
+        )
+    return ""
+
+
+def refuse_rod(config: Config, what: str) -> None:
+    """Refuse what does not know the direction of a rod as a parameter."""
+    if config.particle.is_rod:
+        raise ConfigError(
+            f'particle.model = "rod": {what}; there are pictures, bounds and fits of '
+            "rods (psf, crb, fit_rods, iscat simulate, iscat bounds)"
+        )
 
 
 def sphere_refusal(config: Config) -> str:

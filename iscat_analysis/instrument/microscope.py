@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import Likelihood
@@ -59,6 +59,7 @@ def refuse_uncalibratable(config: Config) -> None:
         )
     if config.optics.convention == "dong2021":
         raise ConfigError('optics.convention = "dong2021" cannot be calibrated: use "exact"')
+    refuse_rod(config, "optics are learned from round particles")
     if config.particle.is_sphere:
         raise ConfigError(
             f'particle.model = "{config.particle.model}": optics are learned from dipoles; record '

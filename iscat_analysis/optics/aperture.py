@@ -16,6 +16,7 @@ from iscat_analysis._kernels.pupil import Pupil, gauss_legendre, make_pupil
 from iscat_analysis._kernels.zernike import orders, zernike
 from iscat_analysis.config import Optics
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.optics.rods import Rod
 from iscat_analysis.optics.spheres import Sphere
 
 FloatArray = NDArray[np.float64]
@@ -36,7 +37,7 @@ class Aperture:
 
     optics: Optics
     pupil: Pupil
-    sphere: Sphere | None = None
+    scatterer: Sphere | Rod | None = None
 
     @property
     def wavenumber(self) -> float:
@@ -50,8 +51,8 @@ class Aperture:
 
     @property
     def is_round(self) -> bool:
-        """Whether no aberration depends on the azimuth."""
-        return all(orders(j)[1] == 0 for j, _ in self.terms)
+        """Whether neither an aberration nor the particle depends on the azimuth."""
+        return not isinstance(self.scatterer, Rod) and all(orders(j)[1] == 0 for j, _ in self.terms)
 
     @property
     def terms(self) -> tuple[tuple[int, float], ...]:
@@ -83,6 +84,8 @@ class Aperture:
 
         Shapes: `phi` (m,), result (2, n, m).
         """
+        if isinstance(self.scatterer, Rod):
+            return self._of_dipole(phi, self.scatterer.dipole(self.optics))
         p, s = self.pupil.t_p_cos[:, None], self.pupil.t_s[:, None]
         if self.optics.polarization == "circular":
             return np.stack([(p + s) / 2 * np.ones(phi.size), (p - s) / 2 * np.exp(2j * phi)])
@@ -90,15 +93,41 @@ class Aperture:
         c, d = np.cos(turned), np.sin(turned)
         return np.stack([p * c**2 + s * d**2, (p - s) * (c * d)])
 
-    def turning(self, phi: FloatArray) -> ComplexArray:
-        """Slope of `polarised` along the angle of linear polarisation [1/rad], shape (2, n, m)."""
+    def _of_dipole(self, phi: FloatArray, dipole: ComplexArray) -> ComplexArray:
+        """Wave of a dipole along the polarisation, across it and along the optical axis.
+
+        Shapes: `phi` (m,), `dipole` (3,), result (2, n, m).
+        """
+        if self.optics.polarization == "circular":
+            meridian = np.exp(np.multiply.outer([-1j, 1j], phi)) / math.sqrt(2)
+        else:
+            turned = phi - math.radians(self.optics.polarization_deg)
+            meridian = np.stack([np.cos(turned), np.sin(turned)]).astype(complex)
+        p, s, q = (
+            part[:, None] for part in (self.pupil.t_p_cos, self.pupil.t_s, self.pupil.t_p_sin)
+        )
+        radial = meridian.conj().T @ dipole[:2]
+        across = s[None] * (dipole[:2, None, None] - meridian[:, None] * radial)
+        return np.asarray(across + meridian[:, None] * (p * radial + q * dipole[2]))
+
+    def turning(self, phi: FloatArray, name: str) -> ComplexArray:
+        """Slope of `polarised` along an angle [1/degree], shape (2, n, m).
+
+        It is the angle of linear polarisation, for round particles, or one of a rod.
+        """
+        if isinstance(self.scatterer, Rod):
+            return self._of_dipole(phi, self.scatterer.dipole_slope(self.optics, name))
         difference = (self.pupil.t_p_cos - self.pupil.t_s)[:, None]
         turned = 2 * (phi - math.radians(self.optics.polarization_deg))
-        return np.stack([difference * np.sin(turned), -difference * np.cos(turned)])
+        slope = np.stack([difference * np.sin(turned), -difference * np.cos(turned)])
+        return np.asarray(slope * math.radians(1.0))
 
-    def seen(self, phi: FloatArray, *, masked: bool = True, turning: bool = False) -> ComplexArray:
-        """Components that reach the camera, with mask and aberrations, shape (1 or 2, n, m)."""
-        whole = self.turning(phi) if turning else self.polarised(phi)
+    def seen(self, phi: FloatArray, *, masked: bool = True, along: str = "") -> ComplexArray:
+        """Components that reach the camera, with mask and aberrations, or their slopes `along`.
+
+        Shapes: result (1 or 2, n, m).
+        """
+        whole = self.turning(phi, along) if along else self.polarised(phi)
         components = whole[: 1 if self.optics.analyzer else 2]
         wave: ComplexArray = components * np.exp(1j * self.wavenumber * self.path_nm(phi))
         return wave * self.transmission[:, None] if masked else wave
@@ -144,9 +173,12 @@ def critical_angle(optics: Optics) -> float | None:
 
 
 def aperture_on(
-    optics: Optics, theta: FloatArray, weight: FloatArray, sphere: Sphere | None = None
+    optics: Optics,
+    theta: FloatArray,
+    weight: FloatArray,
+    scatterer: Sphere | Rod | None = None,
 ) -> Aperture:
-    """Make the pupil on given angles, with the light of a dipole or of a sphere.
+    """Make the pupil on given angles, with the light of a dipole, a sphere or a rod.
 
     Shapes: `theta, weight` (n,).
     """
@@ -161,11 +193,11 @@ def aperture_on(
         direction=direction,
         reciprocal=optics.emission == "reciprocal",
     )
-    if sphere is not None:
+    if isinstance(scatterer, Sphere):
         cos_s = pupil.axial / (wavenumber * optics.n_sample) - direction
-        along, across = sphere.pattern(cos_s, direction, optics.n_sample, wavenumber)
+        along, across = scatterer.pattern(cos_s, direction, optics.n_sample, wavenumber)
         pupil = replace(pupil, t_p_cos=pupil.t_p_cos / cos_s * along, t_s=pupil.t_s * across)
-    return Aperture(optics, pupil, sphere)
+    return Aperture(optics, pupil, scatterer)
 
 
 def _direction(optics: Optics) -> float:
@@ -174,13 +206,13 @@ def _direction(optics: Optics) -> float:
 
 
 def aperture(
-    optics: Optics, nodes: int, nodes_above: int, sphere: Sphere | None = None
+    optics: Optics, nodes: int, nodes_above: int, scatterer: Sphere | Rod | None = None
 ) -> Aperture:
     """Make the pupil on panels that end at the mask's edge and at the critical angle."""
     alpha = math.asin(optics.na / optics.n_immersion)
     edge = math.asin(optics.mask_na / optics.n_immersion)
     theta, weight = gauss_legendre(alpha, critical_angle(optics), nodes, nodes_above, edge)
-    return aperture_on(optics, theta, weight, sphere)
+    return aperture_on(optics, theta, weight, scatterer)
 
 
 def weight_on(

@@ -8,6 +8,8 @@ import numpy as np
 
 from iscat_analysis.optics.model import ForwardModel
 
+_AZIMUTHS = 8  # the light of a dipole is a trigonometric polynomial of order 4
+
 
 def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> float:
     """Scattered light that the pupil collects, as an equivalent area of reference.
@@ -18,10 +20,11 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
     if model.is_measured:
         return math.nan
     amplitude = model.scale.amplitude(mass_kda)
-    p = model.at(amplitude).aperture.pupil
+    opening = model.at(amplitude).aperture
+    p, phi = opening.pupil, np.arange(_AZIMUTHS) * (2 * math.pi / _AZIMUTHS)
     decay = np.exp(-2 * p.axial.imag * model.centre_nm(z_nm, amplitude))
-    density = (np.abs(p.t_p_cos) ** 2 + np.abs(p.t_s) ** 2) * np.sin(p.theta) * decay
-    pupil_integral = math.pi * float(np.sum(p.weight * density))
+    density = (np.abs(opening.polarised(phi)) ** 2).sum(0).mean(1) * np.sin(p.theta) * decay
+    pupil_integral = 2 * math.pi * float(np.sum(p.weight * density))
     medium = 1.0 if model.optics.emission == "reciprocal" else 1 / model.optics.n_immersion**2
     over = model.reference**2 if model.rho else 1.0
     e1 = abs(model.strength) * amplitude

@@ -34,6 +34,7 @@ from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.sized import sized
 from iscat_analysis.optics.spheres import Sphere, sphere_of
@@ -87,7 +88,8 @@ def forward_model(
     if z_max_nm is None:
         z_max_nm = max(config.fit.z_range_nm[1], height)
     sphere = sphere_of(config.particle, matter.permittivity, matter.mass_kda)
-    opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes, sphere)
+    scatterer = sphere or rod_of(config.particle, matter.permittivity, ns)
+    opening = _pupil(optics, reach_nm, ns * z_max_nm, ni * abs(oil_nm), nodes, scatterer)
     reflection = (ng - ns) / (ng + ns)
     transmission = math.sqrt(1 - reflection**2) if paper else 2 * ng / (ng + ns)
     if optics.scheme == "darkfield":
@@ -171,7 +173,7 @@ def _pupil(
     sample_nm: float,
     oil_nm: float,
     nodes: int | None,
-    sphere: Sphere | None,
+    scatterer: Sphere | Rod | None,
 ) -> Aperture:
     """Pupil with enough nodes for its phase; optical paths in sample and oil [nm]."""
     alpha = math.asin(optics.na / optics.n_immersion)
@@ -185,13 +187,13 @@ def _pupil(
     intervals = math.ceil(reach_nm * k * optics.na / STEP) + 2
     check_table("the radial table", 6 * (30 + 0.45 * k * path) * intervals)
     if optics.convention == "dong2021":
-        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES), sphere)
+        return aperture_on(optics, *rectangle(alpha, nodes or DONG2021_FIELD_NODES), scatterer)
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,
         nodes or 16 + math.ceil(0.45 * k * path),
         nodes or 14 + math.ceil(0.45 * k * path * beyond),
-        sphere,
+        scatterer,
     )
 
 

@@ -254,7 +254,7 @@ class ForwardModel:
         names: Sequence[str],
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Signal and its derivatives for an amplitude instead of a mass, see `amplitude_image`."""
-        check_names(self.optics, names)
+        check_names(self.aperture, names)
         if self.is_measured:
             raise ConfigError('optics.psf = "measured" knows no parameters of the optics')
         lens, stack = self._sensitivities(z_nm, tuple(names))

@@ -30,6 +30,7 @@ from iscat_analysis.optics.coherence import (
     over_spectrum,
     spectrum,
 )
+from iscat_analysis.optics.rods import ANGLES, Rod
 from iscat_analysis.optics.waves import LatticeField
 
 FloatArray = NDArray[np.float64]
@@ -42,11 +43,14 @@ STEP_RATIO = 2
 """Radial step of these tables over that of the field: their error is one part in 10⁶."""
 
 
-def check_names(optics: Optics, names: Sequence[str]) -> None:
+def check_names(opening: Aperture, names: Sequence[str]) -> None:
     """Refuse parameters that have no derivative."""
-    unknown = [name for name in names if name not in MEASURABLE]
+    optics, known = opening.optics, MEASURABLE
+    if isinstance(opening.scatterer, Rod):
+        known = (*(name for name in MEASURABLE if name != "polarization_deg"), *ANGLES)
+    unknown = [name for name in names if name not in known]
     if unknown:
-        raise ConfigError(f"names = {unknown}: choose among {', '.join(MEASURABLE)}")
+        raise ConfigError(f"names = {unknown}: choose among {', '.join(known)}")
     if optics.convention == "dong2021":
         raise ConfigError(
             'optics.convention = "dong2021" has no derivatives: use convention = "exact"'
@@ -104,7 +108,7 @@ def _changes(
     # two more directions, with zero weight except where an edge moves
     theta = np.concatenate([opening.pupil.theta, [rim, edge]])
     weights = np.concatenate([opening.pupil.weight, [1.0, 1.0]])
-    whole = aperture_on(optics, theta, weights, opening.sphere)
+    whole = aperture_on(optics, theta, weights, opening.scatterer)
     weight, axial = weight_on(whole, factor, oil_nm)
     weight = weight * np.exp(1j * axial * z_nm)
     inner = np.ones(theta.size)
@@ -129,8 +133,8 @@ def _changes(
             return clear * ((optics.attenuation - 1) * at_edge[:, None])
         if name == "attenuation":
             return clear * behind[:, None] - field * (rho / (optics.attenuation or 1.0))
-        if name == "polarization_deg":
-            return whole.seen(phi, turning=True) * (inner[:, None] * math.pi / 180)
+        if name == "polarization_deg" or name in ANGLES:
+            return whole.seen(phi, along=name) * inner[:, None]
         path: FloatArray = zernike(int(name[1:]), whole.rho[:, None], phi)[0]
         return field * (1j * k * path)
 

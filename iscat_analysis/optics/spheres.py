@@ -104,7 +104,7 @@ def scattering_length_nm(sphere: Sphere, optics: Optics) -> float:
 
 def sphere_of(particle: Particle, permittivity: complex, mass_kda: float) -> Sphere | None:
     """Make the sphere of a configuration; None where it is a dipole."""
-    if particle.model == "dipole":
+    if not particle.is_sphere:
         return None
     return Sphere(
         mass_kda=mass_kda,

@@ -415,7 +415,7 @@ def _series(opening: Aperture, factor: complex, oil_nm: float) -> tuple[Ray, Com
     for each in spectrum(optics):
         there = opening
         if each is not optics:
-            there = aperture_on(each, pupil.theta, pupil.weight, opening.sphere)
+            there = aperture_on(each, pupil.theta, pupil.weight, opening.scatterer)
         weight, axial = weight_on(there, factor_at(factor, each, optics), oil_nm)
         rays.append(Ray(there.seen(phi)[None], weight, axial, there.pupil.transverse))
     whole = over_spectrum(rays)

@@ -7,6 +7,8 @@ same sections that a configuration file has, and arrays otherwise:
     images of a particle, for arrays of positions, heights or masses;
 `fit_rois`
     fits of many regions, counts before and after, into one table;
+`fit_rods`
+    the same of rods of any direction;
 `log_likelihood`
     the log-likelihood of one region and its gradient, for any sampler or optimiser;
 `crb`, `qcrb`
@@ -23,5 +25,15 @@ from iscat_analysis.pieces.images import psf
 from iscat_analysis.pieces.likelihoods import LogLikelihood, log_likelihood
 from iscat_analysis.pieces.limits import crb, qcrb
 from iscat_analysis.pieces.regions import fit_rois
+from iscat_analysis.pieces.rods import fit_rods
 
-__all__ = ["Camera", "LogLikelihood", "crb", "fit_rois", "log_likelihood", "psf", "qcrb"]
+__all__ = [
+    "Camera",
+    "LogLikelihood",
+    "crb",
+    "fit_rods",
+    "fit_rois",
+    "log_likelihood",
+    "psf",
+    "qcrb",
+]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import real_array
 from iscat_analysis.inference.likelihood import LARGEST_LEVEL, LEVEL, Likelihood
@@ -226,6 +226,7 @@ def log_likelihood(
     config = config_of(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
+    refuse_rod(config, "the angles are no parameters of log_likelihood")
     if mode == "track":
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     image, known = real_array("after", after), real_array("before", before)

@@ -10,11 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.bounds import event_bounds, quantum_information
 from iscat_analysis.bounds.experiment import expected_likelihood
+from iscat_analysis.bounds.orientation import ROD_PARAMETERS, rod_bounds
 from iscat_analysis.config import Calibration, CameraConfig, Config, Optics, Particle
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import number_in, truth_in
+from iscat_analysis.inference.orientation import rod_in
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
+from iscat_analysis.optics.rods import ANGLES
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.pieces.setups import LARGEST_REGION, config_of, darkfield_photons, together
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
@@ -61,6 +64,7 @@ def crb(
         Which parameters are free; ``"size"`` is for spheres, whose mass stands for the diameter.
     joint : bool
         Whether all free parameters are unknown at once; False gives each with the others known.
+        The angles of a rod are free in every mode.
     level : bool
         Whether the level of the light is unknown too.
     pixels : int
@@ -79,8 +83,8 @@ def crb(
     Returns
     -------
     dict of str to ndarray
-        Standard deviations [nm, kDa] of the free parameters, by name, each of the shape of the
-        broadcast arguments; NaN where the image does not determine the parameter.
+        Standard deviations [nm, kDa, degrees] of the free parameters, by name, each of the shape of
+        the broadcast arguments; NaN where the image does not determine the parameter.
 
     Raises
     ------
@@ -111,8 +115,8 @@ def crb(
         photons_per_pixel=photons_per_pixel, n_after=n_after, n_before=n_before,
     )  # fmt: skip
     joint, level = truth_in("joint", joint), truth_in("level", level)
-    free = FREE_PARAMETERS[mode]
-    index = [PARAMETERS.index(name) for name in free]
+    free = FREE_PARAMETERS[mode] + (ANGLES if particle.is_rod else ())
+    index = [ROD_PARAMETERS.index(name) for name in free]
     read_noise_e = float(config.camera.assumed.read_noise_e)
     out = np.full((len(free), *setups.shape), np.nan)
     for place in np.ndindex(setups.shape):
@@ -121,7 +125,11 @@ def crb(
             at.model, setups.grid, at.theta, at.level_e, at.scale_e,
             n_before=int(at.n_before), n_after=int(at.n_after), read_noise_e=read_noise_e,
         )  # fmt: skip
-        bounds = event_bounds(likelihood, at.theta, free, at.collected, level=level)
+        rod = rod_in(at.model)
+        if rod is None:
+            bounds = event_bounds(likelihood, at.theta, free, at.collected, level=level)
+        else:
+            bounds = rod_bounds(likelihood, at.theta, rod, free, level=level)
         out[(slice(None), *place)] = (bounds.crb_joint if joint else bounds.crb_single)[index]
     return {name: np.asarray(values) for name, values in zip(free, out, strict=True)}
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.bounds import event_bounds
 from iscat_analysis.bounds.classical import ComplexArray
-from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle
+from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, real_array
 from iscat_analysis.inference.fit import fit_particle
@@ -138,6 +138,7 @@ def fit_rois(
     config = config_of(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration
     )
+    refuse_rod(config, "its direction has to be fitted too")
     if mode == "track":
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     counts = gather(
@@ -263,7 +264,7 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
             "status": str(status),
             "flags": ";".join(str(flag) for flag in noticed),
         }
-    start = _start(likelihood, templates)
+    start = start_of(likelihood, templates)
     free = FREE_PARAMETERS[config.fit.mode]
     if "mass_kda" not in free:
         start = replace(start, mass_kda=model.material.mass_kda)
@@ -303,7 +304,7 @@ def saturated_near(
     return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
 
 
-def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
+def start_of(likelihood: Likelihood, templates: Templates) -> Candidate:
     """Where the matched filter is largest, away from the edges of the region."""
     snr, strength = signal_to_noise(likelihood, templates)
     ranked = np.abs(snr) if templates.two_sided else snr

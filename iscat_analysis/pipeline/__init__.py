@@ -15,7 +15,7 @@ from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
-from iscat_analysis.config import Config
+from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
@@ -159,6 +159,7 @@ def analyse(
             f"{movie.name}: is an array, and workers read a movie from its file: save it, as with "
             "numpy.save, and give its path; or leave `scheduler` out"
         )
+    refuse_rod(config, "iscat-fit does not fit directions")
     started = datetime.now(UTC).isoformat(timespec="seconds")
     with compiling(notify):
         run = Run(notify, progress, partial, executor or LocalExecutor(), inject)

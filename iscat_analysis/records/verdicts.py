@@ -14,6 +14,7 @@ class Status(StrEnum):
     AT_BOUND = "at_bound"
     AMBIGUOUS_Z = "ambiguous_z"
     AMBIGUOUS_SIZE = "ambiguous_size"
+    AMBIGUOUS_DIRECTION = "ambiguous_direction"
     POOR_FIT = "poor_fit"
     TOO_CLOSE = "too_close"
     SATURATED = "saturated"
@@ -41,6 +42,8 @@ _ADVICE = {
     "another focus, or a narrower fit.z_range_nm.",
     Status.AMBIGUOUS_SIZE: "Another diameter explains the data almost as well: use more frames, "
     "another focus, or a narrower fit.diameter_range_nm.",
+    Status.AMBIGUOUS_DIRECTION: "Another direction of a rod explains the data almost as well: use "
+    "more frames, another focus or another polarisation.",
     Status.POOR_FIT: "The model does not describe the data: check focus, NA, pixel size, gain and "
     "neighbours; a large particle that fit.spheres does not describe needs mode size.",
     Status.TOO_CLOSE: "Another particle is nearer than detection.min_separation_nm: "
@@ -75,6 +78,7 @@ SEVERITY = (
     Status.EXTENDED,
     Status.AMBIGUOUS_SIZE,
     Status.AMBIGUOUS_Z,
+    Status.AMBIGUOUS_DIRECTION,
     Status.TOO_CLOSE,
     Status.SATURATED,
     Status.UNCALIBRATED_OPTICS,
@@ -83,8 +87,8 @@ SEVERITY = (
 )
 """Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; no
 dipole and so no mass; a model that does not describe the data, their change in time or their width;
-one of several diameters or heights; a mass shared with a neighbour; pixels left out; a mass on the
-scale of other optics; counts that are not in proportion to the light; frames that were
+one of several diameters, heights or directions; a mass shared with a neighbour; pixels left out; a
+mass on the scale of other optics; counts that are not in proportion to the light; frames that were
 processed."""
 
 

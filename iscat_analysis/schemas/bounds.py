@@ -206,6 +206,28 @@ class Target(Document):
     note: str
 
 
+class RodSigma(Closed):
+    """Standard deviations of a rod for the planned frames; null where not identifiable."""
+
+    x_nm: Positive = maybe("[nm]")
+    y_nm: Positive = maybe("[nm]")
+    z_nm: Positive = maybe("[nm]")
+    mass_kda: Positive = maybe("[kDa]")
+    azimuth_deg: Positive = key("Of the direction in the image [degrees]")
+    tilt_deg: Positive = key("Of the angle to the optical axis [degrees]")
+
+
+class RodBounds(Closed):
+    """Bounds of a rod whose direction is unknown; all others hold it."""
+
+    aspect_ratio: float = key("Length over width")
+    azimuth_deg: float = key("Its direction in the image, from x towards y [degrees]")
+    tilt_deg: float = key("Its angle to the optical axis [degrees]")
+    crb_single: RodSigma = key("Everything else known")
+    crb_joint: RodSigma = key("Over the mode's free parameters and both angles")
+    unidentifiable: list[str] = key("Directions that the image does not show")
+
+
 class Bounds(Document):
     """What iscat bounds prints: classical and quantum Cramér–Rao bounds of one particle."""
 
@@ -233,6 +255,7 @@ class Bounds(Document):
     convention: Convention = key("Formulas")
     emission: Emission = key("Emission model")
     warnings: list[str] = key("What the user should know, one line each")
+    rod: RodBounds = maybe('With particle.model = "rod"')
     detection: DetectionLimit = maybe("Smallest mass that is detected; not in dark field")
     scan: Scan = maybe("With --scan")
     optimum: Optimum = maybe("With --optimize focus or attenuation")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
-from iscat_analysis.config import MOVING, Config
+from iscat_analysis.config import MOVING, Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.regions import Region, region_likelihood
@@ -187,6 +187,7 @@ def make_setting(
     context: AnalysisContext | None = None,
 ) -> Setting:
     """Set up one experiment."""
+    refuse_rod(config, "these studies are of dipoles")
     if config.particle.is_sphere:
         raise ConfigError(
             f'particle.model = "{config.particle.model}": these studies are of dipoles; simulate '
