@@ -456,7 +456,7 @@ class Summary(Document):
     )
     optics: Learned = maybe("If the optics were tested: the test, and the learned optics")
     distribution: Distribution | None = maybe(
-        "Species; null if masses are not fitted once per event"
+        "Species; null if masses are not fitted once per event, and of spheres"
     )
     sizes: Sizes | None = maybe("Spheres: populations of diameters; null for fewer than ten")
 
