@@ -145,7 +145,7 @@ def make_analysis(
     # frames are read and transformed while the species are found
     timeline_future = start_in_thread(timeline_of, ready, found, table)
     searched = found.summary.get("searched_share") if found.summary else None
-    described = species_of(context, table, searched)
+    described = species_of(context, table, searched, tracks)
     explained = {"explained_kda": explained_kda(budget)}
     described["across_particles"] = [one | explained for one in described["across_particles"]]
     calibrated = config.calibration is not None or config.fits_sizes

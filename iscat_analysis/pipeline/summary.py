@@ -15,13 +15,22 @@ from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, free_parameters
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, TrackStatus, free_parameters
+from iscat_analysis.report.numbers import number
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.species import LEAST_EVENTS, describe
+from iscat_analysis.species.diameters import Sizes, describe_sizes
 from iscat_analysis.species.tables import filter_efficiency, shared_error
+from iscat_analysis.units import count
 
 _HEIGHTS = 65
 """Heights at which the Holevo bound is computed for a table; linear in between."""
+
+_CLEAR_OF_THRESHOLD = 3.0
+"""Standard deviations above the threshold from which hardly any sphere is missed."""
+
+_NO_SIZE = {TrackStatus.POOR_FITS, TrackStatus.AMBIGUOUS_SIZE, TrackStatus.MASS_VARIES}
+"""Flags of tracks of which pictures do not tell the diameter."""
 
 
 def summary_of(
@@ -94,13 +103,75 @@ def _scale_transfer(context: AnalysisContext) -> dict[str, Any]:
 
 
 def species_of(
-    context: AnalysisContext, table: pd.DataFrame, searched: float | None = None
+    context: AnalysisContext,
+    table: pd.DataFrame,
+    searched: float | None = None,
+    tracks: pd.DataFrame | None = None,
 ) -> dict[str, Any]:
-    """Describe the species of all events; `searched` is the share that was searched."""
+    """Describe the species of all events, or the sizes of all spheres.
+
+    `searched` is the share of field and time that was searched.
+    """
+    if context.config.fits_sizes:
+        seed = context.config.compute.seed
+        found = sizes_of_tracks(tracks, seed) if tracks is not None else _sizes(context, table)
+        return {
+            "distribution": None,
+            "across_particles": [],
+            "sizes": None if found is None else found.to_dict(),
+        }
     good = table[table["status"] == Status.OK]
     distribution = _distribution(context, good, searched or 1.0)
     across = species_width(context, table, distribution)
     return {"distribution": distribution, "across_particles": across}
+
+
+def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
+    """Describe the diameters of spheres that were fitted once each, of rows that are ok."""
+    good = table[table["status"] == Status.OK]
+    diameter, sigma, snr = (
+        good[name].to_numpy(float) for name in ("diameter_nm", "sigma_diameter_nm", "snr")
+    )
+    notes = []
+    near = diameter[snr < context.templates.threshold + _CLEAR_OF_THRESHOLD]
+    if near.size:
+        notes.append(
+            f"{count(near.size, 'sphere')} of {number(near.min())} to {number(near.max())} nm "
+            f"{'is' if near.size == 1 else 'are'} hardly brighter than what is detected: others of "
+            "such diameters were missed, for which nothing is corrected"
+        )
+    common = 0.0
+    if "systematic_diameter_nm" in good:
+        common = _median(good["systematic_diameter_nm"] / good["diameter_nm"]) or 0.0
+    return describe_sizes(
+        diameter, sigma, seed=context.config.compute.seed, common=common, notes=notes
+    )
+
+
+def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
+    """Describe the diameters that the pictures of tracks show.
+
+    What is wrong with the motion of a track says nothing of its pictures, and leaving out those
+    that are near the wall would leave out the large ones.
+    """
+    if "optical_diameter_nm" not in tracks:
+        return None
+    flags = tracks["flags"].astype(str).str.split(";")
+    good = tracks[[not _NO_SIZE & set(each) for each in flags]]
+    notes = []
+    if len(good) < len(tracks):
+        notes.append(
+            f"{count(len(tracks) - len(good), 'track')} of {len(tracks)} left out, of which "
+            "pictures do not tell the diameter, or do not agree on it"
+        )
+    common = 0.0
+    if "systematic_mass_kda" in good:  # a third, as the mass goes with the cube of the diameter
+        common = (_median(good["systematic_mass_kda"] / good["mass_kda"]) or 0.0) / 3
+    return describe_sizes(
+        good["optical_diameter_nm"].to_numpy(float),
+        good["sigma_optical_diameter_nm"].to_numpy(float),
+        seed=seed, common=common, notes=notes,
+    )  # fmt: skip
 
 
 def _repeats(found: EmpiricalSpread) -> dict[str, Any]:

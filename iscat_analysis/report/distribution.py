@@ -40,6 +40,8 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
         "id": "species",
         "title": "Species",
         "lead": _lead(found),
+        "heading": "Masses and species",
+        "figure": "species",
         "caption": f"Landing and leaving by |mass|, in bins of {width:g} kDa; the species are "
         "fitted to the events, not to the bins.",
         "tables": [

@@ -19,6 +19,7 @@ from iscat_analysis.report.distribution import distribution_section, species_fig
 from iscat_analysis.report.event_figures import corner_figures, event_figures
 from iscat_analysis.report.figures import page_figures
 from iscat_analysis.report.headline import caution, is_uncalibrated
+from iscat_analysis.report.size_distribution import sizes_figure, sizes_section
 from iscat_analysis.report.style import Sketch, drawn, publish
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.report.track_context import tracks_context
@@ -88,6 +89,8 @@ def page_sketches(analysis: Analysis, table: pd.DataFrame) -> Iterator[Sketch]:
     yield from page_figures(analysis, table)
     if (found := _species(analysis, table)) is not None:
         yield "species", partial(species_figure, found)
+    if (sizes := _sizes(analysis, table)) is not None:
+        yield "sizes", partial(sizes_figure, sizes)
     yield from corner_figures(analysis)
 
 
@@ -97,13 +100,25 @@ def _species(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any] | None:
     return jsonable(found) if found else None
 
 
+def _sizes(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any] | None:
+    """Give what ``summary.json`` holds of the diameters, where the page shows them.
+
+    Single frames of a track may be flagged as much as they like.
+    """
+    fair = analysis.tracks is not None or caution(table) is None
+    found = analysis.summary.get("sizes") if fair else None
+    return jsonable(found) if found else None
+
+
 def page_context(
     analysis: Analysis, table: pd.DataFrame, folder: Path | None = None
 ) -> dict[str, Any]:
     """Collect the text of the page."""
     found = _species(analysis, table)
     species = distribution_section(found) if found else None
-    if species is not None and is_uncalibrated(analysis):
+    if (sizes := _sizes(analysis, table)) is not None:
+        species = sizes_section(sizes)
+    elif species is not None and is_uncalibrated(analysis):
         species["lead"] = f"On the model's own scale, which is not a mass. {species['lead']}"
     context = report_context(analysis, table)
     tracked = analysis.tracks is not None

@@ -359,6 +359,27 @@ class Distribution(Document):
     notes: list[str] = key("What the user should know")
 
 
+class Sizes(Closed):
+    """Populations of diameters, as a log-normal mixture in which each sphere has its own error."""
+
+    spheres: Count = key("Spheres used")
+    populations: list[dict[str, Any]] = key(
+        "By rising median diameter_nm [nm]; geometric_sd is of the diameters beyond their errors; "
+        "fraction is of the spheres seen; *_low and *_high are 95 % intervals of a parametric "
+        "bootstrap, that of the median with the error common to all spheres, diameter_systematic; "
+        "an outlier has fewer than three spheres"
+    )
+    selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number that was tried")
+    support: Number = key("Share of simulated repetitions in which BIC chose the same number")
+    histogram: dict[str, Any] = key(
+        "Columns low_nm, high_nm [nm], count, and its 95 % interval count_low, count_high"
+    )
+    curve: dict[str, Any] = key("Columns diameter_nm [nm] and model [spheres per nm], with errors")
+    draws: int = key("Simulated repetitions")
+    seed: int = key("Seed of the bootstrap")
+    notes: list[str] = key("What the user should know")
+
+
 class BudgetEntry(Closed):
     """One source of the error of a mass: medians over the rows that are ok."""
 
@@ -435,8 +456,9 @@ class Summary(Document):
     )
     optics: Learned = maybe("If the optics were tested: the test, and the learned optics")
     distribution: Distribution | None = maybe(
-        "Species; null if masses are not fitted once per event"
+        "Species; null if masses are not fitted once per event, and of spheres"
     )
+    sizes: Sizes | None = maybe("Spheres: populations of diameters; null for fewer than ten")
 
 
 class Fit(Summary):

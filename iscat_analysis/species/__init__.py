@@ -24,6 +24,9 @@ species, `structure` maximises the likelihood above where species or samples sha
 `search` tries numbers of species, `choices` are a number, given masses or a ladder, `bootstrap`
 repeats the measurement, and `curves` holds what is drawn.  `tables` reads events of any program.
 
+`diameters` runs the same mixture on the logarithms of the diameters of spheres, whose errors depend
+on the diameter.
+
 `comparison` asks whether two samples are one.  `equilibrium` fits a constant to a series of
 concentrations, with the law of `mass_action` and the likelihood of `series`, which `maximum`
 maximises; `kinetics` has the rates of landing and leaving.

@@ -18,9 +18,11 @@ HISTOGRAM_COLUMNS = ("low_kda", "high_kda", "count", "count_low", "count_high")
 CURVE_COLUMNS = ("mass_kda", "density", "density_se", "model", "model_corrected", "efficiency")
 """Columns of `Distribution.curves`."""
 
+NOISES = np.linspace(0.05, 0.95, 10)
+"""Quantiles that stand for the events' own noise."""
+
 _POINTS = 300
 _MOST_BINS = 240
-_NOISES = np.linspace(0.05, 0.95, 10)  # quantiles that stand for the events' own noise
 
 
 def bandwidth_of(events: Events, species: int) -> float:
@@ -52,7 +54,7 @@ def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
     kernel = np.exp(-0.5 * z**2) / (math.sqrt(2 * math.pi) * bandwidth)
     pieces = [
         np.exp(logsumexp(best.log_terms(Events(mass, np.full(mass.shape, sigma), None)), axis=1))
-        for sigma in np.quantile(events.sigma, _NOISES)
+        for sigma in np.quantile(events.sigma, NOISES)
     ]
     arrived = best.arrived(events) * np.mean(pieces, axis=0)
     return pd.DataFrame(
@@ -89,6 +91,6 @@ def _selected(events: Events, x: FloatArray) -> FloatArray:
     """Probability that an event of measured mass x was detected, averaged over its noise."""
     if events.efficiency is None:
         return np.ones(x.shape)
-    extra = events.efficiency.extra_sigma(np.quantile(events.sigma, _NOISES))
+    extra = events.efficiency.extra_sigma(np.quantile(events.sigma, NOISES))
     at = x[:, np.newaxis] - np.maximum(events.efficiency.threshold_kda, 0.0)
     return np.asarray(ndtr(at / np.maximum(extra, 1e-9)).mean(axis=1))

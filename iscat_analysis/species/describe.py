@@ -205,18 +205,10 @@ def describe(
         flank = _flanks(events, best, errors_known=errors_known)
     species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, flank)
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
-    fits, bic = found.tried, [fit.bic(events.x.size) for fit in found.tried]
     bandwidth = bandwidth_of(events, len(species))
     return Distribution(
         species=species,
-        selection=pd.DataFrame(
-            {
-                "species": [fit.weight.size - int(found.background) for fit in fits],
-                "log_likelihood": [fit.log_likelihood for fit in fits],
-                "bic": bic,
-                "delta_bic": np.subtract(bic, min(bic)),
-            }
-        ),
+        selection=selection_of(found, events.x.size),
         support=support,
         histogram=histogram_of(events),
         curves=curves_of(events, best, bandwidth),
@@ -256,27 +248,20 @@ def _table(
     some = np.arange(best.weight.size) < known
     some &= ~undetermined
     some &= ~outlier | outlier[some].all()
-
-    def interval(values: list[FloatArray]) -> tuple[FloatArray, FloatArray]:
-        if not values:
-            nothing = np.full(best.weight.size, math.nan)
-            return nothing, nothing
-        low, high = np.quantile(np.array(values), _INTERVAL_ENDS, axis=0, method=_UNBIASED)
-        return low, high
-
-    mass_low, mass_high = interval([r.mixture.mean for r in repeats])
-    width_low, width_high = interval([np.sqrt(r.mixture.variance) for r in repeats])
-    part_low, part_high = interval([_fractions(r.mixture.weight, some) for r in repeats])
-    count_low, count_high = interval([r.count for r in repeats])
-    came_low, came_high = interval([r.corrected for r in repeats])
+    k = best.weight.size
+    mass_low, mass_high = interval_of([r.mixture.mean for r in repeats], k)
+    width_low, width_high = interval_of([np.sqrt(r.mixture.variance) for r in repeats], k)
+    part_low, part_high = interval_of([_fractions(r.mixture.weight, some) for r in repeats], k)
+    count_low, count_high = interval_of([r.count for r in repeats], k)
+    came_low, came_high = interval_of([r.corrected for r in repeats], k)
     means = np.array([r.mixture.mean for r in repeats])
     searched = events.efficiency.searched if events.efficiency else 1.0
     table = pd.DataFrame(
         {
             "mass_kda": best.mean,
             "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
-            "mass_low": mass_low - _widening(best.mean - mass_low, scale),
-            "mass_high": mass_high + _widening(mass_high - best.mean, scale),
+            "mass_low": mass_low - widening(best.mean - mass_low, scale),
+            "mass_high": mass_high + widening(mass_high - best.mean, scale),
             "mass_systematic": scale,
             "width_kda": np.sqrt(best.variance),
             "width_low": width_low,
@@ -307,6 +292,31 @@ def _table(
     if found.steps:
         table.insert(0, "n", [*found.steps, *[0] * (best.weight.size - known)])
     return table
+
+
+def interval_of(values: Sequence[FloatArray], species: int) -> tuple[FloatArray, FloatArray]:
+    """Give the 95 % interval of a number of each species, NaN without repetitions.
+
+    Shapes: `values` (repetitions, species), result (species,).
+    """
+    if not values:
+        nothing = np.full(species, math.nan)
+        return nothing, nothing
+    low, high = np.quantile(np.array(values), _INTERVAL_ENDS, axis=0, method=_UNBIASED)
+    return low, high
+
+
+def selection_of(found: Chosen, events: int) -> pd.DataFrame:
+    """Lay out the numbers of species that were tried."""
+    bic = [fit.bic(events) for fit in found.tried]
+    return pd.DataFrame(
+        {
+            "species": [fit.weight.size - int(found.background) for fit in found.tried],
+            "log_likelihood": [fit.log_likelihood for fit in found.tried],
+            "bic": bic,
+            "delta_bic": np.subtract(bic, min(bic)),
+        }
+    )
 
 
 def _flanks(events: Events, best: Mixture, *, errors_known: bool) -> BoolArray:
@@ -358,7 +368,7 @@ def _ladder(
         error = drawn.std(axis=0, ddof=1)
         low, high = np.quantile(drawn, _INTERVAL_ENDS, axis=0, method=_UNBIASED)
     scale = np.zeros(1) if scale_error is None else scale_error(np.array([monomer]))
-    below, above = (float(_widening(np.array([r]), scale)[0]) for r in
+    below, above = (float(widening(np.array([r]), scale)[0]) for r in
                     (monomer - low[0], high[0] - monomer))  # fmt: skip
     return LadderFit(
         found.steps,
@@ -388,7 +398,7 @@ def _residence(events: Events, best: Mixture, window_frames: int | None) -> Floa
     return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
 
 
-def _widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
+def widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
     """Distance by which the error of the scale moves an end of a 95 % interval."""
     reach = np.maximum(reach, 0.0)
     return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
