@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import blurred
@@ -80,7 +80,7 @@ def path_shifts_at(
         path_shifts(model, roi_px, pixel_nm, h, amplitude, variance_nm2)
         for h in heights.tolist()
     ])  # fmt: skip
-    return np.asarray(make_interp_spline(heights, table, k=1)(z_nm))
+    return np.asarray(scipy.interpolate.make_interp_spline(heights, table, k=1)(z_nm))
 
 
 def _heights(model: ForwardModel, z_nm: FloatArray) -> FloatArray:

@@ -29,8 +29,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
-from scipy.optimize import brentq
+import scipy
 from scipy.special import chdtrc, chdtri, ndtri
 
 from iscat_analysis.config import Config
@@ -210,7 +209,7 @@ def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
     logarithm = log_likelihood(v)
     shown = np.exp(logarithm - logarithm.max())
     any_share = np.full(v.size, shown[0])
-    any_share[1:] = cumulative_trapezoid(shown, v) / v[1:]
+    any_share[1:] = scipy.integrate.cumulative_trapezoid(shown, v) / v[1:]
     return np.asarray(_HIDDEN * shown[0] + (1 - _HIDDEN) * any_share)
 
 
@@ -248,7 +247,7 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
 
     scatter = 0.0
     if excess(0.0) > 0:
-        scatter = float(brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
+        scatter = float(scipy.optimize.brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
     weight = 1 / (variance + scatter)
     return float(np.average(q, weights=weight)), 1 / math.sqrt(float(weight.sum()))
 
