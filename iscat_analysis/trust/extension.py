@@ -157,17 +157,25 @@ class Extension:
         """Message for the user; empty where images are as wide as the model's."""
         if not self.is_common:
             return ""
-        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         wide = math.sqrt(self.mean_nm2)
         error = self.sd_nm2 / (2 * wide)
+        if self.is_long:
+            causes = " and elongated, each in its own direction: particles have separate parts"
+            remedy = "fit.pairs = true gives the mass of two halves to rows with enough light"
+        else:
+            causes = (
+                ": particles wiggle or have separate parts, or wavelength, NA, focus or pixel size "
+                "are not those configured, or the illumination is a cone, or pixels were averaged"
+            )
+            remedy = (
+                "check the optics first; then set particle.wiggle_nm to it (adding squares) if all "
+                "particles wiggle alike, or fit.pairs = true if they may be two halves"
+            )
+        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         return (
             f"images are wider than a point's by a variance of ({wide:.1f} ± {error:.1f} nm)² "
-            "along each axis: particles wiggle or have parts that are apart, or wavelength, NA, "
-            "focus or pixel size are not those configured, or the illumination is a cone, or "
-            "pixels were averaged; masses are too small, and rows are flagged extended where by "
-            "more than half of σ; check the optics first; then set particle.wiggle_nm to it "
-            "(adding squares) if all particles wiggle alike, or fit.pairs = true if they may be "
-            f"two halves{two}"
+            f"along each axis{causes}; masses are too small, and rows are flagged extended where "
+            f"by more than half of σ; {remedy}{two}"
         )
 
     @property
