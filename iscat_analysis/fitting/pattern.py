@@ -8,11 +8,11 @@ the way a movie is cut does not matter, and most particles in it are there all t
 with it.  One that lands or leaves within those blocks is in B with the share f of their light,
 which `Neighbours` takes off again.
 
-Two patterns of which one moves have no common motion: what each loses by the mean of both grows
-with time.  Where pixels change so, beyond noise, B goes along a line in time, pixel by pixel.  Its
-slope comes from the blocks before and after the windows, each side by itself, so that what lands or
-leaves at the step is not in it, and noise of the windows neither; it is taken times the share of
-its variance that is not noise.
+Two patterns that move against each other have no common motion: with their mean motion divided out,
+pixels change linearly in time.  If the variance of these slopes exceeds that of noise, B is a line
+in time for every pixel.  Its slope comes from the blocks before and after the windows, with a level
+for each side, so that it contains neither what lands or leaves at the step nor noise of the
+windows.  It is multiplied by the share of its variance that is not noise.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What the light of one event says of what its fit takes for known: height, and width.
+"""Evidence of one event about the assumptions of its fit: its height, and that it is a point.
 
 A fit in mode mass holds the height, and takes the particle for a point that rests.  Each of these
-has a derivative of the picture: ∂s/∂z; and ½ Σ·∇∇s for a particle whose light is spread over places
+has a derivative of the image: ∂s/∂z; and ½ Σ·∇∇s for a particle whose light is spread over places
 of covariance Σ, because it wiggles or has parts that are apart.  With u the score along them and I
 their information once everything that was fitted follows, I⁻¹u estimates them, and uᵀI⁻¹u tests
 whether they are there (Rao's score test; C. R. Rao, Proc. Camb. Phil. Soc. 44, 50, 1948).
@@ -24,7 +24,7 @@ _XX, _XY, _YY = 5, 6, 7  # rows of second derivatives
 
 
 class Evidence(NamedTuple):
-    """What the light of one event, or of many, says beside its fit.
+    """Evidence of the light of one event, or of many, beside its fit.
 
     Attributes
     ----------

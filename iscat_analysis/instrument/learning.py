@@ -148,13 +148,18 @@ class Tested:
     @property
     def rejected(self) -> bool:
         """Whether the configured optics fail to describe them, one by one or together."""
-        return self.median_p < REJECTED_P or (self.together is not None and self.together.rejected)
+        return _are_rejected(self.median_p, self.together)
 
     @property
     def summary(self) -> dict[str, Any]:
         """Describe the test in the summary."""
         said: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
         return said if self.together is None else said | _doubted(self.together)
+
+
+def _are_rejected(median: float, together: ScoreTest | None) -> bool:
+    """Whether images reject the configured optics, one by one or together."""
+    return median < REJECTED_P or (together is not None and together.rejected)
 
 
 def _doubted(together: ScoreTest) -> dict[str, Any]:
@@ -212,8 +217,7 @@ def tested_optics(
         raise _TooFewError(said, _of_few(few, config, others, pool))
     median, fitted = median_p(images, config, others, pool.map)
     together = _together(fitted, config, pool)
-    rejected = median < REJECTED_P or (together is not None and together.rejected)
-    if first and rejected:  # more particles, and whose rings they show
+    if first and _are_rejected(median, together):  # more particles, and whose rings they show
         images, others = bright_particle_images(movie, config, camera, pool, opening)
         alone = len(images)
         median, fitted = median_p(images, config, others, pool.map)

@@ -250,7 +250,7 @@ class Neighbours:
     def of(self, steps: Sequence[Step], frames: int = 0) -> tuple[list[list[int]], list[list[int]]]:
         """List for each step the others that its fit must include, and those that it depends on.
 
-        Of `frames` around a step those are listed that are in them, if they are more.
+        Others are near in time within the windows, or within `frames` if these are more.
         """
         x, y, frame = (
             np.array(values, dtype=float)

@@ -254,9 +254,9 @@ class ChunkFitter:
         return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     def _relevant(self, steps: Sequence[Step], bound: Sequence[Sequence[int]]) -> set[int]:
-        """Select the steps that change what is fitted in the core, and those that change these.
+        """Select the steps whose light reaches what is fitted in the core, and their neighbours.
 
-        Others keep what the search found of them.
+        Others keep the values of the search.
         """
         reaches = [self._is_near_core(s, self._neighbours.reach_px(s)) for s in steps]
         return {
@@ -406,7 +406,7 @@ class ChunkFitter:
     def _judged(self, finished: Sequence[_Finished], beside: Sequence[Step]) -> list[StepEvent]:
         """Judge all steps, including side lobes and steps that explain less than they leave.
 
-        Those beside them are not reported, but may be so bright that what they leave over is.
+        Steps `beside` them are not reported, but their residuals may be found as steps.
         """
         events = with_spheres(
             self._context, [own.fitted.event for own in finished], self._pool, level=True

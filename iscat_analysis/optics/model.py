@@ -73,7 +73,7 @@ class ForwardModel:
         return self
 
     def dimmed(self, factor: ComplexArray) -> Self:
-        """Multiply every plane wave of the light by a factor; shapes: `factor` (n,)."""
+        """Multiply every plane wave of the light by a complex factor; shapes: `factor` (n,)."""
         wave = self.wave
         if isinstance(wave, RadialField):
             return replace(self, wave=replace(wave, source=wave.source * factor))

@@ -23,7 +23,6 @@ from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.sized import SizedModel, parts_of
 from iscat_analysis.optics.spheres import SMALLEST_NM, Sphere, has_shells
-from iscat_analysis.optics.waves import lifted
 from iscat_analysis.units import sphere_mass_kda
 
 LARGEST_DIPOLE = 1 / 16
@@ -96,7 +95,7 @@ class SeatedModel(SizedModel):
 
     def _linear(self, sphere: Sphere) -> ForwardModel:
         linear = super()._linear(sphere)
-        return replace(linear, wave=lifted(linear.wave, sphere.diameter_nm / 2))
+        return linear.dimmed(np.exp(0.5j * linear.wave.axial * sphere.diameter_nm))
 
 
 def seated_models(

@@ -387,16 +387,6 @@ def with_light_of(field: Field, opening: Aperture, factor: complex, oil_nm: floa
     return field
 
 
-def lifted(field: Field, rise_nm: float) -> Field:
-    """Give the table of a field whose particle is higher."""
-    turn = np.exp(1j * field.axial * rise_nm)
-    if isinstance(field, RadialField):
-        return replace(field, source=field.source * turn)
-    if isinstance(field, LatticeField):
-        return replace(field, harmonics=field.harmonics * turn)
-    return field
-
-
 def _source(opening: Aperture, factor: complex, oil_nm: float) -> tuple[ComplexArray, ComplexArray]:
     """Light of a round pupil in the sums of F0 and F2, and its phase per height."""
     pupil = opening.pupil

@@ -11,9 +11,11 @@ interference turns so fast that this limits bright particles, and no frame tells
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.optics.blur import blurred
@@ -49,17 +51,12 @@ def path_covariances(context: AnalysisContext, moving: TrackedRows) -> FloatArra
         if q == 0 or not mine.size:
             continue
         model = blurred(context.model, q, upwards=True)
-        z = rows.theta[mine, 2]
-        heights = _heights(model, z)
-        amplitude = float(np.median(rows.theta[mine, 3]))
-        share = float(np.median(moving.field.read_e2) / np.median(level))
-        table = np.stack([
-            path_covariance(model, context.roi_px, context.pixel_nm, h, amplitude, q, share)
-            for h in heights.tolist()
-        ])  # fmt: skip
-        for i in range(4):
-            for j in range(4):
-                out[mine, i, j] = np.interp(z, heights, table[:, i, j])
+        covariance = partial(
+            path_covariance, model, context.roi_px, context.pixel_nm,
+            amplitude=float(np.median(rows.theta[mine, 3])), variance_nm2=q,
+            read_share=float(np.median(moving.field.read_e2) / np.median(level)),
+        )  # fmt: skip
+        out[mine] = _interpolated(covariance, model, rows.theta[mine, 2])
     return out
 
 
@@ -71,22 +68,27 @@ def path_shifts_at(
     amplitude: float,
     variance_nm2: float,
 ) -> FloatArray:
-    """Give `path_shifts` at many heights, linear between some.
+    """Give `path_shifts` at many heights.
 
     Shapes: `z_nm` (n,), result (n, 4, 9).
     """
-    heights = _heights(model, z_nm)
-    table = np.stack([
-        path_shifts(model, roi_px, pixel_nm, h, amplitude, variance_nm2)
-        for h in heights.tolist()
-    ])  # fmt: skip
-    return np.asarray(make_interp_spline(heights, table, k=1)(z_nm))
+    shifts = partial(
+        path_shifts, model, roi_px, pixel_nm, amplitude=amplitude, variance_nm2=variance_nm2
+    )
+    return _interpolated(shifts, model, z_nm)
 
 
-def _heights(model: ForwardModel, z_nm: FloatArray) -> FloatArray:
-    """Heights at which errors are computed, from the lowest to the highest."""
+def _interpolated(
+    errors: Callable[[float], FloatArray], model: ForwardModel, z_nm: FloatArray
+) -> FloatArray:
+    """Compute errors at some heights, and interpolate linearly between them.
+
+    Shapes: `z_nm` (n,), result (n, …).
+    """
     count = max(2, math.ceil(np.ptp(z_nm) / model.fringe_nm * _PER_FRINGE) + 1)
-    return np.linspace(z_nm.min(), max(z_nm.max(), z_nm.min() + _STEP_NM), count)
+    heights = np.linspace(z_nm.min(), max(z_nm.max(), z_nm.min() + _STEP_NM), count)
+    table = np.stack([errors(height) for height in heights.tolist()])
+    return np.asarray(scipy.interpolate.make_interp_spline(heights, table, k=1)(z_nm))
 
 
 def path_covariance(

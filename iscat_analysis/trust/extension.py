@@ -29,8 +29,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.integrate import cumulative_trapezoid
-from scipy.optimize import brentq
+import scipy
 from scipy.special import chdtrc, chdtri, ndtri
 
 from iscat_analysis.config import Config
@@ -158,17 +157,25 @@ class Extension:
         """Message for the user; empty where images are as wide as the model's."""
         if not self.is_common:
             return ""
-        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         wide = math.sqrt(self.mean_nm2)
         error = self.sd_nm2 / (2 * wide)
+        if self.is_long:
+            causes = " and elongated, each in its own direction: particles have separate parts"
+            remedy = "fit.pairs = true gives the mass of two halves to rows with enough light"
+        else:
+            causes = (
+                ": particles wiggle or have separate parts, or wavelength, NA, focus or pixel size "
+                "are not those configured, or the illumination is a cone, or pixels were averaged"
+            )
+            remedy = (
+                "check the optics first; then set particle.wiggle_nm to it (adding squares) if all "
+                "particles wiggle alike, or fit.pairs = true if they may be two halves"
+            )
+        two = f"; {self.paired} rows have the mass of two halves" if self.paired else ""
         return (
             f"images are wider than a point's by a variance of ({wide:.1f} ± {error:.1f} nm)² "
-            "along each axis: particles wiggle or have parts that are apart, or wavelength, NA, "
-            "focus or pixel size are not those configured, or the illumination is a cone, or "
-            "pixels were averaged; masses are too small, and rows are flagged extended where by "
-            "more than half of σ; check the optics first; then set particle.wiggle_nm to it "
-            "(adding squares) if all particles wiggle alike, or fit.pairs = true if they may be "
-            f"two halves{two}"
+            f"along each axis{causes}; masses are too small, and rows are flagged extended where "
+            f"by more than half of σ; {remedy}{two}"
         )
 
     @property
@@ -210,7 +217,7 @@ def _of_a_share(log_likelihood: LogLikelihood, v: FloatArray) -> FloatArray:
     logarithm = log_likelihood(v)
     shown = np.exp(logarithm - logarithm.max())
     any_share = np.full(v.size, shown[0])
-    any_share[1:] = cumulative_trapezoid(shown, v) / v[1:]
+    any_share[1:] = scipy.integrate.cumulative_trapezoid(shown, v) / v[1:]
     return np.asarray(_HIDDEN * shown[0] + (1 - _HIDDEN) * any_share)
 
 
@@ -248,7 +255,7 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
 
     scatter = 0.0
     if excess(0.0) > 0:
-        scatter = float(brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
+        scatter = float(scipy.optimize.brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
     weight = 1 / (variance + scatter)
     return float(np.average(q, weights=weight)), 1 / math.sqrt(float(weight.sum()))
 

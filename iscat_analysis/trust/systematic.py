@@ -54,7 +54,7 @@ _MEDIAN_SE = 1.2533  # standard error of a median over that of a mean
 # Of a mass; beneath, lines of standards that scatter by a per cent are as wrong
 _LEAST_NONLINEAR_SHARE = 0.02
 _NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, however small its share
-_LEAST_SIGMAS = 0.5  # of σ, beyond which it is told
+_LEAST_SIGMAS = 0.5  # of σ, beyond which it is in the budget
 _LEAST_SELECTED = 0.01  # of σ, below which a threshold does nothing
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
 _NOTHING = 1e-9  # nm or kDa: what rounding leaves of a place that the optics do not move
@@ -130,8 +130,8 @@ def contributions(
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
-    `camera` is what ``summary.json`` says of it, `threshold_snr` that of the search, and `doubt`
-    what the configured optics may be wrong by where none were learned.
+    `camera` is the section of ``summary.json``, `threshold_snr` that of the search, and `doubt` the
+    errors that configured optics may have.
 
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
@@ -294,9 +294,9 @@ def _of_what_is_left_over(
 def _of_heavy_particles(
     scale: MassScale, config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
-    """Give what a line of faint standards makes of particles that are not.
+    """Give the error of heavy particles by a line of faint standards.
 
-    It moves all masses the same way, and is given where all together would show it.
+    It shifts all masses to one side, and is given if all rows together would show it.
     """
     if not _fits_masses(config):
         return {}
@@ -371,7 +371,7 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
 def _of_configured_optics(
     doubt: OpticsCovariance, config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
-    """Give what optics that no picture has confirmed may be wrong by, as if they were measured."""
+    """Give the error of configured optics that no image has confirmed."""
     optics = config.optics.model_copy(update={"covariance": doubt})
     return _of_the_optics(config.model_copy(update={"optics": optics}), table)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -152,6 +153,8 @@ def test_particles_in_two_halves_are_flagged(apart_nm: float) -> None:
     judged = Extension.of(CONFIG, rows(TRIALS), told, {})
     assert judged.flagged.all()
     assert "wider than a point's" in judged.message
+    assert "elongated, each in its own direction" in judged.message
+    assert "optics" in replace(judged, is_long=False).message  # which cannot elongate images so
 
 
 # ---- heights of many -------------------------------------------------------------------------

@@ -4,8 +4,9 @@ A line from one level to the other, between two frames, is set against a step.  
 line are left out of fits, whatever the course in them; but light that settles exponentially goes on
 rising after any line, and an exponential that describes the frames better than the line tells so.
 
-Particles of one kind rise alike, and the noise of a faint one may hide its rise or feign one.  All
-steps together tell over how many frames they rise; one that does not must show that itself.
+Particles of one kind rise alike, and the noise of a faint one may hide its rise or feign one.  The
+duration is therefore estimated from all steps together, and a step has another one only if its own
+likelihood is clearly larger with it.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def find_rise(
     """Find a rise around the best step, whose log-likelihood is given; None where it is a step.
 
     A course other than the expected one, which is a step if no frames of a rise are expected, must
-    be clearly better.  The gains of all lines over the step are what `common_rise` asks for.
+    be clearly better.  The gains of all lines over the step are given as well, for `common_rise`.
 
     Shapes: `heights` (t,), `weight` (t,).
     """
