@@ -433,7 +433,7 @@ class Particle(Section):
     @property
     def nominal_length_nm(self) -> float:
         """Length of a particle of the nominal mass along its longest axis [nm]."""
-        return self.nominal_diameter_nm * (self.aspect_ratio or 1.0) ** (2 / 3)
+        return float(self.nominal_diameter_nm * (self.aspect_ratio or 1.0) ** (2 / 3))
 
     @property
     def nominal_height_nm(self) -> float:

@@ -11,14 +11,16 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import correlate
 
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.slow_scoring import maximize_slowly
+from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.rods import ANGLES, Rod
 from iscat_analysis.optics.waves import with_light_of
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 AMPLITUDE, AZIMUTH, TILT = 3, 5, 6
 
@@ -27,9 +29,9 @@ _ASIDE_DEG = 20.0  # their first azimuth; across the polarisation, the tilt has 
 _SAME_DEG = 3.0  # between two directions that are one maximum, found twice
 _SAME_VALUE = 0.1  # of their log-likelihoods
 _STEP_DEG = 20.0  # largest step of an angle
-_HOPELESS = 12.0  # behind the best maximum in log-likelihood
 _TOLERANCE, _PASSES = 2e-4, 60
-_LARGEST = 100.0  # amplitude over that of the nominal mass
+_LARGEST, _LEAST_SHARE = 100.0, 1e-3  # amplitude over that of the nominal mass
+_EDGE_SHARE = 0.15  # of the region's side at each edge, where no fit begins
 
 
 @dataclass(frozen=True)
@@ -71,32 +73,28 @@ def score_fisher(
 
 
 def find_directions(
-    likelihood: Likelihood, place: tuple[float, float, float], rod: Rod, *, level: bool
+    likelihood: Likelihood, z_nm: float, rod: Rod, *, level: bool
 ) -> list[Direction]:
-    """Fit x, y, mass and both angles at the height of a place; every maximum, the best first."""
+    """Fit x, y, mass and both angles at a height; every maximum, the best first."""
     free = np.array([True, True, False, True, level, True, True])
     reach = likelihood.model.optics.wavelength_nm / 2
     largest = _LARGEST * likelihood.model.nominal_amplitude
-    lower, upper = (
-        np.array([place[0] + sign * reach, place[1] + sign * reach, place[2], end, sign,
-                  sign * math.inf, sign * math.inf])
-        for sign, end in ((-1.0, 0.0), (1.0, largest))
-    )  # fmt: skip
     farthest = np.array([reach / 2, reach / 2, 1.0, math.inf, 1.0, _STEP_DEG, _STEP_DEG])
     aside = likelihood.model.optics.polarization_deg + _ASIDE_DEG
-    starts = [_start(likelihood, place, rod.turned(aside + a, t)) for a, t in _everywhere()]
-    starts.sort(key=lambda start: -start[0])
-    starts = [start for start in starts if math.isfinite(start[0])] or starts[:1]
-    found: list[Direction] = []
-    for _, start in starts:
-        best = max((each.log_likelihood for each in found), default=-math.inf)
+    starts = (_start(likelihood, z_nm, rod.turned(aside + a, t)) for a, t in _everywhere())
+    found = []
+    for start in starts:
+        box = np.array([reach, reach, 0.0, math.inf, 1.0, math.inf, math.inf])
+        lower, upper = start - box, start + box
+        lower[AMPLITUDE], upper[AMPLITUDE] = 0.0, largest
         theta, value, _, converged, fisher = maximize_slowly(
             lambda theta: score_fisher(likelihood, theta, rod), np.minimum(start, upper), free,
-            lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=best - _HOPELESS,
+            lower, upper, farthest, tolerance=_TOLERANCE, passes=_PASSES, least=-math.inf,
         )  # fmt: skip
-        if converged or not found:
-            found.append(Direction(_upwards(theta), _sigma(fisher, free), value, converged))
-    return _distinct(sorted(found, key=lambda each: (not each.converged, -each.log_likelihood)))
+        found.append(Direction(_upwards(theta), _sigma(fisher, free), value, converged))
+    best = max(found, key=lambda each: each.log_likelihood)
+    maxima = [each for each in found if each.converged or each is best]
+    return _distinct(sorted(maxima, key=lambda each: -each.log_likelihood))
 
 
 def judge(likelihood: Likelihood, direction: Direction, rod: Rod) -> tuple[float, float]:
@@ -126,22 +124,22 @@ def _everywhere() -> list[tuple[float, float]]:
     ]
 
 
-def _start(
-    likelihood: Likelihood, place: tuple[float, float, float], rod: Rod
-) -> tuple[float, FloatArray]:
-    """Value and θ of the brightness that suits a direction best; −inf where it is negative."""
-    model, x, y, z = turned(likelihood.model, rod), *place
-    nominal = model.nominal_amplitude
-    signal = model.amplitude_image(likelihood.grid, x, y, z, nominal)
-    weight = likelihood.signal_information() * signal
-    share = np.nansum(weight * likelihood.measured_signal()) / np.sum(weight * signal)
-    amplitude = nominal * max(float(share), 1e-3)
-    signal = model.amplitude_image(likelihood.grid, x, y, z, amplitude)
-    value = likelihood.noise.terms(likelihood.data, signal, 0.0).value if share > 0 else -math.inf
-    return value, np.array([x, y, z, amplitude, 0.0, rod.azimuth_deg, rod.tilt_deg])
+def _start(likelihood: Likelihood, z_nm: float, rod: Rod) -> FloatArray:
+    """Give θ where the picture of a direction correlates best with what the counts show."""
+    model, grid = turned(likelihood.model, rod), likelihood.grid
+    odd = PixelGrid.centred(min(grid.shape) // 2 * 2 - 1, grid.pixel_nm)
+    picture = model.amplitude_image(odd, 0.0, 0.0, z_nm, model.nominal_amplitude)
+    matched = correlate(np.nan_to_num(likelihood.measured_signal()), picture, mode="same")
+    margin = [int(_EDGE_SHARE * size) for size in grid.shape]
+    inside = tuple(slice(m, size - m) for m, size in zip(margin, grid.shape, strict=True))
+    row, column = np.unravel_index(np.argmax(matched[inside]), matched[inside].shape)
+    share = max(float(matched[inside][row, column] / np.sum(picture**2)), _LEAST_SHARE)
+    amplitude = model.nominal_amplitude * (share if model.rho else math.sqrt(share))
+    x, y = grid.x_nm[margin[1] + column], grid.y_nm[margin[0] + row]
+    return np.array([x, y, z_nm, amplitude, 0.0, rod.azimuth_deg, rod.tilt_deg])
 
 
-def _sigma(fisher: FloatArray, free: FloatArray) -> FloatArray:
+def _sigma(fisher: FloatArray, free: BoolArray) -> FloatArray:
     """Give standard deviations, NaN where not free or not told; shape (7,)."""
     sigma = np.full(7, math.nan)
     known = free & (np.diag(fisher) > 0)

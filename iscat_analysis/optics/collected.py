@@ -21,7 +21,7 @@ def collected_area_nm2(model: ForwardModel, z_nm: float, mass_kda: float) -> flo
         return math.nan
     amplitude = model.scale.amplitude(mass_kda)
     opening = model.at(amplitude).aperture
-    p, phi = opening.pupil, np.arange(_AZIMUTHS) * (2 * math.pi / _AZIMUTHS)
+    p, phi = opening.pupil, np.linspace(0.0, 2 * math.pi, _AZIMUTHS, endpoint=False)
     decay = np.exp(-2 * p.axial.imag * model.centre_nm(z_nm, amplitude))
     density = (np.abs(opening.polarised(phi)) ** 2).sum(0).mean(1) * np.sin(p.theta) * decay
     pupil_integral = 2 * math.pi * float(np.sum(p.weight * density))

@@ -77,9 +77,13 @@ def rod_of(particle: Particle, permittivity: complex, n_sample: float) -> Rod | 
     if particle.aspect_ratio is None:
         return None
     excess = permittivity / n_sample**2 - 1
-    along = depolarisation(particle.aspect_ratio)
-    relative = [(1 + excess / 3) / (1 + factor * excess) for factor in (along, (1 - along) / 2)]
-    return Rod(*relative, azimuth_deg=particle.azimuth_deg or 0.0, tilt_deg=particle.tilt_deg or 0)
+    factor = depolarisation(particle.aspect_ratio)
+    return Rod(
+        along=(1 + excess / 3) / (1 + factor * excess),
+        across=(1 + excess / 3) / (1 + (1 - factor) / 2 * excess),
+        azimuth_deg=particle.azimuth_deg or 0.0,
+        tilt_deg=particle.tilt_deg or 0.0,
+    )
 
 
 def depolarisation(aspect_ratio: float) -> float:
@@ -94,6 +98,8 @@ def depolarisation(aspect_ratio: float) -> float:
 def _basis(optics: Optics) -> ComplexArray:
     """Give unit vectors along the polarisation, across it and along the axis of light, as rows."""
     if optics.polarization == "circular":
-        return np.array([[1, 1j, 0], [1, -1j, 0], [0, 0, math.sqrt(2)]]) / math.sqrt(2)
+        return np.array(
+            [[1, 1j, 0], [1, -1j, 0], [0, 0, math.sqrt(2)]], dtype=np.complex128
+        ) * math.sqrt(0.5)
     c, s = (f(math.radians(optics.polarization_deg)) for f in (math.cos, math.sin))
     return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]], dtype=np.complex128)

@@ -264,7 +264,7 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
             "status": str(status),
             "flags": ";".join(str(flag) for flag in noticed),
         }
-    start = start_of(likelihood, templates)
+    start = _start(likelihood, templates)
     free = FREE_PARAMETERS[config.fit.mode]
     if "mass_kda" not in free:
         start = replace(start, mass_kda=model.material.mass_kda)
@@ -304,7 +304,7 @@ def saturated_near(
     return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
 
 
-def start_of(likelihood: Likelihood, templates: Templates) -> Candidate:
+def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
     """Where the matched filter is largest, away from the edges of the region."""
     snr, strength = signal_to_noise(likelihood, templates)
     ranked = np.abs(snr) if templates.two_sided else snr

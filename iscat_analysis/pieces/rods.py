@@ -23,16 +23,14 @@ from iscat_analysis.inference.orientation import (
 )
 from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.pieces.counts import gather
-from iscat_analysis.pieces.regions import start_of
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import Status, verdict
-from iscat_analysis.search.templates import make_templates
 
 AMBIGUITY_ODDS = 1e-3
 """Likelihood of another direction, over that of the best, above which the row is flagged."""
 
-WIDE_DEG = 15.0
-"""Error of the direction above which it is flagged as well: errors are then no longer normal."""
+WIDE_DEG = 5.0
+"""Error of the direction above which it is flagged as well: it is no longer normal."""
 
 _NAMES = {"x_nm": 0, "y_nm": 1, "mass_kda": AMPLITUDE, "azimuth_deg": AZIMUTH, "tilt_deg": TILT}
 
@@ -61,8 +59,8 @@ def fit_rods(
     optics : Optics
         The microscope.
     particle : Particle
-        A particle with ``model="rod"``: its material, aspect ratio and height are held.  Its angles
-        serve to find the place where the fit begins.
+        A particle with ``model="rod"``: its material, aspect ratio and height are held, its angles
+        are not used.
     camera : Camera
         Pixel size, samples per pixel and read noise.
     n_after, n_before : int
@@ -83,7 +81,7 @@ def fit_rods(
         `other_tilt_deg`, `other_mass_kda` and `other_odds` of the next best, its likelihood over
         that of the best; `chi2_reduced` and `p_value`; and `status`, which is ``"ok"``,
         ``"not_converged"``, ``"poor_fit"`` or ``"ambiguous_direction"``: another direction is
-        likely with odds above 1 : 1000, or the direction is known to no better than 15 degrees.
+        likely with odds above 1 : 1000, or the direction is known to no better than 5 degrees.
 
     Raises
     ------
@@ -123,20 +121,10 @@ def fit_rods(
             f'particle.model = "{particle.model}": fit_rods fits rods; give '
             'Particle(model="rod", aspect_ratio=…), or use fit_rois'
         )
-    templates = make_templates(
-        model, config.detection,
-        pixel_nm=counts.grid.pixel_nm,
-        roi_nm=min(counts.grid.shape) * counts.grid.pixel_nm,
-        z_range_nm=None,
-        field_px=counts.grid.shape,
-    )  # fmt: skip
     rows = []
     for index in range(len(counts.after)):
         likelihood = counts.likelihood(index)
-        start = start_of(likelihood, templates)
-        place = start.x_px * counts.grid.pixel_nm, start.y_px * counts.grid.pixel_nm
-        height = particle.nominal_height_nm
-        found = find_directions(likelihood, (*place, height), rod, level=counts.level)
+        found = find_directions(likelihood, particle.nominal_height_nm, rod, level=counts.level)
         rows.append(_row(likelihood, found, rod))
     return pd.DataFrame(rows)
 

@@ -22,7 +22,7 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.rods import ANGLES, depolarisation
+from iscat_analysis.optics.rods import ANGLES, depolarisation, rod_of
 from tests.rays import picture_of_rays
 
 FloatArray = NDArray[np.float64]
@@ -88,6 +88,19 @@ def integrated_depolarisation(aspect_ratio: float) -> float:
 def test_the_field_inside_is_that_of_an_ellipsoid(aspect_ratio: float) -> None:
     expected = integrated_depolarisation(aspect_ratio)
     assert depolarisation(aspect_ratio) == pytest.approx(expected, rel=1e-9)
+
+
+def test_two_touching_spheres_are_a_spheroid() -> None:
+    """Two dipoles α one diameter apart: 2α/(1 − 2α/4πd³) along, 2α/(1 + α/4πd³) across."""
+    dimer = ia.Particle(
+        kind="silica", model="rod", aspect_ratio=1.392846575, azimuth_deg=0.0, tilt_deg=0.0
+    )
+    permittivity = material(dimer, 525.0).permittivity
+    found = rod_of(dimer, permittivity, 1.33)
+    beta = (permittivity - 1.33**2) / (permittivity + 2 * 1.33**2)  # α/4πd³ = β/8
+    assert found is not None
+    assert found.along == pytest.approx(1 / (1 - beta / 4), rel=1e-9)
+    assert found.across == pytest.approx(1 / (1 + beta / 8), rel=1e-9)
 
 
 @pytest.mark.parametrize("polarization", ["linear", "circular"])
