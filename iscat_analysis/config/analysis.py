@@ -143,6 +143,10 @@ class Fit(Section):
         False,
         description="fit two equal halves to every particle, and give extended ones their mass",
     )
+    index: bool = Field(
+        False,
+        description="mode size: fit the refractive index too, where the picture tells it",
+    )
     z_range_nm: tuple[
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
         Annotated[NonNegative, length(0.0, LARGEST_NM)],

@@ -113,6 +113,12 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
+    def _index_suits_mode(self) -> Config:
+        if self.fit.index and (refusal := index_refusal(self)):
+            raise ValueError(f"fit.index = true does not go together with {refusal}")
+        return self
+
+    @model_validator(mode="after")
     def _spheres_are_seen(self) -> Config:
         for kind in self.fit.spheres:
             if isinstance(kind, float) and abs(kind / self.optics.n_sample - 1) < INVISIBLE:
@@ -255,6 +261,22 @@ def refuse_rod(config: Config, what: str) -> None:
             f'particle.model = "rod": {what}; there are pictures, bounds and fits of '
             "rods (psf, crb, fit_rods, iscat simulate, iscat bounds)"
         )
+
+
+def index_refusal(config: Config) -> str:
+    """Say why the index of a sphere cannot be fitted; else nothing."""
+    particle, mode = config.particle, config.fit.mode
+    absorbs = particle.permittivity is not None and particle.permittivity[1] != 0
+    for key, is_set in (
+        (f'fit.mode = "{mode}": use "size"', mode != "size"),
+        (f'particle.model = "{particle.model}": use "mie"', particle.model != "mie"),
+        ("a material that absorbs, which has two numbers", absorbs or particle.kind == "gold"),
+        ('background.method = "sliding": give background.frames',
+         config.background.method == "sliding"),
+    ):  # fmt: skip
+        if is_set:
+            return key
+    return ""
 
 
 def sphere_refusal(config: Config) -> str:

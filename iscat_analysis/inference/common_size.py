@@ -50,6 +50,9 @@ could not reach more."""
 TOLERANCE = 1e-3
 """Gain of log-likelihood, as a scoring step expects it, at which the fit ends."""
 
+UNDETERMINED = 0.5
+"""Error of n − n_s, over its size, from which the index is not told."""
+
 _PASSES = 40
 _GROWTH = 0.2  # largest relative change of the mass in a step, and of n − n_s
 _HALVINGS = 12
@@ -222,7 +225,7 @@ def _gathered(
     information, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, 3, 3)), np.zeros((n, 3, k))
     mass = float(common[0])
     for f, likelihood in enumerate(likelihoods):
-        signal, rows = _slopes(likelihood, model, places[f], common)
+        signal, rows = slopes(likelihood, model, places[f], common)
         terms = likelihood.noise.terms(likelihood.data, signal, 0.0)
         value += terms.value
         if not math.isfinite(value):
@@ -252,7 +255,7 @@ def _gathered(
     return _Frames(value, pull, known, information, scores, inverse, mixed, diameter / (3 * mass))
 
 
-def _slopes(
+def slopes(
     likelihood: Likelihood, model: SizedModel, place: FloatArray, common: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Signal of a frame, and its derivatives in (x, y, z, m) or (x, y, z, m, n)."""
@@ -294,7 +297,7 @@ def _bias(
     mass = float(common[0])
     linear = _model_of(model, common).at(mass)
     for f, likelihood in enumerate(likelihoods):
-        signal, rows = _slopes(likelihood, model, places[f], common)
+        signal, rows = slopes(likelihood, model, places[f], common)
         terms = likelihood.noise.terms(likelihood.data, signal, 0.0)
         bends = linear.derivative_rows(likelihood.grid, np.array([*places[f], mass]))
         inverse = here.place_inverse[f]

@@ -214,7 +214,19 @@ def line_of(
         row[f"qcrb_{name}"] = bounds.qcrb[k]
     if isinstance(model, SeatedModel):
         return row | _without_mass(model, fit, row)
-    return row | sizes_of(model, fit) if isinstance(model, SizedModel) else row
+    if not isinstance(model, SizedModel):
+        return row
+    return row | sizes_of(model, fit) | _index_of(model, fit)
+
+
+def _index_of(model: SizedModel, fit: FitResult) -> dict[str, float]:
+    """Give the index where it was fitted, and bounds with it, which are the errors."""
+    if not math.isfinite(fit.sigma_index):
+        return {}
+    return {f"crb_{name}": float(fit.sigma[k]) for k, name in enumerate(PARAMETERS)} | {
+        "refractive_index": model.sphere.index.real,
+        "sigma_refractive_index": fit.sigma_index,
+    }
 
 
 def _without_mass(model: SeatedModel, fit: FitResult, row: Mapping[str, Any]) -> dict[str, Any]:

@@ -17,7 +17,12 @@ import pandas as pd
 from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
-from iscat_analysis.inference.common_size import CommonSize, common_sizes, fit_common_size
+from iscat_analysis.inference.common_size import (
+    UNDETERMINED,
+    CommonSize,
+    common_sizes,
+    fit_common_size,
+)
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.sized import SizedModel
@@ -30,9 +35,6 @@ from iscat_analysis.tracking.paths import ALONG, path_shifts_at
 
 LEAST_ABSORPTION = 1e-6
 """Imaginary part of an index from which a single index does not describe the material."""
-
-UNDETERMINED = 0.5
-"""Error of n − n_s, over its size, from which images and motion do not determine the index."""
 
 LEAST_APART = 0.25
 """Logarithm of the ratio of two masses below which a maximum that was given up may be the best."""
