@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import correlate
+from scipy.ndimage import correlate
 
 from iscat_analysis.inference.goodness import goodness_of_fit
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
@@ -129,7 +129,7 @@ def _start(likelihood: Likelihood, z_nm: float, rod: Rod) -> FloatArray:
     model, grid = turned(likelihood.model, rod), likelihood.grid
     odd = PixelGrid.centred(min(grid.shape) // 2 * 2 - 1, grid.pixel_nm)
     picture = model.amplitude_image(odd, 0.0, 0.0, z_nm, model.nominal_amplitude)
-    matched = correlate(np.nan_to_num(likelihood.measured_signal()), picture, mode="same")
+    matched = correlate(np.nan_to_num(likelihood.measured_signal()), picture, mode="constant")
     margin = [int(_EDGE_SHARE * size) for size in grid.shape]
     inside = tuple(slice(m, size - m) for m, size in zip(margin, grid.shape, strict=True))
     row, column = np.unravel_index(np.argmax(matched[inside]), matched[inside].shape)
