@@ -9,7 +9,7 @@ import typer
 from iscat_cli.console import Messages, failures, print_result
 from iscat_cli.options import DebugOption, Mode, ModeOption
 
-WIDTH = 80
+WIDTH, COMMENT = 80, 36  # columns of a narrow terminal, and where most comments begin
 
 EXAMPLE = """Example: a file to edit, and what it says checked without running anything.
 
@@ -43,12 +43,16 @@ _INTRODUCTION = """\
 
 def _folded(line: str) -> str:
     """Let a comment that would leave a narrow terminal go on in the next line."""
-    _, mark, comment = line.partition("  # ")
+    _, mark, comment = line.partition(" # ")
     if not mark or len(line) <= WIDTH:
         return line
     column = len(line) - len(comment)
-    first, *rest = textwrap.wrap(comment, WIDTH - column)
-    return "\n".join([line[:column] + first, *(f"{'# ':>{column}}{more}" for more in rest)])
+    first = textwrap.wrap(comment, WIDTH - column)[0]
+    column = min(column, COMMENT)
+    rest = textwrap.wrap(comment.removeprefix(first).strip(), WIDTH - column)
+    return "\n".join(
+        [f"{line.removesuffix(comment)}{first}", *(f"{'# ':>{column}}{more}" for more in rest)]
+    )
 
 
 def _one_of_each() -> str:

@@ -172,7 +172,8 @@ EVENTS = (
     ),
     Column(
         "refractive_index", "positive",
-        "Refractive index of the sphere, where model is sphere and it is fitted", optional=True,
+        "Refractive index of the sphere, where it is fitted: model is sphere, or fit.index; empty "
+        "if the picture does not tell it", optional=True,
     ),
     Column("sigma_refractive_index", "positive", "Its standard deviation", optional=True),
     Column(

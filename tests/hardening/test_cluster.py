@@ -45,7 +45,7 @@ LANDING = {
     "particle.mass_kda": 146.0,
     "calibration.gradient_per_kda": -3.1e-5,
     "background.window_frames": 40,
-    "compute.memory_limit_mb": 64,
+    "compute.memory_limit_mb": 48,
     "simulation.shape": [96, 96],
     "simulation.frames": FRAMES,
     "simulation.photons_per_pixel": 1e5,

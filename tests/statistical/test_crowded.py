@@ -171,8 +171,9 @@ def test_particles_that_poor_fits_conceal_are_found_together() -> None:
 
 
 def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Control."""
+    """Control, in which large ones, which are tried one by one, are not looked for either."""
     monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
+    monkeypatch.setattr(field, "_large_ones", lambda _, windows, *__: ([], windows))
     landings = draw_landings((2, 160, 160), 60, seed=3, frame=1, apart_px=14.0)
     found, _ = _fitted(Instrument(emission="reciprocal"), landings)
     assert sum(not e.flags for e in found) < 50

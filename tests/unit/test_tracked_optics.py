@@ -18,7 +18,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument import loop
 from iscat_analysis.instrument.fit_optics import Collected
-from iscat_analysis.instrument.joint_fit import _excess
+from iscat_analysis.instrument.joint_fit import excess
 from iscat_analysis.instrument.loop import Round, Rounds
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.optics.parameters import settings_of, with_settings
@@ -142,8 +142,8 @@ def test_what_pictures_of_one_owner_share_counts() -> None:
     scatter = 2.0 * len(scores) * np.eye(3)
     scores -= scores.mean(axis=0)
     room = 5 * np.sqrt(2 / (3 * 400))
-    assert _excess(scatter, scores, np.arange(1600)) == pytest.approx(1.0, abs=room)
-    assert _excess(scatter, scores, owners) == pytest.approx((4 + 16) / 8, abs=2.5 * room)
+    assert excess(scatter, scores, np.arange(1600)) == pytest.approx(1.0, abs=room)
+    assert excess(scatter, scores, owners) == pytest.approx((4 + 16) / 8, abs=2.5 * room)
 
 
 def _learned(names: tuple[str, ...], covariance: np.ndarray) -> OpticsCalibration:
