@@ -155,7 +155,7 @@ def qcrb(
     optics : Optics
         The microscope.
     particle : Particle
-        Its material; its height sets the focus.
+        Its material; its height sets the focus.  The direction of a rod is taken as known.
     camera : Camera
         Its pixel size turns photons per pixel into light.
     photons_per_pixel : array_like
