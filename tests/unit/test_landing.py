@@ -378,7 +378,7 @@ def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reporte
 def test_what_is_shown_of_events_is_made_of_the_first_alone(
     counts: np.ndarray, plain: tuple[Any, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.0026)
+    monkeypatch.setattr(chunks_module, "MEMORY_SHARE", 0.004)
     for module in (merging, chunk_work):
         monkeypatch.setattr(module, "VIEWS", 2)
         monkeypatch.setattr(module, "CLIPS", 1)
