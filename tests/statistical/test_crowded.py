@@ -170,6 +170,7 @@ def test_particles_that_poor_fits_conceal_are_found_together() -> None:
     assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * 60)
 
 
+@pytest.mark.large
 def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Control, in which large ones, which are tried one by one, are not looked for either."""
     monkeypatch.setattr(field, "_with_concealed", lambda *_: None)

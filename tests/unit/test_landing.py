@@ -359,6 +359,7 @@ def test_what_was_injected_is_looked_for_in_the_polarity_that_is_reported(
     assert found["recovered"] >= 2
 
 
+@pytest.mark.large
 def test_pulls_of_injected_particles_are_in_units_of_the_errors_that_are_reported(
     counts: np.ndarray,
 ) -> None:
