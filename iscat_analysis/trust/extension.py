@@ -253,9 +253,9 @@ def _mean(q: FloatArray, se: FloatArray) -> tuple[float, float]:
         mean = np.average(q, weights=1 / (variance + scatter))
         return float(np.sum((q - mean) ** 2 / (variance + scatter))) - (q.size - 1)
 
-    scatter = 0.0
-    if excess(0.0) > 0:
-        scatter = float(scipy.optimize.brentq(excess, 0.0, float(np.sum((q - q.mean()) ** 2))))
+    scatter, most = 0.0, 3 * float(np.sum((q - q.mean()) ** 2))  # with more, the excess is negative
+    if q.size > 1 and excess(0.0) > 0:
+        scatter = float(scipy.optimize.brentq(excess, 0.0, most))
     weight = 1 / (variance + scatter)
     return float(np.average(q, weights=weight)), 1 / math.sqrt(float(weight.sum()))
 

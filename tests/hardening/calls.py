@@ -147,6 +147,14 @@ def _made() -> dict[str, Call]:
     before = rng.poisson(1e6, images.shape).astype(float)
     after = rng.poisson(1e6 * (1 + images)).astype(float)
     regions = {"before": before, "after": after, **scope, "n_before": 100, "n_after": 100}
+    rod = ia.Particle(
+        kind="gold", diameter_nm=15, model="rod", aspect_ratio=3, azimuth_deg=0, tilt_deg=60
+    )
+    rods = regions | {
+        "particle": rod,
+        "before": before[:1, 3:-3, 3:-3],
+        "after": after[:1, 3:-3, 3:-3],
+    }
     frames, walk = np.arange(12), np.cumsum(rng.normal(0, 50, (12, 2)), axis=0)
     track = {"frames": frames, "positions_nm": walk, "sigma_nm": np.full(12, 10.0)}
     track |= {"frame_rate_hz": 100.0, "exposure_ms": 5.0}
@@ -182,6 +190,7 @@ def _made() -> dict[str, Call]:
         "fit_rois": (ia.fit_rois, regions | {
             "mode": "mass", "power_ratio": None, "level": None, "masked": None, "saturated": None,
             "corners_px": np.zeros((2, 2)), "calibration": None, "workers": 1}),
+        "fit_rods": (ia.fit_rods, rods | {"power_ratio": None, "level": None, "masked": None}),
         "log_likelihood": (_likelihood, regions | {
             "mode": "joint", "power_ratio": None, "level": None, "z_range_nm": (0.0, 300.0),
             "masked": None, "theta": np.array([500.0, 500.0, 50.0, 3000.0])}),
