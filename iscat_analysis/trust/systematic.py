@@ -26,7 +26,7 @@ from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model
 from iscat_analysis.optics.measured import Template
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
 from iscat_analysis.trust.assumed import INPUTS, assumed_error
 from iscat_analysis.trust.response import (
     COMMON,
@@ -57,8 +57,8 @@ _NONLINEAR_SIGMAS = 5.0  # beyond which the square is clear in a single row, how
 _LEAST_SIGMAS = 0.5  # of σ, beyond which it is in the budget
 _LEAST_SELECTED = 0.01  # of σ, below which a threshold does nothing
 _SAME = 1e-6  # change of the scale, which rounding leaves between equal optics
-# What rounding leaves of a place that the optics do not move [nm, kDa, and contrast]
-_NOTHING = dict.fromkeys(PARAMETERS, 1e-4) | {"contrast": 1e-9}
+# What rounding leaves of a place, mass or contrast that the optics do not change [nm, kDa, and 1]
+_NOTHING = {"x_nm": 1e-4, "y_nm": 1e-4, "z_nm": 1e-4, "mass_kda": 1e-9, "contrast": 1e-9}
 
 Errors = Callable[[Config, pd.DataFrame], Mapping[str, FloatArray]]
 """Gives, by name in `COMMON`, the standard deviation for every event; none for what it does not
