@@ -152,8 +152,8 @@ def _made() -> dict[str, Call]:
     )
     rods = regions | {
         "particle": rod,
-        "before": before[:1, 3:-3, 3:-3],
-        "after": after[:1, 3:-3, 3:-3],
+        "before": before[:1, 4:-4, 4:-4],
+        "after": after[:1, 4:-4, 4:-4],
     }
     frames, walk = np.arange(12), np.cumsum(rng.normal(0, 50, (12, 2)), axis=0)
     track = {"frames": frames, "positions_nm": walk, "sigma_nm": np.full(12, 10.0)}
