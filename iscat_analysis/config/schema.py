@@ -220,8 +220,8 @@ The light that the two halves of an upright rod scatter back is out of phase by 
 scatters 6 % less than its dipole, (k L)²/10."""
 
 
-def rod_refusal(config: Config) -> str:
-    """Say why a configuration does not go together with a rod; else nothing."""
+def _known_of_dipoles(config: Config) -> str:
+    """Name a setting that the models of spheres and rods do not have; nothing if none is set."""
     particle, optics = config.particle, config.optics
     for key, is_set in (
         ('optics.psf = "measured"', optics.psf == "measured"),
@@ -231,19 +231,35 @@ def rod_refusal(config: Config) -> str:
         ("[calibration]", config.calibration is not None),
         ("particle.wiggle_nm", particle.wiggle_nm > 0),
         ("particle.height_sd_nm", particle.height_sd_nm > 0),
-        (f'particle.height_nm = "{particle.height_nm}"', isinstance(particle.height_nm, str)),
+        ('particle.height_nm = "auto"', particle.height_nm == "auto"),
+        ('particle.height_nm = "contact"', particle.is_rod and particle.height_nm == "contact"),
     ):
         if is_set:
-            return (
-                f'{key} is for round particles, and particle.model is "rod": leave it out, or set '
-                'particle.model = "dipole"'
-            )
-    index, longest = particle.given_index, optics.wavelength_nm / optics.n_sample * ROD_PER_WAVE
-    if index is not None and abs(index / optics.n_sample - 1) < INVISIBLE:
+            return key
+    return ""
+
+
+def _unseen(optics: Optics, *indices: complex | None) -> str:
+    """Say that no part of a particle differs from the sample; nothing if one does."""
+    if any(n is None or abs(n / optics.n_sample - 1) >= INVISIBLE for n in indices):
+        return ""
+    return (
+        f"the refractive index of the particle is that of the sample, optics.n_sample = "
+        f"{optics.n_sample:g}: such a particle scatters no light"
+    )
+
+
+def rod_refusal(config: Config) -> str:
+    """Say why a configuration does not go together with a rod; else nothing."""
+    particle, optics = config.particle, config.optics
+    if key := _known_of_dipoles(config):
         return (
-            f"the refractive index of the particle is that of the sample, optics.n_sample = "
-            f"{optics.n_sample:g}: such a particle scatters no light"
+            f'{key} is for round particles, and particle.model is "rod": leave it out, or set '
+            'particle.model = "dipole"'
         )
+    if unseen := _unseen(optics, particle.given_index):
+        return unseen
+    longest = optics.wavelength_nm / optics.n_sample * ROD_PER_WAVE
     if particle.nominal_length_nm > longest:
         return (
             f"a rod of particle.aspect_ratio = {particle.aspect_ratio:g} and the volume of a "
@@ -300,21 +316,11 @@ def sphere_refusal(config: Config) -> str:
             "tracks are: give frames without particles, as in background.frames = [0, 200]; one "
             "that is learnt with the tracks is for dipoles"
         )
-    for key, set_to in (
-        ('optics.psf = "measured"', optics.psf == "measured"),
-        ('optics.convention = "dong2021"', optics.convention == "dong2021"),
-        ('optics.emission = "dong2021"', optics.emission == "dong2021"),
-        ('optics.calibrate = "always"', optics.calibrate == "always"),
-        ("[calibration]", config.calibration is not None),
-        ("particle.wiggle_nm", particle.wiggle_nm > 0),
-        ("particle.height_sd_nm", particle.height_sd_nm > 0),
-        ('particle.height_nm = "auto"', particle.height_nm == "auto"),
-    ):
-        if set_to:
-            return (
-                f'{key} is for dipoles, and particle.model is "{particle.model}": leave it out, or '
-                'set particle.model = "dipole"'
-            )
+    if key := _known_of_dipoles(config):
+        return (
+            f'{key} is for dipoles, and particle.model is "{particle.model}": leave it out, or '
+            'set particle.model = "dipole"'
+        )
     diameter = particle.nominal_diameter_nm
     if max(diameter, fit.diameter_range_nm[1]) > fit.roi_nm:
         what = (
@@ -330,12 +336,9 @@ def sphere_refusal(config: Config) -> str:
             f"fit.diameter_range_nm = {list(fit.diameter_range_nm)} begins below twice "
             f"particle.shell_nm = {particle.shell_nm:g}, where the shell has no core"
         )
-    indices = [particle.given_index, *([particle.shell_index] if particle.model == "shell" else [])]
-    if all(n is not None and abs(n / optics.n_sample - 1) < INVISIBLE for n in indices):
-        return (
-            f"the refractive index of the particle is that of the sample, optics.n_sample = "
-            f"{optics.n_sample:g}: such a particle scatters no light"
-        )
+    shell = [particle.shell_index] if particle.model == "shell" else []
+    if unseen := _unseen(optics, particle.given_index, *shell):
+        return unseen
     lowest = particle.nominal_height_nm
     if lowest < diameter / 2 * (1 - 1e-9):
         return (

@@ -22,7 +22,7 @@ from iscat_analysis.movie import Stack
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.seated import VESICLE
 from iscat_analysis.optics.spheres import has_shells
-from iscat_analysis.records import FloatArray, Status, Windows
+from iscat_analysis.records import FloatArray, Status, Windows, has_flag
 from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent
 from iscat_analysis.units import count, listed
@@ -243,7 +243,7 @@ def nonlinearity_warning(scale: MassScale, table: pd.DataFrame) -> str:
 
 def large_warning(config: Config, table: pd.DataFrame) -> str:
     """Say which particles are no dipoles, and which spheres they are."""
-    large = table[table["flags"].fillna("").str.split(";").map(lambda f: Status.LARGE.value in f)]
+    large = table[has_flag(table, Status.LARGE)]
     if not len(large):
         return ""
     each = large["model"].value_counts()
@@ -253,7 +253,7 @@ def large_warning(config: Config, table: pd.DataFrame) -> str:
         f"dipole: fitted as spheres on the coverslip ({known}), flagged large, these have no mass "
         "and belong to no species"
     )
-    poor = int(large["flags"].str.contains(Status.POOR_FIT.value).sum())
+    poor = int(has_flag(large, Status.POOR_FIT).sum())
     if poor:
         untried = VESICLE in config.fit.spheres and not has_shells()
         shells = '; vesicles were not tried: pip install "iscat-analysis[shell]"' if untried else ""
@@ -286,8 +286,7 @@ def landing_rate_warning(table: pd.DataFrame) -> str:
 
     Their pictures may agree with the model; `Status.CHANGING` is about the light before and after.
     """
-    flags = table["flags"].fillna("").astype(str).str.split(";")
-    slow = int(flags.map(lambda listed: Status.CHANGING.value in listed).sum())
+    slow = int(has_flag(table, Status.CHANGING).sum())
     if slow < _FEWEST_SLOW or slow < _MANY_SLOW * len(table):
         return ""
     return (

@@ -48,7 +48,7 @@ from iscat_analysis.records.frames import (
     StackMetadata,
     Windows,
 )
-from iscat_analysis.records.rows import flagged, has_only, make_rows, with_diameters
+from iscat_analysis.records.rows import flagged, has_flag, has_only, make_rows, with_diameters
 from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
@@ -90,6 +90,7 @@ __all__ = [
     "Windows",
     "flagged",
     "free_parameters",
+    "has_flag",
     "has_only",
     "make_rows",
     "silent",

@@ -65,6 +65,14 @@ def has_only(table: pd.DataFrame, known: frozenset[str]) -> BoolArray:
                     dtype=bool)  # fmt: skip
 
 
+def has_flag(table: pd.DataFrame, flag: Status | TrackStatus) -> BoolArray:
+    """Tell which rows have a flag, whatever others they have.
+
+    Shapes: result (rows,).
+    """
+    return np.array([flag.value in str(one).split(";") for one in table["flags"]], dtype=bool)
+
+
 def flagged(
     table: pd.DataFrame, flag: Status | TrackStatus, which: BoolArray | None = None
 ) -> pd.DataFrame:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
 from iscat_analysis.inference.split_frames import BLOCK_ROWS
-from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, REPEAT_COLUMNS, FloatArray, Status, has_only
 from iscat_analysis.search.empty import EmptySpread
 
 _NOISE_SHOWS = frozenset(
@@ -26,11 +26,8 @@ def measure_spread(
     mode: str, table: pd.DataFrame, repeats: Sequence[FloatArray], empty: EmptySpread | None
 ) -> dict[str, EmpiricalSpread]:
     """Pool the spread of all events that are ok, or flagged as a poor fit only."""
-    kept = [
-        repeat
-        for repeat, status, flags in zip(repeats, table["status"], table["flags"], strict=True)
-        if {status, *str(flags).split(";")} - {""} <= _NOISE_SHOWS
-    ]
+    shows = has_only(table, _NOISE_SHOWS).tolist()
+    kept = [repeat for repeat, good in zip(repeats, shows, strict=True) if good]
     if not kept:
         return {}
     own = np.stack(kept)[:, :BLOCK_ROWS]
