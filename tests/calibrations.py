@@ -55,8 +55,11 @@ def make_particle_images(
     photons: float = PHOTONS,
     masses_kda: tuple[float, ...] = MASSES_KDA,
     leaving: float = 0.1,
+    height_nm: float = 5.0,
 ) -> tuple[list[ParticleImage], list[ParticleImage], Build]:
     """Draw pictures in a microscope that differs from the configured one.
+
+    Particles are at `height_nm` and taken for 5 nm high.
 
     Returns
     -------
@@ -72,7 +75,7 @@ def make_particle_images(
     for _ in range(count):
         x, y = random.uniform(-PIXEL_NM / 2, PIXEL_NM / 2, 2)
         mass = random.choice(masses_kda) * (-1 if random.random() < leaving else 1)
-        signal = model.image(GRID, x, y, 5.0, mass)
+        signal = model.image(GRID, x, y, height_nm, mass)
         before = random.poisson(photons, GRID.shape).astype(float)
         after = random.poisson(photons * (1 + signal)).astype(float)
         data = conditional(model, GRID, before, after, 1.0).data

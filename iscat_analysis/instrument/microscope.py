@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.goodness import goodness_of_fit
+from iscat_analysis.inference.heights import height_prior
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
 from iscat_analysis.instrument.particle_image import (
@@ -30,7 +32,8 @@ def build_microscope(
 ) -> ForwardModel:
     """Make the forward model of other optics, with the model's own mass scale."""
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
-    highest = None if heights_free(config) else config.particle.nominal_height_nm
+    seated = not heights_free(config) and not config.particle.height_is_open
+    highest = config.particle.nominal_height_nm if seated else None
     return forward_model(changed, reach_nm, z_max_nm=highest, like=like)
 
 
@@ -132,6 +135,7 @@ def median_p(
     """Give the median p-value of the brightest particles in the configured microscope.
 
     The rings of neighbours, where any are known, are put into the pictures that fail without.
+    Particles whose heights are open stand at the height that most of them tell.
     """
     settings = settings_of(config)
     build = microscopes(config, max(map(reach_nm, images)) + math.sqrt(2) * _STARTS_NM[-1])
@@ -147,12 +151,24 @@ def median_p(
         return float(np.median([goodness(image, model)[1] for image in fitted])), fitted
 
     moved = [image.placed(image.x_nm + x, image.y_nm + y) for image in shown]
-    found, fitted = median(with_masses(moved, build, settings))
+    shown = with_masses(moved, build, settings)
+    if config.particle.height_is_open:
+        free = maximise(with_heights(shown, config), build, settings, (), mapper=mapper).images
+        middle = float(np.median([image.z_nm for image in free]))
+        shown = [replace(image, z_nm=middle) for image in shown]
+    found, fitted = median(shown)
     if found >= REJECTED_P or not any(image.neighbours for image in fitted):
         return found, fitted
     elsewhere = [other.placed(other.x_nm + x, other.y_nm + y) for other in others]
     near = Neighbours.fitted(elsewhere, build, rings_of(config, images[0]), settings, mapper)
     return max((found, fitted), median(near.around(fitted, mapper)), key=lambda each: each[0])
+
+
+def with_heights(images: Sequence[ParticleImage], config: Config) -> Sequence[ParticleImage]:
+    """Let each particle have its own height, if heights are to be learned from the movie."""
+    prior = height_prior(config, 0.0) if config.particle.height_is_open else None
+    heights = None if prior is None else prior.range_nm
+    return [replace(image, heights_nm=heights or image.heights_nm) for image in images]
 
 
 def not_alone(

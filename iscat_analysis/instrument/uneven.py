@@ -24,7 +24,7 @@ from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.joint_fit import Asked, Estimate, asked_changes, maximise
 from iscat_analysis.instrument.measure import HELD_OUT
-from iscat_analysis.instrument.microscope import microscopes, reach_nm
+from iscat_analysis.instrument.microscope import microscopes, reach_nm, with_heights
 from iscat_analysis.instrument.particle_image import Build, ParticleImage, with_masses
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import (
@@ -193,7 +193,7 @@ def asked_change(
     mapper: Mapper = map,
 ) -> Change:
     """Find the kind of change that pictures ask for most, beside another focus and phase."""
-    seen = view.placed(images)
+    seen = view.placed(with_heights(images, config))
     if len({image.spot for image in seen}) < LEAST_PICTURES:
         return EVEN
     build = microscopes(config, max(map(reach_nm, images)))

@@ -9,7 +9,7 @@ import pytest
 from calibrations import configuration, make_particle_images
 
 from iscat_analysis.instrument.joint_fit import maximise
-from iscat_analysis.instrument.microscope import REJECTED_P, goodness
+from iscat_analysis.instrument.microscope import REJECTED_P, goodness, median_p, microscopes
 from iscat_analysis.instrument.score_test import ScoreTest, score_test
 from iscat_analysis.optics.parameters import settings_of
 
@@ -56,3 +56,20 @@ def test_without_pictures_optics_are_as_likely_off_as_right() -> None:
     assert found.log_bayes_factor == 0
     focus = found.names.index("focus_nm")
     assert np.sqrt(found.doubt.matrix[focus][focus]) == pytest.approx(30 / np.sqrt(2))
+
+
+@pytest.mark.parametrize(("height", "is_right"), [("auto", True), (5.0, False)])
+def test_a_common_height_is_no_other_optics_if_heights_are_open(
+    height: str | float, is_right: bool
+) -> None:
+    config = configuration()
+    particle = config.particle.model_copy(update={"height_nm": height})
+    config = config.model_copy(update={"particle": particle})
+    assert config.fit.mode == "mass"
+    images, *_ = make_particle_images(
+        {}, COUNT, seed=5, photons=10 * PHOTONS, masses_kda=(2000.0,), height_nm=17.0
+    )
+    median, fitted = median_p(images, config)
+    found = score_test(fitted, microscopes(config, 2600.0), settings_of(config))
+    assert (median > REJECTED_P and not found.rejected) == is_right
+    assert (abs(fitted[0].z_nm - 17.0) < 1.0) == is_right
