@@ -12,9 +12,9 @@ are of no particle; the flags and the lines that name the cause.
 
 A row keeps its promise where the bias of its ``ok`` rows lies within `SIGMAS` of both errors
 together, no more than one of 500 is beyond `BEYOND`, and no more are of no particle than false
-alarms allow; or where no row is ``ok``, or the movie is refused, and the cause is named.  A control
-whose truth is changed afterwards must be found broken.  Exit status 1 where a row breaks its
-promise, or the control does not.
+alarms allow; or where no row of a particle is ``ok``, or the movie is refused, and the cause is
+named.  A control whose truth is changed afterwards must be found broken.  Exit status 1 where a row
+breaks its promise, or the control does not.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def judge(name: str, row: Row, strength: float, seeds: range) -> dict[str, Any]:
     out["named"] = named
     right = enough and abs(out["bias_over_both"]) <= SIGMAS and beyond <= count // ONE_OF
     few = invented <= alarms + CHANCE_FALSE * np.sqrt(alarms)
-    out["kept"] = bool((right and few) or (not len(good) and named))
+    out["kept"] = bool(few and (right or (not count and named)))
     return out
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
@@ -167,7 +167,7 @@ def _doubted(together: ScoreTest) -> dict[str, Any]:
     return {
         "log_bayes_factor": together.log_bayes_factor,
         "left_over": together.left_over,
-        "doubt": together.doubt.model_dump(),
+        "doubt": together.doubt.model_dump() | {"field_px": together.field_px},
     }
 
 
@@ -229,6 +229,7 @@ def tested_optics(
         over_field = [name for name in change.terms if name in FIELD]
         if over_field:
             together = _together(view.placed(fitted), config, pool, over_field)
+            together = together and replace(together, field_px=view.centre_px)
     if sliding and change.matters:  # which the first particles of a long movie tell badly
         images, others = bright_particle_images(movie, config, camera, pool, opening, whole=True)
         alone = len(images)

@@ -58,6 +58,9 @@ class ScoreTest:
     """Part of the images that the change explains, over the images (root mean square), with the
     probability of a change as a factor of its square."""
 
+    field_px: tuple[float, float, float] | None = None
+    """Centre x, y and half the longer side of the field that its terms refer to."""
+
     @property
     def rejected(self) -> bool:
         """Whether other optics are clearly likelier, and different enough to change masses."""

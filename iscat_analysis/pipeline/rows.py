@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.config import OpticsCovariance
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
 from iscat_analysis.inference.nuisances import Evidence
@@ -108,11 +107,10 @@ def reported_rows(
     else:
         unfit = misfit_error(fits, found.context.roi_px**2)
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
-    doubt = None if learned or "doubt" not in optics else OpticsCovariance(**optics["doubt"])
+    doubt = None if learned else optics.get("doubt")
     shared = contributions(
-        config, fits, unfit, found.context.model.scale, shifts, camera, threshold,
-        doubt,
-    )  # fmt: skip
+        config, fits, unfit, found.context.model.scale, shifts, camera, threshold, doubt
+    )
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:
         columns |= repeat_columns(mode, fits, found.repeats)

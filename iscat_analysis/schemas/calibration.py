@@ -241,6 +241,9 @@ class Doubt(Closed):
 
     names: list[str] = key("Parameters, in the order of matrix")
     matrix: list[list[float]] = key("Their covariance")
+    field_px: list[float] | None = key(
+        "Centre x, y and half the longer side of the field of its terms [pixels]; null without any"
+    )
 
 
 class Learned(Closed):

@@ -127,12 +127,12 @@ def contributions(
     held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
     camera: Mapping[str, Any] | None = None,
     threshold_snr: float = 0.0,
-    doubt: OpticsCovariance | None = None,
+    doubt: Mapping[str, Any] | None = None,
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
     `camera` is the section of ``summary.json``, `threshold_snr` that of the search, and `doubt` the
-    errors that configured optics may have.
+    errors that configured optics may have, as the summary has them.
 
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
@@ -370,10 +370,12 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
 
 
 def _of_configured_optics(
-    doubt: OpticsCovariance, config: Config, table: pd.DataFrame
+    doubt: Mapping[str, Any], config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
     """Give the error of configured optics that no image has confirmed."""
-    optics = config.optics.model_copy(update={"covariance": doubt})
+    errors = OpticsCovariance(names=doubt["names"], matrix=doubt["matrix"])
+    field = config.optics.field_px or doubt["field_px"]
+    optics = config.optics.model_copy(update={"covariance": errors, "field_px": field})
     return _of_the_optics(config.model_copy(update={"optics": optics}), table)
 
 

@@ -26,6 +26,7 @@ from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.parameters import settings_of
 from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
+from iscat_analysis.trust.systematic import contributions
 
 NAMES = ("focus_nm", "na", "z8", "z11")
 SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
@@ -212,3 +213,16 @@ def test_the_covariance_survives_the_way_through_a_file() -> None:
         _config(**{"optics.covariance": {"names": ["focus"], "matrix": [[1.0]]}})
     with pytest.raises(ConfigError, match="not symmetric"):
         _config(np.triu(COVARIANCE))
+
+
+def test_a_doubt_about_the_field_grows_from_its_centre() -> None:
+    """A curved focus is another focus at (x² + y²) of the distance to the centre."""
+    config = _config(**{"optics.covariance": None})
+    table = _event(config, 5.0, 0.06).assign(x_px=72.0, y_px=48.0)
+
+    def error(name: str, sigma: float) -> float:
+        doubt = {"names": [name], "matrix": [[sigma**2]], "field_px": [48.0, 48.0, 48.0]}
+        found = contributions(config, table, doubt=doubt)
+        return float({s.name: e for s, e in found}["optics as configured"]["mass_kda"][0])
+
+    assert error("focus_curvature_nm", 8.0) == pytest.approx(error("focus_nm", 8.0 * 0.5**2))
