@@ -1,7 +1,10 @@
 """Find the code blocks of the manual, run them in order, and keep their output.
 
 A page's ``console`` blocks (lines that begin with ``$``) and ``python`` blocks are run one after
-the other in one folder, the Python blocks in one interpreter.  Comments in the page control this:
+the other in one folder, the Python blocks in one interpreter.  A line that is one `iscat` or
+`iscat-fit` command, perhaps with ``> FILE``, runs there too, through the function that the
+installed program calls, so that the library is loaded once for a page.  Every other line runs in a
+shell.  Comments in the page control this:
 
 ``<!-- not run: REASON -->``
     before a block that cannot be run.
@@ -19,6 +22,7 @@ import importlib.util
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -29,6 +33,10 @@ from pathlib import Path
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
 COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
+PROGRAMS = {"iscat": "main", "iscat-fit": "main_fit"}
+"""Functions of `iscat_cli` that the installed programs call."""
+SHELL = set("|&;<>$`*?~")
+"""Characters for which a line needs a shell, wherever they stand."""
 SURROUNDINGS = {
     "MPLBACKEND": "Agg",
     "COLUMNS": "100",
@@ -131,14 +139,17 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
             outcomes.append(outcome)
             shown = block.commands if block.language == "console" else []
             for command in (*block.first, *shown):
-                done = subprocess.run(
-                    ["bash", "-e", "-o", "pipefail", "-c", command],
-                    cwd=folder, env=environment, text=True, check=False,
-                    stdin=subprocess.DEVNULL, capture_output=True,
-                )  # fmt: skip
-                outcome.out += done.stdout if command in shown else ""
-                if done.returncode:
-                    outcome.failed = f"{command}\n{done.stdout}{done.stderr}"
+                if found := _call_of(command):
+                    call, target = found
+                    out, failed = interpreter.run(call)
+                    if target:
+                        (folder / target).write_text(out, encoding="utf-8")
+                        out = ""
+                else:
+                    out, failed = _run_in_shell(command, folder, environment)
+                outcome.out += out if command in shown else ""
+                if failed is not None:
+                    outcome.failed = f"{command}\n{out}{failed}"
                     return outcomes
             if block.language == "python":
                 outcome.out, outcome.failed = interpreter.run(block.text)
@@ -147,17 +158,50 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
     return outcomes
 
 
+def _call_of(command: str) -> tuple[list[str], str] | None:
+    """Find function and arguments of a line that is one command, and the file for its output."""
+    line, _, target = command.replace("\\\n", " ").partition(" > ")
+    if SHELL & set(line + target):
+        return None
+    program, *arguments = shlex.split(line)
+    return ([PROGRAMS[program], *arguments], target) if program in PROGRAMS else None
+
+
+def _run_in_shell(
+    command: str, folder: Path, environment: dict[str, str]
+) -> tuple[str, str | None]:
+    """Run a line; return its output, and what it said besides if it failed."""
+    done = subprocess.run(
+        ["bash", "-e", "-o", "pipefail", "-c", command],
+        cwd=folder, env=environment, text=True, check=False,
+        stdin=subprocess.DEVNULL, capture_output=True,
+    )  # fmt: skip
+    return done.stdout, done.stderr if done.returncode else None
+
+
 class _Interpreter:
-    """One Python process that runs snippet after snippet."""
+    """One Python process that runs snippets, and commands of the package, one after the other."""
 
     LOOP = """
-import contextlib, io, json, sys, traceback
+import contextlib, io, json, os, sys, traceback
+
 names = {"__name__": "__main__"}
-for line in sys.stdin:
+lines, sys.stdin = sys.stdin, open(os.devnull)
+
+def run(work):
+    if isinstance(work, str):
+        exec(compile(work, "<block>", "exec"), names)
+    else:
+        import iscat_cli
+        function, *arguments = work
+        if status := getattr(iscat_cli, function)(arguments):
+            raise SystemExit(f"exit status {status}")
+
+for line in lines:
     said, failed = io.StringIO(), None
     with contextlib.redirect_stdout(said):
         try:
-            exec(compile(json.loads(line), "<block>", "exec"), names)
+            run(json.loads(line))
         except BaseException:
             failed = traceback.format_exc()
     print(json.dumps([said.getvalue(), failed]), flush=True)
@@ -171,8 +215,11 @@ for line in sys.stdin:
     def __enter__(self) -> _Interpreter:
         return self
 
-    def run(self, text: str) -> tuple[str, str | None]:
-        """Run a snippet; return its output, and the traceback if it failed."""
+    def run(self, work: str | list[str]) -> tuple[str, str | None]:
+        """Run a snippet, or a function of `iscat_cli` with its arguments.
+
+        Returns its output, and what it said besides with the traceback if it failed.
+        """
         if self._process is None:
             arguments, folder, environment = self._arguments
             self._process = subprocess.Popen(
@@ -182,13 +229,16 @@ for line in sys.stdin:
         process = self._process
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("the interpreter has no pipes")
-        process.stdin.write(json.dumps(text) + "\n")
+        process.stdin.write(json.dumps(work) + "\n")
         process.stdin.flush()
         answer = process.stdout.readline()
         if not answer:
             self._errors.seek(0)
             return "", self._errors.read() or "the interpreter ended"
         out, failed = json.loads(answer)
+        if failed is not None:
+            self._errors.seek(0)
+            failed = self._errors.read() + failed
         return out, failed
 
     def __exit__(self, *_: object) -> None:
