@@ -1,10 +1,10 @@
 """Find the code blocks of the manual, run them in order, and keep their output.
 
 A page's ``console`` blocks (lines that begin with ``$``) and ``python`` blocks are run one after
-the other in one folder, the Python blocks in one interpreter.  A line that is one `iscat` or
-`iscat-fit` command, perhaps with ``> FILE``, runs there too, through the function that the
-installed program calls, so that the library is loaded once for a page.  Every other line runs in a
-shell.  Comments in the page control this:
+the other in one folder, the Python blocks with names of their own in an interpreter that serves
+page after page.  A line that is one `iscat` or `iscat-fit` command, perhaps with ``> FILE``, runs
+there too, through the function that the installed program calls, so that the library is loaded
+once.  Every other line runs in a shell.  Comments in the page control this:
 
 ``<!-- not run: REASON -->``
     before a block that cannot be run.
@@ -33,7 +33,7 @@ from pathlib import Path
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
 COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
-PROGRAMS = {"iscat": "main", "iscat-fit": "main_fit"}
+FUNCTIONS = {"iscat": "main", "iscat-fit": "main_fit"}
 """Functions of `iscat_cli` that the installed programs call."""
 SHELL = set("|&;<>$`*?~")
 """Characters for which a line needs a shell, wherever they stand."""
@@ -111,7 +111,7 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first, not_run, keep = [], None, None
 
 
-def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
+def run_page(page: Path, folder: Path, interpreter: Interpreter) -> list[Outcome]:
     """Run a page's blocks in a folder and stop at the first that fails.
 
     Parameters
@@ -120,42 +120,50 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
         Markdown.
     folder : Path
         Folder to run in; it should contain the files that `prepare` copies.
-    bin_folder : Path
-        Folder of `iscat` and `python`.
+    interpreter : Interpreter
+        Python to run in; it forgets the names of the page before.
 
     Returns
     -------
     list of Outcome
         One for each block that was run.
     """
-    path = os.pathsep.join([str(bin_folder), os.environ["PATH"]])
-    environment = os.environ | SURROUNDINGS | {"PATH": path}
+    interpreter.run("begin", str(folder))
     outcomes = []
-    with _Interpreter(bin_folder / "python", folder, environment) as interpreter:
-        for block in blocks_of(page):
-            if block.not_run is not None:
-                continue
-            outcome = Outcome(block)
-            outcomes.append(outcome)
-            shown = block.commands if block.language == "console" else []
-            for command in (*block.first, *shown):
-                if found := _call_of(command):
-                    call, target = found
-                    out, failed = interpreter.run(call)
-                    if target:
-                        (folder / target).write_text(out, encoding="utf-8")
-                        out = ""
-                else:
-                    out, failed = _run_in_shell(command, folder, environment)
-                outcome.out += out if command in shown else ""
-                if failed is not None:
-                    outcome.failed = f"{command}\n{out}{failed}"
-                    return outcomes
-            if block.language == "python":
-                outcome.out, outcome.failed = interpreter.run(block.text)
-                if outcome.failed:
-                    return outcomes
+    for block in blocks_of(page):
+        if block.not_run is not None:
+            continue
+        outcome = Outcome(block)
+        outcomes.append(outcome)
+        shown = block.commands if block.language == "console" else []
+        for command in (*block.first, *shown):
+            out, failed = _run_command(command, folder, interpreter)
+            outcome.out += out if command in shown else ""
+            if failed is not None:
+                outcome.failed = f"{command}\n{out}{failed}"
+                return outcomes
+        if block.language == "python":
+            outcome.out, outcome.failed = interpreter.run("python", block.text)
+            if outcome.failed:
+                return outcomes
     return outcomes
+
+
+def _run_command(command: str, folder: Path, interpreter: Interpreter) -> tuple[str, str | None]:
+    """Run a line; return its output, and what it said besides if it failed."""
+    if found := _call_of(command):
+        call, target = found
+        out, failed = interpreter.run(*call)
+        if target:
+            (folder / target).write_text(out, encoding="utf-8")
+            out = ""
+        return out, failed
+    done = subprocess.run(
+        ["bash", "-e", "-o", "pipefail", "-c", command],
+        cwd=folder, env=interpreter.environment, text=True, check=False,
+        stdin=subprocess.DEVNULL, capture_output=True,
+    )  # fmt: skip
+    return done.stdout, done.stderr if done.returncode else None
 
 
 def _call_of(command: str) -> tuple[list[str], str] | None:
@@ -164,86 +172,79 @@ def _call_of(command: str) -> tuple[list[str], str] | None:
     if SHELL & set(line + target):
         return None
     program, *arguments = shlex.split(line)
-    return ([PROGRAMS[program], *arguments], target) if program in PROGRAMS else None
+    return ([FUNCTIONS[program], *arguments], target) if program in FUNCTIONS else None
 
 
-def _run_in_shell(
-    command: str, folder: Path, environment: dict[str, str]
-) -> tuple[str, str | None]:
-    """Run a line; return its output, and what it said besides if it failed."""
-    done = subprocess.run(
-        ["bash", "-e", "-o", "pipefail", "-c", command],
-        cwd=folder, env=environment, text=True, check=False,
-        stdin=subprocess.DEVNULL, capture_output=True,
-    )  # fmt: skip
-    return done.stdout, done.stderr if done.returncode else None
+class Interpreter:
+    """A Python process that runs blocks and commands of the package, one after the other.
 
-
-class _Interpreter:
-    """One Python process that runs snippets, and commands of the package, one after the other."""
+    Parameters
+    ----------
+    bin_folder : Path
+        Folder of `iscat` and `python`.
+    """
 
     LOOP = """
 import contextlib, io, json, os, sys, traceback
 
-names = {"__name__": "__main__"}
+names = {}
 lines, sys.stdin = sys.stdin, open(os.devnull)
 
-def run(work):
-    if isinstance(work, str):
-        exec(compile(work, "<block>", "exec"), names)
+def run(kind, *given):
+    if kind == "begin":
+        os.chdir(*given)
+        names.clear()
+        names["__name__"] = "__main__"
+    elif kind == "python":
+        exec(compile(*given, "<block>", "exec"), names)
     else:
         import iscat_cli
-        function, *arguments = work
-        if status := getattr(iscat_cli, function)(arguments):
+        if status := getattr(iscat_cli, kind)(given):
             raise SystemExit(f"exit status {status}")
 
 for line in lines:
     said, failed = io.StringIO(), None
     with contextlib.redirect_stdout(said):
         try:
-            run(json.loads(line))
+            run(*json.loads(line))
         except BaseException:
             failed = traceback.format_exc()
     print(json.dumps([said.getvalue(), failed]), flush=True)
 """
 
-    def __init__(self, python: Path, folder: Path, environment: dict[str, str]) -> None:
-        self._arguments = ([str(python), "-c", self.LOOP], folder, environment)
-        self._process: subprocess.Popen[str] | None = None
-        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the interpreter
+    def __init__(self, bin_folder: Path) -> None:
+        path = os.pathsep.join([str(bin_folder), os.environ["PATH"]])
+        self.environment = os.environ | SURROUNDINGS | {"PATH": path}
+        self._python = bin_folder / "python"
 
-    def __enter__(self) -> _Interpreter:
+    def __enter__(self) -> Interpreter:
+        self._errors = tempfile.TemporaryFile("w+")
+        self._process = subprocess.Popen(
+            [str(self._python), "-c", self.LOOP], env=self.environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+        )  # fmt: skip
         return self
 
-    def run(self, work: str | list[str]) -> tuple[str, str | None]:
-        """Run a snippet, or a function of `iscat_cli` with its arguments.
+    def run(self, kind: str, *given: str) -> tuple[str, str | None]:
+        """Run a block (``"python"``), or a function of `iscat_cli` with its arguments.
 
-        Returns its output, and what it said besides with the traceback if it failed.
+        ``"begin"`` goes to the folder of another page.  Returns the output, and, if it failed, what
+        was said on stderr with the traceback.
         """
-        if self._process is None:
-            arguments, folder, environment = self._arguments
-            self._process = subprocess.Popen(
-                arguments, cwd=folder, env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-            )  # fmt: skip
         process = self._process
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("the interpreter has no pipes")
-        process.stdin.write(json.dumps(work) + "\n")
+        process.stdin.write(json.dumps([kind, *given]) + "\n")
         process.stdin.flush()
         answer = process.stdout.readline()
-        if not answer:
-            self._errors.seek(0)
-            return "", self._errors.read() or "the interpreter ended"
-        out, failed = json.loads(answer)
+        out, failed = json.loads(answer) if answer else ("", "the interpreter ended")
         if failed is not None:
             self._errors.seek(0)
             failed = self._errors.read() + failed
         return out, failed
 
     def __exit__(self, *_: object) -> None:
-        if self._process is not None:
-            self._process.communicate(timeout=60)
+        self._process.communicate(timeout=60)
         self._errors.close()
 
 
@@ -253,15 +254,16 @@ def main() -> None:
 
     root = Path(__file__).resolve().parent.parent
     failures = 0
-    for name in sys.argv[1:]:
-        with tempfile.TemporaryDirectory() as folder:
-            prepare(root, Path(folder))
-            for outcome in run_page(Path(name), Path(folder), Path(sys.executable).parent):
-                head = f"{name}:{outcome.block.line}"
-                sys.stdout.write(f"== {head}\n{outcome.out}{outcome.failed or ''}\n")
-                failures += outcome.failed is not None
-            if kept := os.environ.get("KEEP"):
-                shutil.copytree(folder, kept, dirs_exist_ok=True)
+    with Interpreter(Path(sys.executable).parent) as interpreter:
+        for name in sys.argv[1:]:
+            with tempfile.TemporaryDirectory() as folder:
+                prepare(root, Path(folder))
+                for outcome in run_page(Path(name), Path(folder), interpreter):
+                    head = f"{name}:{outcome.block.line}"
+                    sys.stdout.write(f"== {head}\n{outcome.out}{outcome.failed or ''}\n")
+                    failures += outcome.failed is not None
+                if kept := os.environ.get("KEEP"):
+                    shutil.copytree(folder, kept, dirs_exist_ok=True)
     raise SystemExit(failures)
 
 
