@@ -8,8 +8,6 @@ once.  Every other line runs in a shell.  Comments in the page control this:
 
 ``<!-- not run: REASON -->``
     before a block that cannot be run.
-``<!-- needs: MODULE -->``
-    before a block that is run only if a module of another package is installed.
 ``<!-- first: COMMAND -->``
     before a block: a command that is run but not shown.
 ``<!-- keep: NAME -->``
@@ -18,7 +16,6 @@ once.  Every other line runs in a shell.  Comments in the page control this:
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
@@ -31,7 +28,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
-COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
+COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
 FUNCTIONS = {"iscat": "main", "iscat-fit": "main_fit"}
 """Functions of `iscat_cli` that the installed programs call."""
@@ -94,9 +91,6 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first.append(comment["text"])
         elif comment and comment["kind"] == "keep":
             keep = comment["text"]
-        elif comment and comment["kind"] == "needs":
-            missing = importlib.util.find_spec(comment["text"]) is None
-            not_run = f"{comment['text']}, which is not installed here" if missing else None
         elif comment:
             not_run = comment["text"]
         elif fence:
