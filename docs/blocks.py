@@ -1,12 +1,13 @@
 """Find the code blocks of the manual, run them in order, and keep their output.
 
 A page's ``console`` blocks (lines that begin with ``$``) and ``python`` blocks are run one after
-the other in one folder, the Python blocks in one interpreter.  Comments in the page control this:
+the other in one folder, the Python blocks with names of their own in an interpreter that serves
+page after page.  A line that is one `iscat` or `iscat-fit` command, perhaps with ``> FILE``, runs
+there too, through the function that the installed program calls, so that the library is loaded
+once.  Every other line runs in a shell.  Comments in the page control this:
 
 ``<!-- not run: REASON -->``
     before a block that cannot be run.
-``<!-- needs: MODULE -->``
-    before a block that is run only if a module of another package is installed.
 ``<!-- first: COMMAND -->``
     before a block: a command that is run but not shown.
 ``<!-- keep: NAME -->``
@@ -15,10 +16,10 @@ the other in one folder, the Python blocks in one interpreter.  Comments in the 
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -27,8 +28,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 FENCE = re.compile(r"^(?P<indent> *)(?P<ticks>```+)(?P<language>[^`]*?)\s*$")
-COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|needs|first|keep): (?P<text>.*?) -->$")
+COMMENT = re.compile(r"^ *<!-- (?P<kind>not run|first|keep): (?P<text>.*?) -->$")
 RUNNABLE = ("console", "python")
+FUNCTIONS = {"iscat": "main", "iscat-fit": "main_fit"}
+"""Functions of `iscat_cli` that the installed programs call."""
+SHELL = set("|&;<>$`*?~")
+"""Characters for which a line needs a shell, wherever they stand."""
 SURROUNDINGS = {
     "MPLBACKEND": "Agg",
     "COLUMNS": "100",
@@ -86,9 +91,6 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first.append(comment["text"])
         elif comment and comment["kind"] == "keep":
             keep = comment["text"]
-        elif comment and comment["kind"] == "needs":
-            missing = importlib.util.find_spec(comment["text"]) is None
-            not_run = f"{comment['text']}, which is not installed here" if missing else None
         elif comment:
             not_run = comment["text"]
         elif fence:
@@ -103,7 +105,7 @@ def blocks_of(page: Path) -> Iterator[Block]:
             first, not_run, keep = [], None, None
 
 
-def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
+def run_page(page: Path, folder: Path, interpreter: Interpreter) -> list[Outcome]:
     """Run a page's blocks in a folder and stop at the first that fails.
 
     Parameters
@@ -112,88 +114,131 @@ def run_page(page: Path, folder: Path, bin_folder: Path) -> list[Outcome]:
         Markdown.
     folder : Path
         Folder to run in; it should contain the files that `prepare` copies.
-    bin_folder : Path
-        Folder of `iscat` and `python`.
+    interpreter : Interpreter
+        Python to run in; it forgets the names of the page before.
 
     Returns
     -------
     list of Outcome
         One for each block that was run.
     """
-    path = os.pathsep.join([str(bin_folder), os.environ["PATH"]])
-    environment = os.environ | SURROUNDINGS | {"PATH": path}
+    interpreter.run("begin", str(folder))
     outcomes = []
-    with _Interpreter(bin_folder / "python", folder, environment) as interpreter:
-        for block in blocks_of(page):
-            if block.not_run is not None:
-                continue
-            outcome = Outcome(block)
-            outcomes.append(outcome)
-            shown = block.commands if block.language == "console" else []
-            for command in (*block.first, *shown):
-                done = subprocess.run(
-                    ["bash", "-e", "-o", "pipefail", "-c", command],
-                    cwd=folder, env=environment, text=True, check=False,
-                    stdin=subprocess.DEVNULL, capture_output=True,
-                )  # fmt: skip
-                outcome.out += done.stdout if command in shown else ""
-                if done.returncode:
-                    outcome.failed = f"{command}\n{done.stdout}{done.stderr}"
-                    return outcomes
-            if block.language == "python":
-                outcome.out, outcome.failed = interpreter.run(block.text)
-                if outcome.failed:
-                    return outcomes
+    for block in blocks_of(page):
+        if block.not_run is not None:
+            continue
+        outcome = Outcome(block)
+        outcomes.append(outcome)
+        shown = block.commands if block.language == "console" else []
+        for command in (*block.first, *shown):
+            out, failed = _run_command(command, folder, interpreter)
+            outcome.out += out if command in shown else ""
+            if failed is not None:
+                outcome.failed = f"{command}\n{out}{failed}"
+                return outcomes
+        if block.language == "python":
+            outcome.out, outcome.failed = interpreter.run("python", block.text)
+            if outcome.failed:
+                return outcomes
     return outcomes
 
 
-class _Interpreter:
-    """One Python process that runs snippet after snippet."""
+def _run_command(command: str, folder: Path, interpreter: Interpreter) -> tuple[str, str | None]:
+    """Run a line; return its output, and what it said besides if it failed."""
+    if found := _call_of(command):
+        call, target = found
+        out, failed = interpreter.run(*call)
+        if target:
+            (folder / target).write_text(out, encoding="utf-8")
+            out = ""
+        return out, failed
+    done = subprocess.run(
+        ["bash", "-e", "-o", "pipefail", "-c", command],
+        cwd=folder, env=interpreter.environment, text=True, check=False,
+        stdin=subprocess.DEVNULL, capture_output=True,
+    )  # fmt: skip
+    return done.stdout, done.stderr if done.returncode else None
+
+
+def _call_of(command: str) -> tuple[list[str], str] | None:
+    """Find function and arguments of a line that is one command, and the file for its output."""
+    line, _, target = command.replace("\\\n", " ").partition(" > ")
+    if SHELL & set(line + target):
+        return None
+    program, *arguments = shlex.split(line)
+    return ([FUNCTIONS[program], *arguments], target) if program in FUNCTIONS else None
+
+
+class Interpreter:
+    """A Python process that runs blocks and commands of the package, one after the other.
+
+    Parameters
+    ----------
+    bin_folder : Path
+        Folder of `iscat` and `python`.
+    """
 
     LOOP = """
-import contextlib, io, json, sys, traceback
-names = {"__name__": "__main__"}
-for line in sys.stdin:
+import contextlib, io, json, os, sys, traceback
+
+names = {}
+lines, sys.stdin = sys.stdin, open(os.devnull)
+
+def run(kind, *given):
+    if kind == "begin":
+        os.chdir(*given)
+        names.clear()
+        names["__name__"] = "__main__"
+    elif kind == "python":
+        exec(compile(*given, "<block>", "exec"), names)
+    else:
+        import iscat_cli
+        if status := getattr(iscat_cli, kind)(given):
+            raise SystemExit(f"exit status {status}")
+
+for line in lines:
     said, failed = io.StringIO(), None
     with contextlib.redirect_stdout(said):
         try:
-            exec(compile(json.loads(line), "<block>", "exec"), names)
+            run(*json.loads(line))
         except BaseException:
             failed = traceback.format_exc()
     print(json.dumps([said.getvalue(), failed]), flush=True)
 """
 
-    def __init__(self, python: Path, folder: Path, environment: dict[str, str]) -> None:
-        self._arguments = ([str(python), "-c", self.LOOP], folder, environment)
-        self._process: subprocess.Popen[str] | None = None
-        self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - closed with the interpreter
+    def __init__(self, bin_folder: Path) -> None:
+        path = os.pathsep.join([str(bin_folder), os.environ["PATH"]])
+        self.environment = os.environ | SURROUNDINGS | {"PATH": path}
+        self._python = bin_folder / "python"
 
-    def __enter__(self) -> _Interpreter:
+    def __enter__(self) -> Interpreter:
+        self._errors = tempfile.TemporaryFile("w+")
+        self._process = subprocess.Popen(
+            [str(self._python), "-c", self.LOOP], env=self.environment, text=True,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
+        )  # fmt: skip
         return self
 
-    def run(self, text: str) -> tuple[str, str | None]:
-        """Run a snippet; return its output, and the traceback if it failed."""
-        if self._process is None:
-            arguments, folder, environment = self._arguments
-            self._process = subprocess.Popen(
-                arguments, cwd=folder, env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors,
-            )  # fmt: skip
+    def run(self, kind: str, *given: str) -> tuple[str, str | None]:
+        """Run a block (``"python"``), or a function of `iscat_cli` with its arguments.
+
+        ``"begin"`` goes to the folder of another page.  Returns the output, and, if it failed, what
+        was said on stderr with the traceback.
+        """
         process = self._process
         if process.stdin is None or process.stdout is None:
             raise RuntimeError("the interpreter has no pipes")
-        process.stdin.write(json.dumps(text) + "\n")
+        process.stdin.write(json.dumps([kind, *given]) + "\n")
         process.stdin.flush()
         answer = process.stdout.readline()
-        if not answer:
+        out, failed = json.loads(answer) if answer else ("", "the interpreter ended")
+        if failed is not None:
             self._errors.seek(0)
-            return "", self._errors.read() or "the interpreter ended"
-        out, failed = json.loads(answer)
+            failed = self._errors.read() + failed
         return out, failed
 
     def __exit__(self, *_: object) -> None:
-        if self._process is not None:
-            self._process.communicate(timeout=60)
+        self._process.communicate(timeout=60)
         self._errors.close()
 
 
@@ -203,15 +248,16 @@ def main() -> None:
 
     root = Path(__file__).resolve().parent.parent
     failures = 0
-    for name in sys.argv[1:]:
-        with tempfile.TemporaryDirectory() as folder:
-            prepare(root, Path(folder))
-            for outcome in run_page(Path(name), Path(folder), Path(sys.executable).parent):
-                head = f"{name}:{outcome.block.line}"
-                sys.stdout.write(f"== {head}\n{outcome.out}{outcome.failed or ''}\n")
-                failures += outcome.failed is not None
-            if kept := os.environ.get("KEEP"):
-                shutil.copytree(folder, kept, dirs_exist_ok=True)
+    with Interpreter(Path(sys.executable).parent) as interpreter:
+        for name in sys.argv[1:]:
+            with tempfile.TemporaryDirectory() as folder:
+                prepare(root, Path(folder))
+                for outcome in run_page(Path(name), Path(folder), interpreter):
+                    head = f"{name}:{outcome.block.line}"
+                    sys.stdout.write(f"== {head}\n{outcome.out}{outcome.failed or ''}\n")
+                    failures += outcome.failed is not None
+                if kept := os.environ.get("KEEP"):
+                    shutil.copytree(folder, kept, dirs_exist_ok=True)
     raise SystemExit(failures)
 
 

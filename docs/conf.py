@@ -23,7 +23,7 @@ from docutils.utils.math.latex2mathml import tex2mathml
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 
-from blocks import blocks_of, prepare, run_page  # noqa: E402
+from blocks import Interpreter, blocks_of, prepare, run_page  # noqa: E402
 from kernel_cache import share_kernels  # noqa: E402
 
 share_kernels(HERE.parent)
@@ -170,8 +170,16 @@ def _run_pages() -> None:
         if "_build" not in page.parts and any(block.not_run is None for block in blocks_of(page))
     ]
     pages.sort(key=_commands_of, reverse=True)
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        list(pool.map(_run_one_page, pages))
+    turns = iter(pages)
+
+    def run_in_turn(_: int) -> None:
+        with Interpreter(PROGRAMS) as interpreter:
+            for page in turns:
+                _run_one_page(page, interpreter)
+
+    cores = os.cpu_count() or 1
+    with ThreadPoolExecutor(cores) as pool:
+        list(pool.map(run_in_turn, range(cores)))
 
 
 def _commands_of(page: Path) -> int:
@@ -179,7 +187,7 @@ def _commands_of(page: Path) -> int:
     return sum(len(block.first) + max(1, len(block.commands)) for block in run)
 
 
-def _run_one_page(page: Path) -> None:
+def _run_one_page(page: Path, interpreter: Interpreter) -> None:
     """Run a page's blocks, and keep their output and figures."""
     target = GENERATED / page.stem
     if target.is_dir() and os.environ.get("DOCS_REUSE"):  # while writing
@@ -189,7 +197,7 @@ def _run_one_page(page: Path) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         prepare(HERE.parent, folder)
-        for outcome in run_page(page, folder, PROGRAMS):
+        for outcome in run_page(page, folder, interpreter):
             if outcome.failed:
                 raise RuntimeError(f"{page}:{outcome.block.line}: {outcome.failed}")
             if outcome.block.keep:

@@ -53,7 +53,25 @@ def test_the_runner_finds_fails_and_stops(tmp_path: Path) -> None:
         "```python\nprint('never')\n```\n",
         encoding="utf-8",
     )
-    outcomes = BLOCKS.run_page(page, tmp_path, Path(sys.executable).parent)
+    with BLOCKS.Interpreter(Path(sys.executable).parent) as interpreter:
+        outcomes = BLOCKS.run_page(page, tmp_path, interpreter)
+        (tmp_path / "next.md").write_text("```python\nprint(x)\n```\n", encoding="utf-8")
+        (of_next,) = BLOCKS.run_page(tmp_path / "next.md", tmp_path, interpreter)
     assert [outcome.out for outcome in outcomes] == ["hidden\none two\n", "1\n", "2\n", ""]
     assert outcomes[0].block.keep == "said"
     assert "ValueError: oh" in outcomes[-1].failed
+    assert "NameError: name 'x'" in of_next.failed
+
+
+def test_a_command_of_the_package_is_run_as_a_shell_would(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```console\n$ iscat config \\\n   --mode joint > setup.toml\n$ grep '^mode =' setup.toml\n"
+        "```\n```console\n$ iscat-fit 'no such.tif'\n```\n```console\n$ echo never\n```\n",
+        encoding="utf-8",
+    )
+    with BLOCKS.Interpreter(Path(sys.executable).parent) as interpreter:
+        done, failed = BLOCKS.run_page(page, tmp_path, interpreter)
+    assert done.out.startswith('mode = "joint"')
+    assert done.failed is None
+    assert "iscat-fit: error: no such.tif" in failed.failed
