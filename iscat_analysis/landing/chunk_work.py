@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -171,7 +172,7 @@ def analyse_chunk(
         masked=~chunk.usable[own],
         saturated=chunk.saturated[own],
         strongest=fitter.strongest[(slice(None), *own)],
-        ends_e=_ends(chunk, inside)[(slice(None), *own)],
+        ends_e=_ends(chunk, inside, fitter, steps)[(slice(None), *own)],
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
@@ -204,11 +205,21 @@ def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
     return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)
 
 
-def _ends(chunk: Chunk, inside: slice) -> FloatArray:
-    """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
+def _ends(
+    chunk: Chunk, inside: slice, fitter: ChunkFitter, steps: Sequence[StepEvent]
+) -> FloatArray:
+    """Mean images of the first and the last quarter of a core, without what lands or leaves.
+
+    Shapes: result (2, y, x).
+    """
     lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
     held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
     ends = blocks[:few], blocks[-few:]
-    return np.stack([chunk.blocks_e[part].mean(axis=0, dtype=np.float64) for part in ends])
+    images = []
+    for part in ends:
+        frames = slice(int(chunk.edges[part[0]]), int(chunk.edges[part[-1] + 1]))
+        light = chunk.blocks_e[part].mean(axis=0, dtype=np.float64)
+        images.append(light / fitter.light_in(frames, steps))
+    return np.stack(images)

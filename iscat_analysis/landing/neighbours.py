@@ -20,7 +20,7 @@ import numpy as np
 
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
-from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
@@ -68,6 +68,8 @@ class Neighbours:
         self._chunk = chunk
         self._window = window
         self._roi_px = context.roi_px
+        self._farthest_px = farthest_px(context.config, chunk.shape)
+        self.are_spheres = context.model.is_sized
         nominal = context.model.material.mass_kda
         self._contrast_per_kda = (
             context.model.peak_contrast(context.config.particle.nominal_height_nm, nominal)
@@ -119,8 +121,13 @@ class Neighbours:
         return Step(sign, at, start, corner, image, slopes, theta, snr, excess)
 
     def _half(self, start: Candidate) -> int:
-        """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
-        return round(self._roi_px * min(max(start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
+        """From the centre to the edge of a step's image [pixels].
+
+        Strong rings reach far, and fall as the square of the distance.
+        """
+        strength = max(start.snr / _FAINT_SNR, 1.0)
+        regions = min(strength, max(LARGEST_IMAGE, math.sqrt(strength * LARGEST_IMAGE)))
+        return round(min(self._roi_px * regions, self._farthest_px))
 
     def reach_px(self, step: Step) -> float:
         """Farthest centre of a fitted square that holds pixels of a step's image."""

@@ -223,6 +223,14 @@ class ChunkFitter:
 
         return list(self._pool.map(one, range(len(fitted))))
 
+    def light_in(self, frames: slice, fitted: Sequence[StepEvent]) -> FloatArray:
+        """Give the factor by which steps change the light of frames relative to the chunk, (y, x)."""
+        light = np.ones(self._chunk.shape)
+        for one in fitted:
+            share = self._neighbours.presence(one.step, frames)
+            light[self._neighbours.box(one.step)] *= 1 + share * one.step.image
+        return light
+
     # ---- search ----------------------------------------------------------------------------
 
     def _search(self, maps: StepMaps, steps: Sequence[Step]) -> list[Step]:
