@@ -21,6 +21,7 @@ from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
 from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
+from iscat_analysis.landing.neighbours import Neighbours
 from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
@@ -172,13 +173,14 @@ def analyse_chunk(
         masked=~chunk.usable[own],
         saturated=chunk.saturated[own],
         strongest=fitter.strongest[(slice(None), *own)],
-        ends_e=_ends(chunk, inside, fitter, steps)[(slice(None), *own)],
+        ends_e=_ends(chunk, inside, fitter.neighbours, steps)[(slice(None), *own)],
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
         cause=misfit_warning(context.config, events),
         empty=fitter.empty,
         searched=fitter.searched,
+        untold=np.array([step.told for step in steps if step.told]).reshape(-1, 2),
     )
 
 
@@ -206,7 +208,7 @@ def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
 
 
 def _ends(
-    chunk: Chunk, inside: slice, fitter: ChunkFitter, steps: Sequence[StepEvent]
+    chunk: Chunk, inside: slice, neighbours: Neighbours, fitted: Sequence[StepEvent]
 ) -> FloatArray:
     """Mean images of the first and the last quarter of a core, without what lands or leaves.
 
@@ -221,5 +223,5 @@ def _ends(
     for part in ends:
         frames = slice(int(chunk.edges[part[0]]), int(chunk.edges[part[-1] + 1]))
         light = chunk.blocks_e[part].mean(axis=0, dtype=np.float64)
-        images.append(light / fitter.light_in(frames, steps))
+        images.append(light / neighbours.light_in(frames, (one.step for one in fitted)))
     return np.stack(images)

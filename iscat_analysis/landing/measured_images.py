@@ -78,8 +78,8 @@ def _hides_others(step: Step, threshold: float, *, sphere: bool) -> bool:
     """Whether the misfit of a step could hide others.
 
     It does if the model misses a little of a very bright picture, or nearly all of a picture.  In
-    between it may be two particles that land at once.  A sphere that was fitted as one has the right
-    picture, unless what it misses says otherwise.
+    between it may be two particles that land at once.  A sphere that was fitted as one has the
+    right picture, unless what it misses says otherwise.
     """
     if sphere:
         return step.excess > (threshold / _LEAST_MISFIT_SHARE) ** 2

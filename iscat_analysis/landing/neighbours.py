@@ -13,7 +13,7 @@ out, it is held with the share f of the light that makes the pattern, which is t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -161,6 +161,13 @@ class Neighbours:
         ends, whole = self._power[edges[1:]], np.diff(self._power[edges])
         later = (ends - self._power[turned].mean(axis=0)) / np.where(whole > 0, whole, 1.0)
         return np.asarray(later if step.sign > 0 else 1 - later)
+
+    def light_in(self, frames: slice, steps: Iterable[Step]) -> FloatArray:
+        """Give the factor by which steps change the light of frames, (y, x)."""
+        light = np.ones(self._chunk.shape)
+        for step in steps:
+            light[self.box(step)] *= 1 + self.presence(step, frames) * step.image
+        return light
 
     def box(self, step: Step) -> tuple[slice, slice]:
         """Pixels of the field that a step's image covers."""

@@ -156,8 +156,8 @@ class _Strip:
         usual = np.abs(change) < _PARTICLE_SIGMAS * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
         moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ change[..., None])
-        used = max(np.count_nonzero(usual), 1)
-        motion = _shared_motion(change, seen, turned, np.nonzero(lit)[1]) / used
+        motion = _shared_motion(change, seen, turned, np.nonzero(lit)[1])
+        motion /= max(int(np.count_nonzero(usual)), 1)
         return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
 
 
@@ -181,7 +181,7 @@ def _shared_motion(
         np.sum(moved[one] * (2 * projection[other] - information[other] @ moved[one]))
         for one, other in permutations(range(_PARTS), 2)
     ]
-    by_chance = projection[0].size  # of which noise takes so much away
+    by_chance = float(projection[0].size)  # of which noise takes so much away
     return _PARTS * (float(np.median(explained)) + by_chance)
 
 
