@@ -4,6 +4,9 @@ A neighbour that lands or leaves in the frames of a step enters its likelihood t
 pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the frames after and before
 in which it is there.
 
+Of two bright spheres the fields add up, and not their contrasts: with the fields e of all, the mean
+light over frames is 1 + Σ φ_k C_k + Σ φ_kl 2 Re(e_k · e_l*), φ_kl the share in which both are there.
+
 Where the sample drifts, a particle moves with it: the mean of C over a window is its expansion to
 second order in the shift since the step, mean and smear.  In the pattern, whose motion is divided
 out, it is held with the share f of the light that makes the pattern, which is taken off again:
@@ -24,6 +27,7 @@ from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.records import Candidate, FitResult, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
@@ -33,6 +37,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 WHOLE = (slice(None), slice(None))
 """All of an image."""
 
+_LEAST_CROSSED_SNR = 0.5  # contrast of a neighbour times the step's, below which fields do not meet
 _WEAK_CONTRAST = 0.05  # contrast up to which several add up
 
 
@@ -216,6 +221,64 @@ class Neighbours:
         if shares[0] != shares[1]:
             times_change(ratio, _ends(here), step.image, _ends(inside), *shares)
 
+    def interfere(
+        self,
+        ratio: FloatArray,
+        step: Step,
+        others: Sequence[Step],
+        before: slice,
+        after: slice,
+        region: Region,
+    ) -> None:
+        """Multiply by what the fields of bright spheres make of each other's light.
+
+        The contrasts of all of them, that of the step included, are in the ratio and the model.
+        """
+        if not self.are_spheres or self._pattern is not None:
+            return
+        shown = [step, *(s for s in others if self._is_seen_beside(s, step, region))]
+        fields = [self._field(s, region) for s in shown]
+        contrasts = [2 * e[0].real + np.sum(np.abs(e) ** 2, axis=0) for e in fields]
+        light = []
+        for frames in (before, after):
+            total, product = 1.0, 1.0
+            for k, one in enumerate(shown):
+                share = self.presence(one, frames)
+                total = total + share * contrasts[k]
+                product = product * (1 + share * contrasts[k])
+                for field, other in zip(fields[:k], shown, strict=False):
+                    both = self._together(one, other, frames)
+                    total = total + both * _crossed(field, fields[k])
+            light.append(total / product)
+        ratio *= light[1] / light[0]
+
+    def crossed(self, step: Step, other: Step, region: Region) -> FloatArray | float:
+        """Give what the fields of two bright spheres make of each other's light."""
+        if not self.are_spheres or not self._is_seen_beside(other, step, region):
+            return 0.0
+        return _crossed(self._field(step, region), self._field(other, region))
+
+    def _is_seen_beside(self, other: Step, step: Step, region: Region) -> bool:
+        """Whether the light that two fields make together is more than noise."""
+        shared = self.shared(other, region)
+        if shared is None:
+            return False
+        return bool(np.abs(other.image[shared[1]]).max() * step.start.snr > _LEAST_CROSSED_SNR)
+
+    def _field(self, step: Step, region: Region) -> ComplexArray:
+        """Field of a step's particle over the reference, (1 or 2, y, x)."""
+        pixel, start = self._context.pixel_nm, step.start
+        place = start.x_px * pixel, start.y_px * pixel
+        grid = PixelGrid.region(region.rows, region.columns, pixel)
+        dx, dy = np.meshgrid(grid.x_nm - place[0], grid.y_nm - place[1])
+        model = self._context.wide_at(*place, step.at.frame + step.sign * self._window // 2)
+        return model.field(dx, dy, start.z_nm, start.mass_kda)
+
+    def _together(self, one: Step, other: Step, frames: slice) -> float:
+        """Share of the frames' light that shines while both particles are there."""
+        shares = self.presence(one, frames), self.presence(other, frames)
+        return min(shares) if one.sign == other.sign else max(sum(shares) - 1, 0.0)
+
     def own_factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice]
     ) -> FloatArray:
@@ -279,6 +342,7 @@ class Neighbours:
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
             close = dt < max((1 + windows) * self._window, frames)
+            close |= self.are_spheres  # what stands there all the time has a field too
             near = close & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
@@ -307,6 +371,11 @@ class Neighbours:
             return None
         here = slice(top - first, bottom - first), slice(left - begin, right - begin)
         return here, (slice(top - y, bottom - y), slice(left - x, right - x))
+
+
+def _crossed(one: ComplexArray, two: ComplexArray) -> FloatArray:
+    """Light that two fields make together beyond that of each."""
+    return np.asarray(2 * np.sum(one * np.conj(two), axis=0).real)
 
 
 def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:
