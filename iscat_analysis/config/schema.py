@@ -287,8 +287,6 @@ def index_refusal(config: Config) -> str:
         (f'fit.mode = "{mode}": use "size"', mode != "size"),
         (f'particle.model = "{particle.model}": use "mie"', particle.model != "mie"),
         ("a material that absorbs, which has two numbers", absorbs or particle.kind == "gold"),
-        ('background.method = "sliding": give background.frames',
-         config.background.method == "sliding"),
     ):  # fmt: skip
         if is_set:
             return key

@@ -154,7 +154,7 @@ def make_context(
     refuse_uneven_field(config)
     model = square_model(config, pixel, roi_px)
     if sliding:
-        reach_nm = math.sqrt(2) * (LARGEST_IMAGE * roi_px + 2) * pixel
+        reach_nm = math.sqrt(2) * (farthest_px(config, field_px) + 2) * pixel
     else:
         field_nm = math.hypot(field_px[0] + 1, field_px[1] + 1) * pixel
         reach_nm = min(field_nm, math.sqrt(2) * (SPREAD_NM + 2 * pixel))
@@ -184,6 +184,18 @@ def make_context(
         searches=searches,
         lines=lines,
     )
+
+
+def farthest_px(config: Config, field_px: tuple[int, int]) -> float:
+    """Give how far from a particle that lands its rings are drawn at most [pixels].
+
+    Those of a bright sphere are seen in all of a field of usual size.
+    """
+    pixel = _pixel_nm(config)
+    largest = LARGEST_IMAGE * config.fit.roi_px(pixel)
+    if not config.particle.is_sphere:
+        return largest
+    return max(largest, min(max(field_px), 2 * SPREAD_NM / pixel))
 
 
 def square_of(config: Config, field_px: tuple[int, int]) -> tuple[float, int]:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.scoring import LARGEST_GAIN_RATIO
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise_models import PixelTerms
 from iscat_analysis.inference.sizes import (
     highest_maxima,
     scan_sizes,
@@ -65,7 +66,7 @@ class CommonSize:
     mass_kda: float
     index: float
     places: FloatArray
-    """x, y and z in each frame [nm], shape (frames, 3)."""
+    """x, y and z [nm] and perhaps the level in each frame, shape (frames, 3) or (frames, 4)."""
 
     log_likelihood: float
     log_weight: float
@@ -148,12 +149,14 @@ def fit_common_size(
     None where the start has no likelihood, as where light would be negative.
 
     `motion` is 1/d of the hydrodynamic diameter and its error [1/nm], a prior that is normal in D.
+    A level that is given beside the places is fitted as they are.
 
-    Shapes: `places` (frames, 3).
+    Shapes: `places` (frames, 3) or (frames, 4).
     """
     free_index = index is not None
     common = np.array([mass_kda, index] if index is not None else [mass_kda])
-    rows = np.clip(places, [-np.inf, -np.inf, z_range_nm[0]], [np.inf, np.inf, z_range_nm[1]])
+    rows = places.copy()
+    rows[:, 2] = np.clip(rows[:, 2], *z_range_nm)
     here = _gathered(likelihoods, model, rows, common, z_range_nm, motion)
     if not math.isfinite(here.value):
         return None
@@ -220,28 +223,27 @@ def _gathered(
     motion: tuple[float, float] | None,
 ) -> _Frames:
     """Compute value, scores and information of all frames."""
-    n, k = len(likelihoods), common.size
-    value, pull, scores = 0.0, np.zeros(k), np.zeros((n, 3))
-    information, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, 3, 3)), np.zeros((n, 3, k))
+    (n, p), k = places.shape, common.size
+    value, pull, scores = 0.0, np.zeros(k), np.zeros((n, p))
+    information, inverse, mixed = np.zeros((n, k, k)), np.zeros((n, p, p)), np.zeros((n, p, k))
     mass = float(common[0])
     for f, likelihood in enumerate(likelihoods):
-        signal, rows = slopes(likelihood, model, places[f], common)
-        terms = likelihood.noise.terms(likelihood.data, signal, 0.0)
+        terms, rows = _terms(likelihood, model, places[f], common)
         value += terms.value
         if not math.isfinite(value):
             break
-        flat = (rows * terms.by_signal).reshape(3 + k, -1)
+        flat = rows.reshape(p + k, -1)
         score = flat @ terms.score.ravel()
         fisher = (flat * terms.information.ravel()) @ flat.T
         z, down = places[f, 2], score[2] < 0
-        free = np.array([True, True, not (z <= z_range_nm[0] and down)])
-        free[2] &= not (z >= z_range_nm[1] and not down)
+        free = np.ones(p, dtype=bool)
+        free[2] = not (z <= z_range_nm[0] if down else z >= z_range_nm[1])
         held = np.ix_(free, free)
-        whole = np.zeros((3, 3))
-        whole[held] = np.linalg.inv(fisher[:3, :3][held])
-        scores[f], inverse[f], mixed[f] = score[:3], whole, fisher[:3, 3:]
-        information[f] = fisher[3:, 3:] - mixed[f].T @ whole @ mixed[f]
-        pull += score[3:] - mixed[f].T @ whole @ score[:3]
+        whole = np.zeros((p, p))
+        whole[held] = np.linalg.inv(fisher[:p, :p][held])
+        scores[f], inverse[f], mixed[f] = score[:p], whole, fisher[:p, p:]
+        information[f] = fisher[p:, p:] - mixed[f].T @ whole @ mixed[f]
+        pull += score[p:] - mixed[f].T @ whole @ score[:p]
     known = information.sum(axis=0)
     diameter = model.sphere.of_mass(mass).diameter_nm
     if motion is not None:
@@ -253,6 +255,22 @@ def _gathered(
     if not math.isfinite(value):
         value = -math.inf
     return _Frames(value, pull, known, information, scores, inverse, mixed, diameter / (3 * mass))
+
+
+def _terms(
+    likelihood: Likelihood, model: SizedModel, place: FloatArray, common: FloatArray
+) -> tuple[PixelTerms, FloatArray]:
+    """Terms of the likelihood of a frame, and the slopes of its expectation in places and c.
+
+    Shapes: `place` (p,), `common` (k,), rows (p + k, ny, nx).
+    """
+    signal, rows = slopes(likelihood, model, place[:3], common)
+    level = float(place[3]) if place.size > 3 else 0.0
+    terms = likelihood.noise.terms(likelihood.data, signal, level)
+    rows = rows * terms.by_signal
+    if place.size > 3:
+        rows = np.insert(rows, 3, terms.by_level, axis=0)
+    return terms, rows
 
 
 def slopes(
@@ -297,16 +315,15 @@ def _bias(
     mass = float(common[0])
     linear = _model_of(model, common).at(mass)
     for f, likelihood in enumerate(likelihoods):
-        signal, rows = slopes(likelihood, model, places[f], common)
-        terms = likelihood.noise.terms(likelihood.data, signal, 0.0)
-        bends = linear.derivative_rows(likelihood.grid, np.array([*places[f], mass]))
-        inverse = here.place_inverse[f]
+        terms, rows = _terms(likelihood, model, places[f], common)
+        bends = linear.derivative_rows(likelihood.grid, np.array([*places[f, :3], mass]))
+        inverse, p = here.place_inverse[f], places.shape[1]
         traced = sum(
             (1 if i == j else 2) * inverse[i, j] * bends[:, 5 + pair]
             for pair, (i, j) in enumerate(PAIRS)
             if j < 3
         )
-        along = rows[3:] - np.einsum("ic,i...->c...", inverse @ here.mixed[f], rows[:3])
-        weight = terms.information * terms.by_signal**2
+        along = rows[p:] - np.einsum("ic,i...->c...", inverse @ here.mixed[f], rows[:p])
+        weight = terms.information * terms.by_signal
         total += np.tensordot(along, weight * traced, axes=2)
     return np.asarray(-0.5 * np.linalg.solve(here.known, total))

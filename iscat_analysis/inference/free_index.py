@@ -22,10 +22,13 @@ from iscat_analysis.inference.common_size import (
     slopes,
 )
 from iscat_analysis.inference.fit import AMPLITUDE, fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.sizes import OTHER_SIZE, SURE_ODDS
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Candidate, FitResult, FloatArray, Status, verdict
+
+INDEX = 5
+"""Place of the index behind θ."""
 
 _SAME_LIKELIHOOD = 0.5  # by which a fit may end below the one that it began from
 
@@ -77,13 +80,13 @@ def _refitted(
 ) -> tuple[Likelihood, FitResult, FloatArray]:
     """Fit the sphere again with the index that was found, and give the covariance with the index.
 
-    Shapes: covariance (5, 5), of x, y, z, mass and index.
+    Shapes: covariance (6, 6), of θ and the index.
     """
     own = replace(likelihood, model=model.of_index(best.index - float(best.bias[1])))
     pixel = likelihood.grid.pixel_nm
-    x, y, z = (float(value) for value in best.places[0])
+    x, y, z, *_ = best.places[0].tolist()
     start = Candidate(x / pixel, y / pixel, z, best.mass_kda, fit.snr)
-    again = fit_particle(own, start, "size", z_range_nm, level=False)
+    again = fit_particle(own, start, "size", z_range_nm, level=bool(fit.box.free[LEVEL]))
     again = again.shifted(fit.x_nm - float(fit.estimate[0]), fit.y_nm - float(fit.estimate[1]))
     return own, again, _covariance(own, again)
 
@@ -106,7 +109,7 @@ def _is_told(
     gain = again.log_likelihood - fit.log_likelihood
     if Status.AT_BOUND in again.flags or gain < -_SAME_LIKELIHOOD:
         return False
-    errors = [math.sqrt(covariance[4, 4]) for covariance in covariances]
+    errors = [math.sqrt(covariance[INDEX, INDEX]) for covariance in covariances]
     errors.append(abs(index - known) / math.sqrt(max(2 * gain, 1.0)))
     return max(errors) < UNDETERMINED * abs(index - model.optics.n_sample)
 
@@ -120,7 +123,7 @@ def _with_errors(fit: FitResult, covariance: FloatArray, others: Sequence[Common
         flags.append(Status.AMBIGUOUS_SIZE)
     status, noticed = verdict(flags)
     return replace(
-        fit, sigma=errors[:4], sigma_index=float(errors[4]), status=status, flags=noticed
+        fit, sigma=errors[:4], sigma_index=float(errors[INDEX]), status=status, flags=noticed
     )
 
 
@@ -131,11 +134,12 @@ def _maxima(
 
     They begin at the diameters and heights that are likely at the configured index.
     """
-    x, y, z, mass = (float(value) for value in fit.theta[:4])
+    x, y, z, mass, level = fit.theta.tolist()
+    levels = [level] if fit.box.free[LEVEL] else []
     starts = [(z, mass), *((other.z_nm, other.mass_kda) for other in fit.alternatives)]
     tried = [
         fit_common_size(
-            [likelihood], model, np.array([[x, y, height]]), z_range_nm,
+            [likelihood], model, np.array([[x, y, height, *levels]]), z_range_nm,
             mass_kda=size, index=model.sphere.index.real,
         )
         for height, size in starts
@@ -153,11 +157,12 @@ def _combination(
 ) -> tuple[float, float]:
     """Give q of the combination d^q (n − n_s) that is told best, and its relative error.
 
-    Shapes: `covariance` (5, 5).
+    Shapes: `covariance` (6, 6).
     """
     model = _model_of(likelihood)
+    both = np.ix_([AMPLITUDE, INDEX], [AMPLITUDE, INDEX])
     scale = np.array([3 * fit.mass_kda, model.sphere.index.real - model.optics.n_sample])
-    relative = covariance[3:, 3:] / np.outer(scale, scale)
+    relative = covariance[both] / np.outer(scale, scale)
     along = np.linalg.eigh(relative)[1][:, 0]
     told = along / along[1]
     return float(told[0]), math.sqrt(max(float(told @ relative @ told), 0.0))
@@ -166,19 +171,17 @@ def _combination(
 def _covariance(likelihood: Likelihood, fit: FitResult) -> FloatArray:
     """Give the inverse of the expected information; 0 for a height that is at an end of its range.
 
-    Shapes: result (5, 5), of x, y, z, mass and index.
+    Shapes: result (6, 6), of θ and the index.
     """
     model = _model_of(likelihood)
     common = np.array([fit.theta[AMPLITUDE], model.sphere.index.real])
     signal, rows = slopes(likelihood, model, fit.theta[:3], common)
-    terms = likelihood.noise.terms(likelihood.data, signal, 0.0)
-    flat = (rows * terms.by_signal).reshape(5, -1)
-    fisher = (flat * terms.information.ravel()) @ flat.T
-    free = np.ones(5, dtype=bool)
-    free[2] = fit.box.lower[2] < fit.theta[2] < fit.box.upper[2]
+    fisher = likelihood.score_of_signal(signal, rows, float(fit.theta[LEVEL]))[2]
+    free = np.append(fit.box.free, True)
+    free[2] &= fit.box.lower[2] < fit.theta[2] < fit.box.upper[2]
     inside, scale = np.ix_(free, free), np.sqrt(np.diag(fisher))
     unit = np.outer(scale, scale)
     inverse = np.linalg.pinv(fisher[inside] / unit[inside], hermitian=True)
-    covariance = np.zeros((5, 5))
+    covariance = np.zeros(fisher.shape)
     covariance[inside] = inverse / unit[inside]
     return covariance

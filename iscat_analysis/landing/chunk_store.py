@@ -37,6 +37,7 @@ class Store(Checkpoint):
                 ends_e=data["ends_e"],
                 trajectory=_trajectory(data["trajectory"]),
                 cause=str(data["cause"]),
+                untold=data["untold"],
                 searched=Searched(data["searched_frames"], data["searched_shares"]),
                 empty=_empty(data["squares"], data["number"], data["shared"]),
             )
@@ -61,6 +62,7 @@ class Store(Checkpoint):
             "ends_e": done.ends_e,
             "trajectory": _columns(done.trajectory),
             "cause": np.array(done.cause),
+            "untold": done.untold,
             "squares": np.empty(0) if done.empty is None else done.empty.squares,
             "number": np.empty(0) if done.empty is None else done.empty.counts,
             "shared": np.empty(0) if done.empty is None else done.empty.shared,

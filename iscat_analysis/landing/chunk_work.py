@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
 from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
+from iscat_analysis.landing.neighbours import Neighbours
 from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
@@ -171,13 +173,14 @@ def analyse_chunk(
         masked=~chunk.usable[own],
         saturated=chunk.saturated[own],
         strongest=fitter.strongest[(slice(None), *own)],
-        ends_e=_ends(chunk, inside)[(slice(None), *own)],
+        ends_e=_ends(chunk, inside, fitter.neighbours, steps)[(slice(None), *own)],
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
         cause=misfit_warning(context.config, events),
         empty=fitter.empty,
         searched=fitter.searched,
+        untold=np.array([step.told for step in steps if step.told]).reshape(-1, 2),
     )
 
 
@@ -204,11 +207,21 @@ def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
     return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)
 
 
-def _ends(chunk: Chunk, inside: slice) -> FloatArray:
-    """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
+def _ends(
+    chunk: Chunk, inside: slice, neighbours: Neighbours, fitted: Sequence[StepEvent]
+) -> FloatArray:
+    """Mean images of the first and the last quarter of a core, without what lands or leaves.
+
+    Shapes: result (2, y, x).
+    """
     lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
     held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
     ends = blocks[:few], blocks[-few:]
-    return np.stack([chunk.blocks_e[part].mean(axis=0, dtype=np.float64) for part in ends])
+    images = []
+    for part in ends:
+        frames = slice(int(chunk.edges[part[0]]), int(chunk.edges[part[-1] + 1]))
+        light = chunk.blocks_e[part].mean(axis=0, dtype=np.float64)
+        images.append(light / neighbours.light_in(frames, (one.step for one in fitted)))
+    return np.stack(images)

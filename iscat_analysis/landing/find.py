@@ -28,6 +28,7 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import FloodError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.context import AnalysisContext, make_context
+from iscat_analysis.fitting.indices import untold_message
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, notify_nobody
@@ -232,6 +233,11 @@ def analyse_landings(
     searched = merged.searched().summary(_median_snr(fits), context.templates.threshold, stride)
     if text := searched_warning(movie.name, searched):
         warn(text)
+    if config.fit.index:
+        missing = int(fits["refractive_index"].isna().sum())
+        n_sample = config.optics.n_sample
+        if text := untold_message(merged.untold, missing, len(fits), n_sample):
+            warn(f"{movie.name}: {text}")
     if merged.cause:
         warn(f"{movie.name}: {merged.cause}")
     if not config.background.power_normalization:

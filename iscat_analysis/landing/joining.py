@@ -56,6 +56,7 @@ def joined(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> FinishedChun
         cause=next((part.cause for part in done if part.cause), ""),
         empty=EmptySpread.beside([part.empty for part in done]),
         searched=_searched(done),
+        untold=np.concatenate([part.untold for part in done]),
     )
 
 

@@ -58,7 +58,8 @@ def with_measured_images(
     order = [(not s.is_measured, -s.excess, -s.start.snr, i) for i, s in enumerate(steps)]
     for *_, i in sorted(order):
         step = steps[i]
-        if not (step.is_measured or _hides_others(step, threshold)):
+        sphere = neighbours.are_spheres or step.sphere is not None
+        if not (step.is_measured or _hides_others(step, threshold, sphere=sphere)):
             continue
         middle = next((steps[k] for k in chosen if _is_lobe(step, steps[k], window, roi_px)), None)
         if middle is None:
@@ -73,14 +74,14 @@ def with_measured_images(
     return [step for i, step in enumerate(measured) if i not in lobes]
 
 
-def _hides_others(step: Step, threshold: float) -> bool:
+def _hides_others(step: Step, threshold: float, *, sphere: bool) -> bool:
     """Whether the misfit of a step could hide others.
 
     It does if the model misses a little of a very bright picture, or nearly all of a picture.  In
-    between it may be two particles that land at once.  A sphere that was recognised has the right
-    picture, unless what it misses says otherwise.
+    between it may be two particles that land at once.  A sphere that was fitted as one has the
+    right picture, unless what it misses says otherwise.
     """
-    if step.sphere is not None:
+    if sphere:
         return step.excess > (threshold / _LEAST_MISFIT_SHARE) ** 2
     described = step.excess < _LITTLE * step.snr**2
     if described and RINGS * step.start.snr > threshold:
@@ -126,7 +127,7 @@ def _measured(
     weight = np.where(used, 1 / sigma, 0.0)
     place = step.start.y_px - rows[0], step.start.x_px - columns[0]
     centre = _centre(contrast * weight, place, _LARGEST_SHIFT_SHARE * roi_px)
-    image = ring_average(contrast, weight, centre)
+    image = np.maximum(ring_average(contrast, weight, centre), contrast.min())  # no light is less
     half = roi_px // 2
     y, x = (max(round(c) - half, 0) for c in place)
     core = slice(y, y + 2 * half + 1), slice(x, x + 2 * half + 1)

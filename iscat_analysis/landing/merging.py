@@ -12,6 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.drift import Trajectory, measure_drift, middle_of
+from iscat_analysis.fitting.indices import Told
 from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
@@ -52,6 +53,7 @@ class FinishedChunk:
         default_factory=lambda: np.empty((0, len(NOTHING)))
     )  # of every row
     searched: Searched | None = None  # share of the field at each boundary
+    untold: FloatArray = field(default_factory=lambda: np.empty((0, 2)))  # `Told` of some rows
 
 
 class MergedChunks:
@@ -65,6 +67,7 @@ class MergedChunks:
         self._strongest = np.zeros((2, *shape))
         self._masked, self._saturated = (np.zeros(shape, dtype=np.bool_) for _ in range(2))
         self.cause = ""
+        self.untold: list[Told] = []
         self.empty: EmptySpread | None = None
         self.evidence = np.empty((0, len(NOTHING)))  # of the rows of `result`
 
@@ -91,6 +94,7 @@ class MergedChunks:
         self._masked |= done.masked
         self._saturated |= done.saturated
         self.cause = self.cause or done.cause
+        self.untold += [(power, sigma) for power, sigma in done.untold.tolist()]
         if done.empty is not None:
             self.empty = done.empty if self.empty is None else self.empty + done.empty
         # the images are merged; holding them for every chunk would grow with the movie

@@ -4,6 +4,9 @@ A neighbour that lands or leaves in the frames of a step enters its likelihood t
 pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the frames after and before
 in which it is there.
 
+Of two bright spheres the fields add up, and not their contrasts: with the fields e of all, the mean
+light over frames is 1 + Σ φ_k C_k + Σ φ_kl 2 Re(e_k · e_l*), φ_kl the share in which both are there.
+
 Where the sample drifts, a particle moves with it: the mean of C over a window is its expansion to
 second order in the shift since the step, mean and smear.  In the pattern, whose motion is divided
 out, it is held with the share f of the light that makes the pattern, which is taken off again:
@@ -13,17 +16,18 @@ out, it is held with the share f of the light that makes the pattern, which is t
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
-from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.records import Candidate, FitResult, FloatArray
 from iscat_analysis.search.sliding import Chunk, StepFrame
@@ -33,6 +37,7 @@ _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is
 WHOLE = (slice(None), slice(None))
 """All of an image."""
 
+_LEAST_CROSSED_SNR = 0.5  # contrast of a neighbour times the step's, below which fields do not meet
 _WEAK_CONTRAST = 0.05  # contrast up to which several add up
 
 
@@ -68,6 +73,8 @@ class Neighbours:
         self._chunk = chunk
         self._window = window
         self._roi_px = context.roi_px
+        self._farthest_px = farthest_px(context.config, chunk.shape)
+        self.are_spheres = context.model.is_sized
         nominal = context.model.material.mass_kda
         self._contrast_per_kda = (
             context.model.peak_contrast(context.config.particle.nominal_height_nm, nominal)
@@ -119,8 +126,13 @@ class Neighbours:
         return Step(sign, at, start, corner, image, slopes, theta, snr, excess)
 
     def _half(self, start: Candidate) -> int:
-        """From the centre to the edge of a step's image [pixels]; strong rings reach far."""
-        return round(self._roi_px * min(max(start.snr / _FAINT_SNR, 1.0), LARGEST_IMAGE))
+        """From the centre to the edge of a step's image [pixels].
+
+        Strong rings reach far, and fall as the square of the distance.
+        """
+        strength = max(start.snr / _FAINT_SNR, 1.0)
+        regions = min(strength, max(LARGEST_IMAGE, math.sqrt(strength * LARGEST_IMAGE)))
+        return round(min(self._roi_px * regions, self._farthest_px))
 
     def reach_px(self, step: Step) -> float:
         """Farthest centre of a fitted square that holds pixels of a step's image."""
@@ -154,6 +166,13 @@ class Neighbours:
         ends, whole = self._power[edges[1:]], np.diff(self._power[edges])
         later = (ends - self._power[turned].mean(axis=0)) / np.where(whole > 0, whole, 1.0)
         return np.asarray(later if step.sign > 0 else 1 - later)
+
+    def light_in(self, frames: slice, steps: Iterable[Step]) -> FloatArray:
+        """Give the factor by which steps change the light of frames, (y, x)."""
+        light = np.ones(self._chunk.shape)
+        for step in steps:
+            light[self.box(step)] *= 1 + self.presence(step, frames) * step.image
+        return light
 
     def box(self, step: Step) -> tuple[slice, slice]:
         """Pixels of the field that a step's image covers."""
@@ -201,6 +220,64 @@ class Neighbours:
         shares = self.presence(step, before), self.presence(step, after)
         if shares[0] != shares[1]:
             times_change(ratio, _ends(here), step.image, _ends(inside), *shares)
+
+    def interfere(
+        self,
+        ratio: FloatArray,
+        step: Step,
+        others: Sequence[Step],
+        before: slice,
+        after: slice,
+        region: Region,
+    ) -> None:
+        """Multiply by what the fields of bright spheres make of each other's light.
+
+        The contrasts of all of them, that of the step included, are in the ratio and the model.
+        """
+        if not self.are_spheres or self._pattern is not None:
+            return
+        shown = [step, *(s for s in others if self._is_seen_beside(s, step, region))]
+        fields = [self._field(s, region) for s in shown]
+        contrasts = [2 * e[0].real + np.sum(np.abs(e) ** 2, axis=0) for e in fields]
+        light = []
+        for frames in (before, after):
+            total, product = 1.0, 1.0
+            for k, one in enumerate(shown):
+                share = self.presence(one, frames)
+                total = total + share * contrasts[k]
+                product = product * (1 + share * contrasts[k])
+                for field, other in zip(fields[:k], shown, strict=False):
+                    both = self._together(one, other, frames)
+                    total = total + both * _crossed(field, fields[k])
+            light.append(total / product)
+        ratio *= light[1] / light[0]
+
+    def crossed(self, step: Step, other: Step, region: Region) -> FloatArray | float:
+        """Give what the fields of two bright spheres make of each other's light."""
+        if not self.are_spheres or not self._is_seen_beside(other, step, region):
+            return 0.0
+        return _crossed(self._field(step, region), self._field(other, region))
+
+    def _is_seen_beside(self, other: Step, step: Step, region: Region) -> bool:
+        """Whether the light that two fields make together is more than noise."""
+        shared = self.shared(other, region)
+        if shared is None:
+            return False
+        return bool(np.abs(other.image[shared[1]]).max() * step.start.snr > _LEAST_CROSSED_SNR)
+
+    def _field(self, step: Step, region: Region) -> ComplexArray:
+        """Field of a step's particle over the reference, (1 or 2, y, x)."""
+        pixel, start = self._context.pixel_nm, step.start
+        place = start.x_px * pixel, start.y_px * pixel
+        grid = PixelGrid.region(region.rows, region.columns, pixel)
+        dx, dy = np.meshgrid(grid.x_nm - place[0], grid.y_nm - place[1])
+        model = self._context.wide_at(*place, step.at.frame + step.sign * self._window // 2)
+        return model.field(dx, dy, start.z_nm, start.mass_kda)
+
+    def _together(self, one: Step, other: Step, frames: slice) -> float:
+        """Share of the frames' light that shines while both particles are there."""
+        shares = self.presence(one, frames), self.presence(other, frames)
+        return min(shares) if one.sign == other.sign else max(sum(shares) - 1, 0.0)
 
     def own_factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice]
@@ -265,6 +342,7 @@ class Neighbours:
             dt = np.abs(frame - frame[i])
             dx, dy = np.abs(x - x[i]), np.abs(y - y[i])
             close = dt < max((1 + windows) * self._window, frames)
+            close |= self.are_spheres  # what stands there all the time has a field too
             near = close & (np.maximum(dx, dy) < reach)
             near[i] = False
             seen.append([int(k) for k in np.flatnonzero(near)])
@@ -293,6 +371,11 @@ class Neighbours:
             return None
         here = slice(top - first, bottom - first), slice(left - begin, right - begin)
         return here, (slice(top - y, bottom - y), slice(left - x, right - x))
+
+
+def _crossed(one: ComplexArray, two: ComplexArray) -> FloatArray:
+    """Light that two fields make together beyond that of each."""
+    return np.asarray(2 * np.sum(one * np.conj(two), axis=0).real)
 
 
 def _ends(part: tuple[slice, slice]) -> tuple[int, int, int, int]:

@@ -19,6 +19,7 @@ import numpy as np
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out
+from iscat_analysis.fitting.indices import Told, with_index
 from iscat_analysis.fitting.large import with_spheres
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
@@ -73,6 +74,7 @@ class StepEvent:
     step: Step
     others: tuple[Step, ...]
     repeats: FloatArray
+    told: Told | None = None  # of a sphere whose picture does not tell its index
 
 
 @dataclass(frozen=True)
@@ -108,8 +110,8 @@ class ChunkFitter:
         self._window = window
         self._pool = pool
         self._roi_px = context.roi_px
-        self._neighbours = Neighbours(context, chunk, window, pattern)
-        self._tasks = TaskBuilder(context, chunk, window, self._neighbours, pattern)
+        self.neighbours = Neighbours(context, chunk, window, pattern)
+        self._tasks = TaskBuilder(context, chunk, window, self.neighbours, pattern)
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._sieve = SidelobeFilter(chunk.first, self._stride, window, context.roi_px)
         self._doubtful: list[Peak] = []
@@ -123,11 +125,11 @@ class ChunkFitter:
         """Find and fit every step."""
         templates = self._context.templates
         matched = make_filter(self._chunk, templates.images[0], templates.noise)
-        maps = StepMaps(self._context, self._chunk, matched, self._neighbours, self._pattern)
+        maps = StepMaps(self._context, self._chunk, matched, self.neighbours, self._pattern)
         steps: list[Step] = []
         if self._pattern is None:
             steps = large_steps(
-                self._context, self._chunk, self._window, self._neighbours, self._pool.map
+                self._context, self._chunk, self._window, self.neighbours, self._pool.map
             )
         rejected: list[Step] = []
         for self.rounds in range(1, ROUNDS + 1):
@@ -142,7 +144,7 @@ class ChunkFitter:
                 break
             known = len(steps) if self.rounds > 1 else 0
             steps = steps + fresh
-            seen, bound = self._neighbours.of(steps)
+            seen, bound = self.neighbours.of(steps)
             relevant = self._relevant(steps, bound)
             new = relevant.intersection(range(known, len(steps)))
             chosen = new
@@ -166,7 +168,7 @@ class ChunkFitter:
             kept = {id(s) for s in credible}
             rejected += [s for s in steps if id(s) not in kept]
             steps = with_measured_images(
-                credible, self._neighbours.of(credible)[0], self._chunk, self._neighbours,
+                credible, self.neighbours.of(credible)[0], self._chunk, self.neighbours,
                 self._window, self._context.templates.threshold, self._roi_px,
             ) if credible else []  # fmt: skip
         if core is not None and self._last is not None:
@@ -182,7 +184,7 @@ class ChunkFitter:
         lobes = [self._begin(peak) for peak in self._doubtful]
         everything = steps + lobes
         seen, around = (
-            [[k for k in near if k < len(steps)] for near in self._neighbours.of(everything, n)[0]]
+            [[k for k in near if k < len(steps)] for near in self.neighbours.of(everything, n)[0]]
             for n in (0, TRACE_FRAMES)
         )
         # steps of the other polarity are fitted too: their rings have the one that is reported
@@ -202,7 +204,7 @@ class ChunkFitter:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
                 context=self._context, chunk=self._chunk, window=self._window,
-                events=events, steps=everything, neighbours=self._neighbours, own=self._own,
+                events=events, steps=everything, neighbours=self.neighbours, own=self._own,
             )  # fmt: skip
         return sorted(fitted, key=lambda f: (f.step.at.frame, f.step.start.y_px, f.step.start.x_px))
 
@@ -215,7 +217,7 @@ class ChunkFitter:
         def one(number: int) -> tuple[Trace | None, Clip | None]:
             step = fitted[number]
             patch = patch_of(step, chunk, window)
-            trace = trace_of(step, patch, chunk, self._neighbours, self._tasks)
+            trace = trace_of(step, patch, chunk, self.neighbours, self._tasks)
             clip = None
             if number < clips:
                 clip = clip_of(step, patch, self._context, chunk, window, self._pattern)
@@ -251,14 +253,14 @@ class ChunkFitter:
             mass = context.model.material.mass_kda
         mass = max(mass, 1e-3 * context.model.material.mass_kda)
         start = Candidate(peak.x_px, peak.y_px, context.height_nm(mass), mass, abs(peak.snr))
-        return self._neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
+        return self.neighbours.draw(sign, StepFrame.undated(peak.frame, self._stride), start)
 
     def _relevant(self, steps: Sequence[Step], bound: Sequence[Sequence[int]]) -> set[int]:
         """Select the steps whose light reaches what is fitted in the core, and their neighbours.
 
         Others keep the values of the search.
         """
-        reaches = [self._is_near_core(s, self._neighbours.reach_px(s)) for s in steps]
+        reaches = [self._is_near_core(s, self.neighbours.reach_px(s)) for s in steps]
         return {
             i for i, others in enumerate(bound) if reaches[i] or any(reaches[k] for k in others)
         }
@@ -279,7 +281,7 @@ class ChunkFitter:
             if step.sphere is not None:
                 likelihood, fit = refitted(task.likelihood, *step.sphere, level=True)
                 excess = chi2_excess(likelihood.residuals(fit.theta))
-                return self._neighbours.draw_sphere(
+                return self.neighbours.draw_sphere(
                     step.sign, task.at, model_of(likelihood), fit, excess
                 )
             likelihood, start = task.likelihood, _displaced(self._seated(step), *task.offset_px)
@@ -344,9 +346,7 @@ class ChunkFitter:
             mass_kda=float(likelihood.model.scale.mass(theta[3])),
         )
         excess = chi2_excess(likelihood.residuals(theta))
-        moved = self._neighbours.draw(
-            step.sign, task.at, start, theta=theta, snr=snr, excess=excess
-        )
+        moved = self.neighbours.draw(step.sign, task.at, start, theta=theta, snr=snr, excess=excess)
         if not step.is_measured:
             return moved
         return replace(step, at=moved.at, start=moved.start, theta=theta, snr=snr)
@@ -391,6 +391,7 @@ class ChunkFitter:
         )  # fmt: skip
         if event.snr < _LEAST_THRESHOLD_SHARE * context.templates.threshold:
             return None
+        event, told = with_index(context, event)
         step = replace(step, at=task.at)
         seen = (
             near[index] if context.lines is None else [i for i in range(len(steps)) if i != index]
@@ -399,9 +400,9 @@ class ChunkFitter:
         far = others if context.lines is not None else [steps[i] for i in around[index]]
         spans, lighting = self._tasks.trace_spans(step, task.windows, far)
         repeats = step_repeats(
-            self._chunk, spans, event, step, lighting, self._neighbours, self._pattern, context.mode
+            self._chunk, spans, event, step, lighting, self.neighbours, self._pattern, context.mode
         )
-        return _Finished(StepEvent(event, step, others, repeats), task.crowded, lobe)
+        return _Finished(StepEvent(event, step, others, repeats, told), task.crowded, lobe)
 
     def _judged(self, finished: Sequence[_Finished], beside: Sequence[Step]) -> list[StepEvent]:
         """Judge all steps, including side lobes and steps that explain less than they leave.

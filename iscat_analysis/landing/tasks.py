@@ -110,6 +110,7 @@ class TaskBuilder:
         cuts = chunk.cut(*first), chunk.cut(*second)
         for other in neighbours:
             self._neighbours.apply(ratio, other, *cuts, region)
+        self._neighbours.interfere(ratio, step, neighbours, *cuts, region)
         if context.lines is not None:
             there = [self._present(steps, span, cut) for cut in cuts]
             taken = [context.lines.taken(signal)[region.slices] for signal in there]
@@ -276,6 +277,8 @@ class TaskBuilder:
             here, inside = both
             padded = np.zeros(image.shape)
             padded[here] = other.image[inside]
+            if step.sign * (other.at.frame - step.at.frame) > 0:  # the step's particle is there
+                padded += self._neighbours.crossed(step, other, region)
             seen.append(other)
             images.append(padded)
         for other, height in zip(seen, crosstalk(patch, image, images), strict=True):

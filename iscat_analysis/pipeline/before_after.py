@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +25,7 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, posterior_of
 from iscat_analysis.fitting.field import add_signal, fit_field
+from iscat_analysis.fitting.indices import untold_message, with_index
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import Region, contrast_image, photons_scale
 from iscat_analysis.fitting.results import (
@@ -36,7 +36,6 @@ from iscat_analysis.fitting.results import (
     view_of,
 )
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.inference.free_index import fit_index
 from iscat_analysis.landing.split_frame_estimates import field_repeats
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import (
@@ -164,35 +163,6 @@ def _judge_beside_particles(
     return noise.compared_with_fits(table["chi2_reduced"].to_numpy(float))
 
 
-def _with_indices(
-    context: AnalysisContext, events: Sequence[Event], pool: ThreadPoolExecutor
-) -> tuple[tuple[Event, ...], str]:
-    """Fit the index of every sphere, and say what the pictures tell that do not tell it."""
-    z_range_nm = context.config.fit.z_range_nm
-    found = list(pool.map(lambda one: fit_index(one.likelihood, one.fit, z_range_nm), events))
-    fitted = tuple(
-        replace(
-            event, likelihood=own.likelihood, fit=own.fit,
-            flags=verdict([*own.fit.flags, *(set(event.flags) - set(event.fit.flags))])[1],
-        )
-        for event, own in zip(events, found, strict=True)
-    )  # fmt: skip
-    untold = [own for own in found if not own.is_told]
-    if not untold:
-        return fitted, ""
-    n_sample = context.model.optics.n_sample
-    known = [own for own in untold if math.isfinite(own.sigma)]
-    told = ""
-    if known:
-        power, sigma = (float(np.median([own[k] for own in known])) for k in (2, 3))
-        told = f": they tell d^{power:.2g} (n − {n_sample:g}) to {100 * sigma:.2g} %"
-    return fitted, (
-        f"the pictures of {len(untold)} of {count(len(found), 'sphere')} do not tell diameter and "
-        f"index apart{told}; refractive_index is empty, and diameter_nm that of the configured "
-        "index"
-    )
-
-
 def _fit_together(
     ready: Prepared,
     run: Run,
@@ -207,9 +177,12 @@ def _fit_together(
         context, windows, excess_noise=noise.excess, pool=pool, progress=run.progress
     )
     if context.config.fit.index:
-        events, untold = _with_indices(context, events, pool)
-        if untold:
-            run.warn(untold)
+        found = list(pool.map(lambda event: with_index(context, event), events))
+        events = tuple(event for event, _ in found)
+        untold = [told for _, told in found if told]
+        n_sample = context.model.optics.n_sample
+        if text := untold_message(untold, len(untold), len(events), n_sample):
+            run.warn(text)
     run.clock.lap("fit")
     # rings of many particles that a wrong microscope leaves over look uneven too
     cause = misfit_warning(context.config, events)

@@ -32,7 +32,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, PixelGrid, forward_model, signed_peak
 from iscat_analysis.optics.materials import material
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status
-from iscat_analysis.trust.response import Response, at_standards, response_of
+from iscat_analysis.trust.response import Response, at_standards, has_own_index, response_of
 
 _STEP = 0.1  # of a standard deviation, for derivatives
 
@@ -88,11 +88,20 @@ def assumed_error(key: str, config: Config, table: pd.DataFrame) -> Mapping[str,
 def _of_spheres(
     key: str, config: Config, table: pd.DataFrame, sigma: float
 ) -> Mapping[str, FloatArray]:
-    """Error of the masses of spheres, which follow from their pictures without standards."""
+    """Error of the masses of spheres, which follow from their pictures without standards.
+
+    An index that was fitted is not assumed, and takes its part of what other inputs have wrong.
+    """
     mass = np.abs(table["mass_kda"].to_numpy(float))
     if config.optics.scheme == "darkfield" or not np.isfinite(mass).any():
         return {}
-    share = abs(_shift(key, config, table, sigma, float(np.nanmedian(mass))))
+    own = has_own_index(table)
+    share = np.zeros(mass.size)
+    for index in (False, True):
+        rows = (own == index) & np.isfinite(mass)
+        if rows.any() and not (index and key == "index"):
+            typical = float(np.median(mass[rows]))
+            share[rows] = abs(_shift(key, config, table, sigma, typical, index=index))
     return {"mass_kda": share * mass}
 
 
@@ -116,18 +125,26 @@ def _value(key: str, config: Config) -> float | None:
 
 
 def _shift(
-    key: str, config: Config, table: pd.DataFrame, sigma: float, mass_kda: float | None = None
+    key: str,
+    config: Config,
+    table: pd.DataFrame,
+    sigma: float,
+    mass_kda: float | None = None,
+    *,
+    index: bool = False,
 ) -> float:
     """Relative shift of the amplitude for one standard deviation of an input.
 
-    Of a particle of a mass; without one, of a faint particle, as standards are.
+    Of a particle of a mass; without one, of a faint particle, as standards are.  The `index` of a
+    sphere may be free.
     """
     respond = _response(config, table)
     amplitude = respond.faint_amplitude
     if mass_kda is not None:
         scale = forward_model(config, respond.model.reach_nm).scale
         amplitude = float(scale.amplitudes(mass_kda))
-    return respond.to_input(_change(key, config, respond, amplitude, sigma), amplitude).amplitude
+    change = _change(key, config, respond, amplitude, sigma)
+    return respond.to_input(change, amplitude, index=index).amplitude
 
 
 def _response(config: Config, table: pd.DataFrame) -> Response:

@@ -15,12 +15,14 @@ from iscat_analysis.config import ABERRATIONS, Config, Optics
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
+from iscat_analysis.inference.sizes import slopes_with_index
 from iscat_analysis.optics.forward import (
     ForwardModel,
     PixelGrid,
     forward_model,
     peak_per_amplitude,
 )
+from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 
 COMMON = (*PARAMETERS, "contrast")
@@ -103,32 +105,40 @@ class Response:
         moved: FloatArray = self.at(self.model.height_nm, np.array([self.faint_amplitude]))[0, 3]
         return moved
 
-    def to_contrast(self, z_nm: float, amplitude: float) -> float:
-        """Relative shift of the amplitude per share by which a picture is stronger."""
+    def to_contrast(self, z_nm: float, amplitude: float, *, index: bool = False) -> float:
+        """Relative shift of the amplitude per share by which a picture is stronger.
+
+        With the index of the sphere free, that takes its part of the difference.
+        """
         theta = self.theta(z_nm, amplitude)
         signal, _ = self.model.amplitude_gradient(self.grid, *theta[:4].tolist())
-        whole = joint_information(self.expected(theta), theta, (), [signal])
-        chosen = np.concatenate([[0], 1 + self._kept])
+        further = self._along_index(theta) if index else []
+        whole = joint_information(self.expected(theta), theta, (), [signal, *further])
+        count = 1 + len(further)
+        chosen = np.concatenate([np.arange(count), count + self._kept])
         moved = imitation(whole[np.ix_(chosen, chosen)], 1)
-        return -float(moved[self._row_of_mass, 0]) / amplitude
+        return -float(moved[len(further) + self._row_of_mass, 0]) / amplitude
 
     @property
     def faint_amplitude(self) -> float:
         """Amplitude of a particle whose scattered light alone is negligible."""
         return _FAINT / peak_per_amplitude(self.model)
 
-    def to_input(self, derivative: FloatArray, amplitude: float) -> Shifts:
+    def to_input(self, derivative: FloatArray, amplitude: float, *, index: bool = False) -> Shifts:
         """Shift of ln a and of the optics where pictures differ by a derivative from the model.
 
         Parameters of the optics that were learned from such pictures imitate the difference as far
-        as they can, and the particle the rest.
+        as they can, and the particle the rest, with the index of a sphere if that is free.
 
         Shapes: `derivative` (ny, nx).
         """
         theta = self.theta(self.model.height_nm, amplitude)
-        whole = joint_information(self.expected(theta), theta, self.names, [derivative])
-        count = 1 + len(self.names)
-        chosen = np.concatenate([np.arange(count), count + self._kept])
+        further = self._along_index(theta) if index else []
+        others = [derivative, *further]
+        whole = joint_information(self.expected(theta), theta, self.names, others)
+        count, all_others = 1 + len(self.names), len(others) + len(self.names)
+        shared = np.delete(np.arange(all_others), np.arange(1, len(others)))
+        chosen = np.concatenate([shared, np.arange(1, len(others)), all_others + self._kept])
         whole = whole[np.ix_(chosen, chosen)]
         information = eliminated(whole, count)
         size = np.sqrt(np.maximum(np.diag(information)[1:], 1e-300))
@@ -137,7 +147,7 @@ class Response:
         )
         optics = (inverse @ (information[1:, 0] / size)) / size
         moved = imitation(whole, count)
-        row = self._row_of_mass
+        row = len(further) + self._row_of_mass
         left = 1 - float(information[0, 1:] @ optics) / float(information[0, 0])
         return Shifts(float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics, left)
 
@@ -146,6 +156,15 @@ class Response:
         theta = self.theta(self.model.height_nm, amplitude)
         rows = self.expected(theta).derivatives(theta)
         return self.to_input((rows[:, _XX] + rows[:, _YY]) / 2, amplitude)
+
+    def _along_index(self, theta: FloatArray) -> list[FloatArray]:
+        """Differentiate the picture of a sphere along its index, (1, ny, nx)."""
+        if not isinstance(self.model, SizedModel):
+            raise TypeError(f"{type(self.model).__name__} has no index")
+        x, y, z, amplitude, _ = theta.tolist()
+        known = self.model.sphere.index.real
+        slopes = slopes_with_index(self.model, self.grid, (x, y, z), amplitude, known)[1]
+        return [slopes[-1]]
 
     @property
     def _row_of_mass(self) -> int:
@@ -172,6 +191,13 @@ def response_of(
         frames=(int(table["n_before"].median()), int(table["n_after"].median())),
         contrast=contrast,
     )  # fmt: skip
+
+
+def has_own_index(table: pd.DataFrame) -> NDArray[np.bool_]:
+    """Tell of which rows the index of the sphere was fitted."""
+    if "refractive_index" not in table:
+        return np.zeros(len(table), dtype=np.bool_)
+    return np.asarray(table["refractive_index"].notna(), dtype=np.bool_)
 
 
 def at_standards(config: Config) -> Config:

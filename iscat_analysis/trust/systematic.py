@@ -32,6 +32,7 @@ from iscat_analysis.trust.response import (
     COMMON,
     amplitude_nodes,
     at_standards,
+    has_own_index,
     height_weights,
     lagrange,
     response_of,
@@ -223,7 +224,10 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     respond = response_of(config, table, ())
     places = table.loc[known, ["z_nm", "mass_kda"]].to_numpy(float).tolist()
     out = np.full(mass.size, np.nan)
-    out[known] = [abs(share * respond.to_contrast(z, kda)) * kda for z, kda in places]
+    out[known] = [
+        abs(share * respond.to_contrast(z, kda, index=own)) * kda
+        for (z, kda), own in zip(places, has_own_index(table)[known].tolist(), strict=True)
+    ]
     return {"mass_kda": out}
 
 

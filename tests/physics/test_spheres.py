@@ -400,10 +400,44 @@ def test_the_error_of_an_assumed_index_is_in_the_diameter() -> None:
     def strength(n: float) -> float:
         return math.log((n**2 - 1.33**2) / (n**2 + 2 * 1.33**2))
 
-    n = material(config.particle, config.optics.wavelength_nm).permittivity.real ** 0.5
+    n = index_of(config)
     expected = strength(n + config.uncertainty.index) - strength(n)
     assert share == pytest.approx(expected, rel=0.06)
     assert assumed_error("wavelength_nm", config, pd.DataFrame(rows))["mass_kda"][0] > 0
+
+
+def test_an_index_that_was_fitted_is_not_assumed() -> None:
+    """It takes its part of what a wrong wavelength does: as in a fit of the picture."""
+    config = of("iscat", particle={"diameter_nm": 200.0, "height_nm": 100.0})
+    mass, n = config.particle.nominal_mass_kda, index_of(config)
+    rows = {"n_before": [1000], "n_after": [1000], "z_nm": [100.0], "mass_kda": [mass],
+            "status": ["ok"], "refractive_index": [n]}  # fmt: skip
+    assert assumed_error("index", config, pd.DataFrame(rows))["mass_kda"][0] == 0.0
+    told = assumed_error("wavelength_nm", config, pd.DataFrame(rows))["mass_kda"][0] / mass
+    respond = response_of(config, pd.DataFrame(rows), ())
+    sigma = config.uncertainty.wavelength_nm
+    optics = config.optics.model_copy(update={"wavelength_nm": config.optics.wavelength_nm + sigma})
+    other = forward_model(config.model_copy(update={"optics": optics}), respond.model.reach_nm)
+    theta = respond.theta(100.0, mass)
+    seen = other.amplitude_image(respond.grid, *theta[:4].tolist())
+    likelihood = respond.expected(theta)
+    weight = np.sqrt(likelihood.signal_information(likelihood.signal(theta)))
+
+    def left(some: np.ndarray) -> np.ndarray:
+        x, y, z, part, index = some.tolist()
+        model = respond.model.of_index(n + index)  # type: ignore[attr-defined]
+        here = (theta[:3] + np.array([x, y, z])).tolist()
+        picture = model.amplitude_image(respond.grid, *here, mass * (1 + part))
+        return np.asarray((picture - seen) * weight).ravel()
+
+    scale = [1.0, 1.0, 1.0, 0.01, 0.001]
+    found = scipy.optimize.least_squares(left, np.zeros(5), x_scale=scale).x[3]
+    assert told == pytest.approx(abs(found), rel=0.05)
+
+
+def index_of(config: Config) -> float:
+    """Give the index of the sphere of a configuration."""
+    return float(material(config.particle, config.optics.wavelength_nm).permittivity.real ** 0.5)
 
 
 def test_the_scattering_length_of_a_small_sphere_is_that_of_its_polarisability() -> None:

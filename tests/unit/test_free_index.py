@@ -107,7 +107,6 @@ def test_errors_of_both_are_as_large_as_said(diameter: float, index: float, shar
     [
         ("fit", {"mode": "localize"}, 'use "size"'),
         ("particle", {"kind": "gold"}, "absorbs"),
-        ("background", {"frames": None}, "give background.frames"),
     ],
 )
 def test_where_no_index_can_be_fitted_it_is_refused(

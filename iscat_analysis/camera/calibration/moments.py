@@ -64,8 +64,11 @@ def moments_of(
     advance: Callable[[int], None],
     *,
     flickering: str = "frames",
+    jumps: BoolArray | None = None,
 ) -> Moments:
     """Measure mean and variance of every pixel; with `used`, the light's flicker is taken out.
+
+    Differences of successive frames at `jumps` are left out.
 
     Notes
     -----
@@ -75,7 +78,7 @@ def moments_of(
     which a pixel that follows it s times as strongly loses s/P.
     Where rows or columns flicker, the mean is that of each.
 
-    Shapes: `used` (y, x).
+    Shapes: `used` (y, x), `jumps` (frames − 1,).
     """
     together = _TOGETHER[flickering]
     frames, rows, columns = stack.shape
@@ -98,6 +101,9 @@ def moments_of(
         if last is not None:
             block = np.concatenate([last[np.newaxis], block])
         steps = np.diff(block, axis=0)
+        if jumps is not None:
+            first = max(start - 1, 0)
+            steps[jumps[first : first + len(steps)]] = 0.0
         squares += np.einsum("kyx,kyx->yx", steps, steps)
         if used is not None:
             common = np.mean(steps, axis=together, keepdims=True, where=used)
@@ -105,7 +111,7 @@ def moments_of(
             flicker.append(common)
         last = block[-1]
         advance(stop - start)
-    n = frames - 1
+    n = frames - 1 - (0 if jumps is None else int(np.count_nonzero(jumps)))
     mean = total / frames
     if used is None:
         still, certain = np.ones_like(mean), np.zeros_like(mean)

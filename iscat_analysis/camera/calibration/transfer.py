@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.calibration.moments import Moments, brightness_bins, moments_of
-from iscat_analysis.camera.calibration.pixels import unlike_neighbours, unsteady
+from iscat_analysis.camera.calibration.pixels import stand_out, unlike_neighbours, unsteady
 from iscat_analysis.camera.calibration.regression import (
     LEAST_RELIABILITY,
     variance_line,
@@ -58,8 +59,9 @@ def measure_transfer(
 
     Notes
     -----
-    The variance of the read noise and of rounding is taken off.  Errors are from the scatter of
-    pixels, times what squares of `_TILE_PX` pixels scatter more than these.
+    The variance of the read noise and of rounding is taken off.  Where a bright particle lands, its
+    pixels change and the light of the field with them, which is no flicker.  Errors are from the
+    scatter of pixels, times what squares of `_TILE_PX` pixels scatter more than these.
 
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
@@ -74,7 +76,9 @@ def measure_transfer(
     if np.count_nonzero(used) < _LEAST_PIXELS:
         return None
     try:
-        found = moments_of(open_stack(electrons), used, lambda _: None)
+        found = moments_of(
+            open_stack(electrons), used, lambda _: None, jumps=_jumps(electrons, light, used)
+        )
     except DataError:
         return None
     used &= ~unsteady([found], used) & (found.variance > _LEAST_NOISE * light)
@@ -84,6 +88,20 @@ def measure_transfer(
     if own > (1 - LEAST_RELIABILITY) * float(found.mean[used].var()):
         return None
     return _binned(found, used, camera.dark_variance_e2(counts)[used])
+
+
+def _jumps(electrons: FloatArray, light: FloatArray, used: BoolArray) -> BoolArray:
+    """Find successive frames that differ by more than noise and power, as where a particle lands.
+
+    Shapes: `electrons` (t, y, x), `light, used` (y, x), result (t − 1,).
+    """
+    mean = light[used]
+    excess = np.empty(len(electrons) - 1)
+    for number, (before, after) in enumerate(pairwise(electrons)):
+        step = after[used] - before[used]
+        step -= step.mean() / mean.mean() * mean
+        excess[number] = np.mean(step**2 / mean)
+    return stand_out(excess)
 
 
 def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:

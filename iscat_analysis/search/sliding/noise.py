@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +32,7 @@ _LENGTHS = (1, 2, 3, 5, 7, 10, 15, 20, 30, 40, 50, 70, 100)
 _SLOPE_DISTANCES_PX = (1, 2, 3, 4)  # pixels, whose differences make up the slope of a fine pattern
 _PARTICLE_SIGMAS = 4.0  # standard deviations, from which on a difference is not asked of motion
 _NORMAL_QUARTILE = 0.6744897501960817
+_PARTS = 4  # of a field, which a pattern that moves has in common
 _ROWS = 16  # on which the noise is measured
 _ROWS_TOGETHER = 64  # the same beside what the pattern's motion makes, of which slopes tell
 
@@ -153,11 +155,34 @@ class _Strip:
         seen = np.moveaxis(slopes[:, :, lit] / sigma[:, lit], 0, -1)  # (pair, pixel, slope)
         usual = np.abs(change) < _PARTICLE_SIGMAS * math.sqrt(noise)
         turned = np.swapaxes(seen * usual[..., None], 1, 2)
-        projection = turned @ change[..., None]
-        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ projection
-        by_chance = moved.size  # of χ²
-        motion = (float(np.sum(projection * moved)) - by_chance) / max(np.count_nonzero(usual), 1)
+        moved = np.linalg.pinv(turned @ seen, hermitian=True) @ (turned @ change[..., None])
+        motion = _shared_motion(change, seen, turned, np.nonzero(lit)[1])
+        motion /= max(int(np.count_nonzero(usual)), 1)
         return _Compared(noise, _variance(change - (seen @ moved)[..., 0]), motion)
+
+
+def _shared_motion(
+    change: FloatArray, seen: FloatArray, turned: FloatArray, column: NDArray[np.int64]
+) -> float:
+    """Give the χ² that a motion of the whole field explains.
+
+    A bright particle changes the light like an edge that moved, but differently in every part of
+    the field.  So the motion that each part tells is asked to explain each other part, and the
+    median of these pairs counts.
+
+    Shapes: `change` (pair, pixel), `seen` (pair, pixel, slope), `turned` (pair, slope, pixel),
+    `column` (pixel,).
+    """
+    parts = np.array_split(np.argsort(column, kind="stable"), _PARTS)
+    projection = np.stack([turned[..., part] @ change[:, part, None] for part in parts])
+    information = np.stack([turned[..., part] @ seen[:, part] for part in parts])
+    moved = np.linalg.pinv(information, hermitian=True) @ projection
+    explained = [
+        np.sum(moved[one] * (2 * projection[other] - information[other] @ moved[one]))
+        for one, other in permutations(range(_PARTS), 2)
+    ]
+    by_chance = float(projection[0].size)  # of which noise takes so much away
+    return _PARTS * (float(np.median(explained)) + by_chance)
 
 
 def _across(images: FloatArray, reach: int, axis: int) -> FloatArray:
