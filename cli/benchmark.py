@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,7 +35,7 @@ that can be named, and your own simulation compared with the bounds.
     iscat benchmark --config setup.toml --truth true.csv --results results.csv
 """
 
-MODES = ("mass", "localize", "joint")
+MODES = ("mass", "size", "localize", "joint")
 
 
 @command
@@ -83,9 +84,9 @@ def benchmark(
 ) -> None:
     """Measure spread, bias and coverage of the fits against CRB and QCRB.
 
-    Draws synthetic shot noise, fits it in modes mass, localize and joint, and writes
-    benchmark.json, benchmark.html and figures to the output folder. With --estimator, others see
-    the same counts; each runs in a process of its own.
+    Draws synthetic shot noise, fits it in modes mass, localize and joint, of spheres in modes size
+    and localize, and writes benchmark.json, benchmark.html and figures to the output folder. With
+    --estimator, others see the same counts; each runs in a process of its own.
     """
     with failures(messages):
         from iscat_analysis.errors import ConfigError
@@ -162,21 +163,24 @@ def estimators_table() -> Table:
 
 def left_out(study: Mapping[str, Any]) -> list[str]:
     """Say where fits are part of no bias and no spread though they did not fail."""
-    from iscat_analysis.records import Status
-
     notes = []
-    for mode in MODES:
-        entry = study[mode]
-        ambiguous, trials = entry["flagged"][Status.AMBIGUOUS_Z], entry["trials"]
-        if ambiguous:
-            verb = "is" if ambiguous == 1 else "are"
-            notes.append(
-                f"mode {mode}: of {trials} fits {ambiguous} {verb} {Status.AMBIGUOUS_Z} and "
-                "left out of bias and spread: several heights describe the pixels about as well; "
-                "more photons or frames (bounds.photons_per_pixel, bounds.n_after) or a narrower "
-                "fit.z_range_nm tell which"
-            )
+    for mode, (status, several, key) in product(MODES, _AMBIGUOUS):
+        if mode not in study or not (ambiguous := study[mode]["flagged"][status]):
+            continue
+        verb = "is" if ambiguous == 1 else "are"
+        notes.append(
+            f"mode {mode}: of {study[mode]['trials']} fits {ambiguous} {verb} {status} and "
+            f"left out of bias and spread: several {several} describe the pixels about as well; "
+            "more photons or frames (bounds.photons_per_pixel, bounds.n_after) or a narrower "
+            f"{key} tell which"
+        )
     return notes
+
+
+_AMBIGUOUS = (
+    ("ambiguous_z", "heights", "fit.z_range_nm"),
+    ("ambiguous_size", "diameters", "fit.diameter_range_nm"),
+)
 
 
 def benchmark_table(study: Mapping[str, Any]) -> Table:
@@ -185,7 +189,7 @@ def benchmark_table(study: Mapping[str, Any]) -> Table:
     found = table("mode", "parameter", *headings, "failed")
     found.columns[1].justify = "left"
     for mode in MODES:
-        entry = study[mode]
+        entry = study.get(mode, {})
         for name, values in entry.items():
             if not isinstance(values, Mapping) or "spread_over_crb" not in values:
                 continue

@@ -36,7 +36,7 @@ from iscat_analysis.config.instrument import (
 )
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
-from iscat_analysis.config.schema import Config, refuse_rod
+from iscat_analysis.config.schema import Config, refuse_rod, refuse_sphere
 from iscat_analysis.config.synthetic import (
     SIMULATED,
     BoundsConfig,
@@ -100,6 +100,7 @@ __all__ = [
     "plausible_pixel",
     "read_optics_file",
     "refuse_rod",
+    "refuse_sphere",
     "toml_value",
     "with_absolute_paths",
 ]

@@ -279,6 +279,15 @@ def refuse_rod(config: Config, what: str) -> None:
         )
 
 
+def refuse_sphere(config: Config, what: str) -> None:
+    """Refuse what does not know the diameter of a sphere as a parameter."""
+    if config.particle.is_sphere:
+        raise ConfigError(
+            f'particle.model = "{config.particle.model}": {what}; iscat benchmark studies spheres '
+            "without --estimator, and iscat simulate makes movies of them"
+        )
+
+
 def index_refusal(config: Config) -> str:
     """Say why the index of a sphere cannot be fitted; else nothing."""
     particle, mode = config.particle, config.fit.mode

@@ -65,6 +65,22 @@ class Sphere:
         least = sphere_mass_kda(max(SMALLEST_NM, 2 * self.shell_nm), self.density_kg_m3)
         return replace(self, mass_kda=max(abs(mass_kda), least))
 
+    def homogeneous(self) -> Sphere:
+        """Give the sphere without a shell that scatters as much while both are small.
+
+        A shell around a core with the share f of the volume makes their permittivities ε₁ (core)
+        and ε₂ act as one (Bohren and Huffman, section 5.4)
+
+            ε = ε₂ (ε₁ + 2 ε₂ + 2 f (ε₁ − ε₂))/(ε₁ + 2 ε₂ − f (ε₁ − ε₂)).
+        """
+        if not self.shell_nm:
+            return self
+        share = max(1 - 2 * self.shell_nm / self.diameter_nm, 0.0) ** 3
+        core, shell = self.index**2, self.shell_index**2
+        both, apart = core + 2 * shell, share * (core - shell)
+        index = complex(np.sqrt(shell * (both + 2 * apart) / (both - apart)))
+        return replace(self, index=index, shell_nm=0.0, shell_index=0.0)
+
     def pattern(
         self, cos_s: ComplexArray, direction: float, n_sample: float, wavenumber: float
     ) -> tuple[ComplexArray, ComplexArray]:

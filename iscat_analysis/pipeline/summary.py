@@ -29,7 +29,12 @@ _HEIGHTS = 65
 _CLEAR_OF_THRESHOLD = 3.0
 """Standard deviations above the threshold from which hardly any sphere is missed."""
 
-_NO_SIZE = {TrackStatus.POOR_FITS, TrackStatus.AMBIGUOUS_SIZE, TrackStatus.MASS_VARIES}
+_NO_SIZE = {
+    TrackStatus.POOR_FITS,
+    TrackStatus.AMBIGUOUS_SIZE,
+    TrackStatus.OTHER_PARTICLE,
+    TrackStatus.MASS_VARIES,
+}
 """Flags of tracks of which pictures do not tell the diameter."""
 
 

@@ -276,8 +276,8 @@ TRACKS = (
     Column(
         "refractive_index", "positive",
         "Refractive index of a sphere of that diameter that scatters like mass_kda of [particle]; "
-        "with particle.model = \"mie\" or \"shell\", from images and diffusion together; "
-        "null for a material that absorbs", "index",
+        "with particle.model = \"mie\" or \"shell\", of a homogeneous sphere, from images and "
+        "diffusion together; null for a material that absorbs", "index",
     ),
     Column(
         "confinement_nm", "positive",
@@ -336,6 +336,12 @@ TRACKS = (
         "optical_probability", "share",
         "Posterior probability of that diameter among all that the images allow",
         optional=True,
+    ),
+    Column(
+        "log_odds_particle", "number",
+        "Logarithm of the posterior odds, from images and diffusion, that the track is of "
+        "[particle] with any diameter, against a homogeneous sphere of any diameter and any index "
+        "up to 1.8", "ln odds", optional=True,
     ),
 )  # fmt: skip
 """The columns of ``tracks.csv``, in order."""

@@ -104,6 +104,7 @@ class TrackStatus(StrEnum):
     FEW_FRAMES = "few_frames"
     POOR_FITS = "poor_fits"
     AMBIGUOUS_SIZE = "ambiguous_size"
+    OTHER_PARTICLE = "other_particle"
     MASS_VARIES = "mass_varies"
     PARTLY_SEEN = "partly_seen"
     SHORT_WAY = "short_way"
@@ -128,6 +129,9 @@ _TRACK_ADVICE = {
     "selection of frames: see the status of its rows in fits.csv.",
     TrackStatus.AMBIGUOUS_SIZE: "Another diameter explains all its frames almost as well: "
     "optical_probability says how likely this one is.",
+    TrackStatus.OTHER_PARTICLE: "Its images and its motion are those of a homogeneous sphere of "
+    "another refractive index rather than of the particle of [particle], so that its optical "
+    "diameter is wrong: give [particle] its refractive_index, or its shell.",
     TrackStatus.MASS_VARIES: "Its frames differ in mass by more than their errors, or the masses "
     "of all tracks change together: motion blurs the image, particles met, the particle changed, "
     "or the focus drifts.",

@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
-from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.estimators import (
     contest_figures,
     contest_parts,
@@ -37,11 +36,14 @@ BENCHMARK_NAMES = frozenset(
 ENOUGH_RANKS = 100
 """Posteriors below which the uniformity of their ranks is not tested: a p-value would mislead."""
 
-MODES = ("mass", "localize", "joint")
+MODES = ("mass", "size", "localize", "joint")
 
+_LABELS = {**LABELS, "diameter_nm": "diameter"}
+_UNITS = {**UNITS, "diameter_nm": "nm"}
 _TITLES = {
     "mass": "Mass: position and mass, height known",
-    "localize": "Localize: position in three dimensions, mass known",
+    "size": "Size: position in three dimensions and diameter of a sphere",
+    "localize": "Localize: position in three dimensions, mass or diameter known",
     "joint": "Joint: position in three dimensions and mass",
 }
 _SCHEMES = {"iscat": "iSCAT", "cobri": "COBRI", "darkfield": "dark field"}
@@ -76,7 +78,7 @@ def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) ->
                 "Poisson statistics and read noise, before and after landing, and fitted by the "
                 "code that fits movies, from starts up to a pixel off, at any height of the range "
                 "and with a mass up to half as large again. The spread is over fits that neither "
-                "failed nor were flagged for an ambiguous height.",
+                "failed nor were flagged for an ambiguous height or diameter.",
                 "The Cramér–Rao bound (CRB) holds for the same free parameters, frames, camera "
                 "noise and measured background; the quantum bound (QCRB) for the collected "
                 "scattered light and any measurement of it.",
@@ -116,26 +118,27 @@ def _summary(study: Mapping[str, Any]) -> dict[str, Any]:
     for mode in MODES:
         if mode not in study:
             continue
-        ratios = [study[mode][name]["spread_over_crb"] for name in FREE_PARAMETERS[mode]]
+        names = _scored(study[mode])
+        ratios = [study[mode][name]["spread_over_crb"] for name in names]
         finite = [r for r in ratios if math.isfinite(r)]
         low, high = (min(finite), max(finite)) if finite else (math.nan, math.nan)
         facts.append(
             {
                 "label": f"spread / CRB, {mode}",
                 "value": f"{low:.2f}–{high:.2f}" if finite else "—",
-                "note": f"over {', '.join(LABELS[n] for n in FREE_PARAMETERS[mode])}; "
+                "note": f"over {', '.join(_LABELS[n] for n in names)}; "
                 f"{study[mode]['failed']} of {study[mode]['trials']} fits failed",
             }
         )
     rows = []
     for mode in MODES:
-        for name in FREE_PARAMETERS[mode] if mode in study else ():
+        for name in _scored(study[mode]) if mode in study else ():
             entry = study[mode][name]
             baselines = entry.get("baselines", {})
             rows.append(
                 [
                     mode,
-                    f"{LABELS[name]} [{UNITS[name]}]",
+                    f"{_LABELS[name]} [{_UNITS[name]}]",
                     _with(entry["spread_over_crb"], entry["spread_over_crb_ci95"]),
                     _plain(entry["spread_over_qcrb"]),
                     *(
@@ -167,11 +170,16 @@ def _summary(study: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
+def _scored(entry: Mapping[str, Any]) -> list[str]:
+    """Name the parameters of a mode that have a score."""
+    return [name for name in _LABELS if name in entry]
+
+
 def _mode_section(
     study: Mapping[str, Any], mode: str, drawn: Mapping[str, Markup]
 ) -> dict[str, Any]:
     entry, at = study[mode], study[mode]["at"]
-    names = FREE_PARAMETERS[mode]
+    names = _scored(entry)
     charts = [
         {"id": f"{mode}-{stem}", "title": title, "svg": drawn[f"{stem}_{mode}"], "wide": True}
         for stem, title in _FIGURES.items()
@@ -181,8 +189,10 @@ def _mode_section(
         ", ".join(f"{n} {flag.replace('_', ' ')}" for flag, n in entry["flagged"].items() if n)
         or "none"
     )
+    diameter = at.get("diameter_nm")
+    what = f"{at['mass_kda']:,.0f} kDa" if diameter is None else f"A sphere of {diameter:.4g} nm"
     lead = (
-        f"{at['mass_kda']:,.0f} kDa at z = {at['z_nm']:.3g} nm, focus at {at['focus_nm']:.0f} nm; "
+        f"{what} at z = {at['z_nm']:.3g} nm, focus at {at['focus_nm']:.0f} nm; "
         f"{at['n_scattered']['collected']:,.0f} scattered photons collected; "
         f"{at['pixels']} × {at['pixels']} pixels of {at['pixel_size_nm']:.4g} nm; "
         f"{at['n_before']} frames before and {at['n_after']} after landing. "
@@ -227,7 +237,7 @@ def _mode_section(
 def _row(entry: Mapping[str, Any], at: Mapping[str, Any], name: str) -> list[Any]:
     e = entry[name]
     return [
-        f"{LABELS[name]} [{UNITS[name]}]",
+        f"{_LABELS[name]} [{_UNITS[name]}]",
         at[name],
         _with_error(e["bias"], e["bias_se"]),
         _with(e["spread"], e["spread_ci95"]),
@@ -241,7 +251,7 @@ def _row(entry: Mapping[str, Any], at: Mapping[str, Any], name: str) -> list[Any
 def _coverage_row(entry: Mapping[str, Any], name: str) -> list[Any]:
     kinds = ("coverage68", "coverage95", "posterior_coverage68", "posterior_coverage95")
     shares = [_percent(entry[name][kind], entry[name][f"{kind}_ci95"]) for kind in kinds]
-    return [f"{LABELS[name]} [{UNITS[name]}]", *shares]
+    return [f"{_LABELS[name]} [{_UNITS[name]}]", *shares]
 
 
 def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
@@ -249,22 +259,22 @@ def benchmark_figures(study: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     for mode in MODES:
         if mode not in study:
             continue
+        names = _scored(study[mode])
         for axis, stem in (("photons", "photons"), ("z", "heights")):
             curve = study["curves"][axis][mode]
-            yield f"{stem}_{mode}", _panels(mode, partial(_draw_curve, axis, curve))
+            yield f"{stem}_{mode}", _panels(names, partial(_draw_curve, axis, curve))
         for kind, draw in (("pulls", _draw_pulls), ("ranks", _draw_ranks)):
             bins = study["histograms"][kind][mode]
             if bins:
-                yield f"{kind}_{mode}", _panels(mode, partial(draw, bins))
+                yield f"{kind}_{mode}", _panels(names, partial(draw, bins))
 
 
-def _panels(mode: str, draw: Callable[[Axes, str], None]) -> Figure:
-    names = FREE_PARAMETERS[mode]
+def _panels(names: Sequence[str], draw: Callable[[Axes, str], None]) -> Figure:
     figure = new_figure(2.9 * len(names), 2.9)
     for position, name in enumerate(names):
         axes = figure.add_subplot(1, len(names), position + 1)
         draw(axes, name)
-        axes.set_title(f"{LABELS[name]} [{UNITS[name]}]")
+        axes.set_title(f"{_LABELS[name]} [{_UNITS[name]}]")
         if position:
             axes.set_ylabel("")
     handles, labels = figure.axes[0].get_legend_handles_labels()

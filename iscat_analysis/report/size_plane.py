@@ -57,14 +57,16 @@ def size_plane(analysis: Analysis) -> Figure:
     axes = figure.subplots()
     ends = 0.7 * min(moved.min(), optical.min()), 1.3 * max(moved.max(), optical.max())
     diameters = np.linspace(*ends, _NODES)
-    own = sphere.index.real if abs(sphere.index.imag) < _STEP else None
-    for index in (*INDICES, own) if own is not None else ():
-        chosen = index == own
-        line = lengths(diameters, replace(sphere, index=complex(index)))
-        axes.plot(diameters, line, color=BLUE if chosen else GREY, lw=1.4 if chosen else 0.7)
+    own = "shell" if sphere.shell_nm else f"{sphere.index.real:.2f}"
+    drawn = [(f"{n:.2f}", replace(sphere, index=complex(n), shell_nm=0.0)) for n in INDICES]
+    absorbs = abs(sphere.index.imag) >= _STEP
+    for label, one in [] if absorbs else [*drawn, (own, sphere)]:
+        line = lengths(diameters, one)
+        color, width = (BLUE, 1.4) if one is sphere else (GREY, 0.7)
+        axes.plot(diameters, line, color=color, lw=width)
         axes.annotate(
-            f"{index:.2f}", (diameters[-1], line[-1]), color=BLUE if chosen else GREY,
-            fontsize="small", va="center", xytext=(3, 0), textcoords="offset points",
+            label, (diameters[-1], line[-1]), color=color, fontsize="small", va="center",
+            xytext=(3, 0), textcoords="offset points",
         )  # fmt: skip
     good = (tracks["status"] == str(TrackStatus.OK)).to_numpy()
     for rows, color, name in ((good, INK, "ok"), (~good, PURPLE, "flagged")):

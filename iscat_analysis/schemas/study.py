@@ -137,6 +137,7 @@ class ModeStudy(Document):
     y_nm: Score = key("Row")
     z_nm: Score = maybe("Height, where it is free")
     mass_kda: Score = maybe("Mass, where it is free")
+    diameter_nm: Score = maybe("Diameter of a sphere, where it is free")
     trials: Natural = key("Repetitions")
     failed: Count = key("Repetitions without an estimate")
     flagged: dict[str, Count] = maybe("Repetitions by status")
@@ -148,9 +149,10 @@ class ModeStudy(Document):
 class Benchmark(Document):
     """What iscat benchmark prints and writes as benchmark.json."""
 
-    mass: ModeStudy = key("Mode mass: bias, spread, bounds, coverage and pulls by parameter")
+    mass: ModeStudy = maybe("Mode mass: bias, spread, bounds, coverage and pulls by parameter")
+    size: ModeStudy = maybe("Mode size, likewise; of spheres, which have this in place of mass")
     localize: ModeStudy = key("Mode localize, likewise")
-    joint: ModeStudy = key("Mode joint, likewise")
+    joint: ModeStudy = maybe("Mode joint, likewise; not of spheres")
     estimators: dict[str, dict[str, Any]] = maybe(
         "With --estimator: by name and mode, as the estimators of a challenge's part"
     )

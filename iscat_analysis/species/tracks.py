@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.special import ndtri
+from scipy.special import logit, ndtri
 
 from iscat_analysis.records import (
     TRACK_COLUMNS,
@@ -64,8 +64,12 @@ COVERAGE = 0.95
 SLOWED = 0.05
 """Share by which a wall slows a particle before its size is remarked on."""
 
+SLOWED_BY_WALL = 9 / 32
+"""That share is this times diameter over height (H. Faxén, Ann. Phys. 373, 89, 1922)."""
+
 SURE_SIZE = 0.999
-"""Posterior probability of an optical diameter below which it is flagged as ambiguous."""
+"""Posterior probability of an optical diameter below which it is flagged as ambiguous, and of
+another particle from which it is flagged as that."""
 
 _FIRST_LOOK, _FULL_LOOK = 19, 199  # resamples: few unless they leave doubt
 _MOST_DOUBTFUL_SHARE = 0.1
@@ -340,13 +344,14 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
         TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
         TrackStatus.AMBIGUOUS_SIZE: record.get("optical_probability", 1.0) < SURE_SIZE,
+        TrackStatus.OTHER_PARTICLE: record.get("log_odds_particle", 0.0) < -float(logit(SURE_SIZE)),
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10
         or setup.change * abs(record["mass_kda"]) > record["sigma_mass_kda"],
         TrackStatus.PARTLY_SEEN: _is_partly_seen(record, setup),
         TrackStatus.SHORT_WAY: record["short_way"],
         TrackStatus.NOT_FREE: min(record[name] for name in _FREE) <= SURPRISING,
         TrackStatus.STANDS_STILL: record["d_low_um2_s"] == 0,
-        TrackStatus.NEAR_WALL: 9 / 32 * record["diameter_nm"] > SLOWED * record["z_nm"],
+        TrackStatus.NEAR_WALL: SLOWED_BY_WALL * record["diameter_nm"] > SLOWED * record["z_nm"],
     }
     return [status for status in TrackStatus if seen.get(status, False)]
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import tifffile
 
-from iscat_analysis.config import Config, config_to_toml, parse_config
+from iscat_analysis.config import Config, config_to_toml, parse_config, refuse_sphere
 from iscat_analysis.errors import DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.reading import is_file, read_bytes, read_json, toml_of
@@ -197,6 +197,7 @@ def draw_stack(setting: Setting, truth: FloatArray, random: np.random.Generator)
 
 
 def _write_stacks(part: Part, folder: Path, seed: Sequence[int]) -> list[dict[str, Any]]:
+    refuse_sphere(part.config, "challenges are of dipoles")
     setting = make_setting(part.config, part.config.fit.mode)
     (folder / "stacks").mkdir(exist_ok=True)
     pixel, centre = setting.context.pixel_nm, setting.truth

@@ -114,4 +114,5 @@ def calibrate_posterior(
 
     with threads(workers) as pool:
         done = list(pool.map(one, range(draws)))
-    return PosteriorRanks(setting.free, ranks, widths, inside[0], inside[1], draws - sum(done))
+    names = tuple(setting.scored)  # a rank is the same in the diameter as in the mass
+    return PosteriorRanks(names, ranks, widths, inside[0], inside[1], draws - sum(done))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.bounds import EventBounds, Experiment, plan
-from iscat_analysis.config import MOVING, Config, refuse_rod
+from iscat_analysis.config import MOVING, Config, refuse_rod, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.regions import Region, region_likelihood
@@ -31,6 +31,9 @@ START_PX = 1.0
 
 START_MASS = 1.5
 """Factor between a start's mass and the particle's, at most."""
+
+OF_DIPOLES, OF_SPHERES = ("mass", "localize", "joint"), ("size", "localize")
+"""Modes that fit dipoles, and those that fit spheres."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,15 @@ class Setting:
         return FREE_PARAMETERS[self.mode]
 
     @property
+    def scored(self) -> Mapping[str, int]:
+        """Names of what is scored, each with its place among the parameters.
+
+        In mode `size` the mass stands for the diameter, in which it is scored.
+        """
+        own = "diameter_nm" if self.mode == "size" else "mass_kda"
+        return {own if n == "mass_kda" else n: PARAMETERS.index(n) for n in self.free}
+
+    @property
     def pixels(self) -> int:
         """Side of the fitted square [pixels]."""
         return self.region.rows[1]
@@ -64,6 +76,30 @@ class Setting:
     def bounds(self) -> EventBounds:
         """Bounds over the free parameters, for all frames."""
         return self.experiment.bounds(self.free, level=self.level)
+
+    @property
+    def crb(self) -> FloatArray:
+        """Joint Cramér–Rao bounds of what is scored, shape (4,)."""
+        return self.in_diameters(self.truth, self.bounds.crb_joint)[1]
+
+    @property
+    def qcrb(self) -> FloatArray:
+        """Quantum bounds of what is scored, shape (4,)."""
+        return self.in_diameters(self.truth, self.bounds.qcrb)[1]
+
+    def in_diameters(self, values: FloatArray, errors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Give the diameter in place of the mass, in mode `size`, and its error.
+
+        Shapes: `values, errors` (…, 4).
+        """
+        if self.mode != "size":
+            return values, errors
+        values, errors = values.copy(), errors.copy()
+        particle, mass = self.config.particle, values[..., 3]
+        diameter = particle.nominal_diameter_nm * np.cbrt(mass / particle.nominal_mass_kda)
+        errors[..., 3] *= diameter / (3 * mass)
+        values[..., 3] = diameter
+        return values, errors
 
     @property
     def experiment_in_region(self) -> Experiment:
@@ -164,6 +200,11 @@ class Setting:
             "y_nm": float(self.truth[1] - centre),
             "z_nm": float(self.truth[2]),
             "mass_kda": float(self.truth[3]),
+            **(
+                {"diameter_nm": self.config.particle.nominal_diameter_nm}
+                if self.config.particle.is_sphere
+                else {}
+            ),
             "focus_nm": optics.focus_nm,
             "attenuation": optics.attenuation if self.context.model.rho else 0.0,
             "na": optics.na,
@@ -187,12 +228,9 @@ def make_setting(
     context: AnalysisContext | None = None,
 ) -> Setting:
     """Set up one experiment."""
-    refuse_rod(config, "these studies are of dipoles")
-    if config.particle.is_sphere:
-        raise ConfigError(
-            f'particle.model = "{config.particle.model}": these studies are of dipoles; simulate '
-            "spheres (iscat simulate) and fit them (iscat-fit --mode size)"
-        )
+    refuse_rod(config, "these studies are of dipoles and spheres")
+    if mode not in OF_SPHERES:
+        refuse_sphere(config, "challenges and the estimators of others are of dipoles")
     pixel_nm = config.camera.pixel_size_nm
     side = config.fit.roi_px(pixel_nm) if pixel_nm else config.bounds.pixels
     changes: dict[str, Mapping[str, Any]] = {

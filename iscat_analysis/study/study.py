@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.config import Config, config_to_toml
+from iscat_analysis.config import Config, config_to_toml, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, silent
 from iscat_analysis.report import atomic_folder, check_output
@@ -33,11 +33,8 @@ from iscat_analysis.study.scores import (
     share_interval,
     spread_interval,
 )
-from iscat_analysis.study.setting import Setting, make_setting
+from iscat_analysis.study.setting import OF_DIPOLES, OF_SPHERES, Setting, make_setting
 from iscat_analysis.study.trials import Trials, run_trials
-
-MODES = ("mass", "localize", "joint")
-"""What is studied, always in this order."""
 
 PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 """Collected scattered photons of the first curve."""
@@ -77,7 +74,7 @@ def run_benchmark(
     command: str = "",
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Measure what the fits achieve, in every mode, on synthetic shot noise.
+    """Measure what the fits achieve, in every mode of the particle, on synthetic shot noise.
 
     Other estimators then get counts of the same experiments, each the same.
     """
@@ -88,9 +85,12 @@ def run_benchmark(
     threads = config.compute.workers if workers is None else workers
     fewer = max(trials // CURVE_SHARE, LEAST_TRIALS)
     posteriors = max(trials // POSTERIOR_SHARE, MIN_TRIALS) if posterior else 0
-    settings = {mode: make_setting(config, mode) for mode in MODES}
+    if estimators:
+        refuse_sphere(config, "the estimators of others are of dipoles")
+    modes = OF_SPHERES if config.particle.is_sphere else OF_DIPOLES
+    settings = {mode: make_setting(config, mode) for mode in modes}
     tally = _Tally(
-        progress, len(MODES) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
+        progress, len(modes) * (trials + fewer * (len(PHOTONS) + HEIGHTS) + posteriors * 4)
     )
     study: dict[str, Any] = {}
     curves: dict[str, dict[str, Any]] = {"photons": {}, "z": {}}
@@ -99,7 +99,7 @@ def run_benchmark(
         stream = 100 * number
         found = run_trials(
             setting, trials, seed=seed, stream=stream, workers=threads,
-            baselines=Baselines.calibrated(setting), advance=tally,
+            baselines=None if mode == "size" else Baselines.calibrated(setting), advance=tally,
         )  # fmt: skip
         lower, upper = _prior(setting)
         ranked = calibrate_posterior(
@@ -118,7 +118,7 @@ def run_benchmark(
             "at": setting.described(),
         }
         histograms["pulls"][mode] = {
-            name: pull_histogram(_pull(found, PARAMETERS.index(name))) for name in setting.free
+            name: pull_histogram(_pull(found, k)) for name, k in setting.scored.items()
         }
         histograms["ranks"][mode] = _rank_histograms(ranked)
         faintest = make_setting(config, mode, collected=PHOTONS[0], context=setting.context)
@@ -198,12 +198,11 @@ def _pull(trials: Trials, k: int) -> FloatArray:
 
 def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
     """Score every free parameter."""
-    bounds, kept = setting.bounds, found.usable
+    (crbs, qcrbs), kept = (setting.crb, setting.qcrb), found.usable
     error = found.estimate - found.truth
     out: dict[str, Any] = {}
-    for i, name in enumerate(setting.free):
-        k = PARAMETERS.index(name)
-        crb, qcrb = float(bounds.crb_joint[k]), float(bounds.qcrb[k])
+    for i, (name, k) in enumerate(setting.scored.items()):
+        crb, qcrb = float(crbs[k]), float(qcrbs[k])
         own = score(error[kept, k], found.sigma[kept, k], crb, qcrb)
         baselines = {}
         for label, other in (("gaussian", found.gauss), ("peak", found.peak)):
@@ -257,49 +256,52 @@ def _curve(
     tally: _Tally,
 ) -> dict[str, Any]:
     """Tabulate spread and bounds along an axis, for every free parameter."""
-    free = settings[0].free
+    scored = settings[0].scored
     out: dict[str, Any] = {"at": values, "trials": trials, "failed": [], "ambiguous": []}
     kinds = ("spread", "spread_ci95", "bias", "crb", "qcrb")
-    lines: dict[str, dict[str, list[Any]]] = {n: {kind: [] for kind in kinds} for n in free}
+    lines: dict[str, dict[str, list[Any]]] = {n: {kind: [] for kind in kinds} for n in scored}
     for number, setting in enumerate(settings):
         found = run_trials(
             setting, trials, seed=seed, stream=stream + number, workers=workers, advance=tally
         )
         out["failed"].append(int(found.failed.sum()))
-        out["ambiguous"].append(int(found.flagged(Status.AMBIGUOUS_Z).sum()))
-        bounds, kept = setting.bounds, found.usable
-        for name in free:
-            k = PARAMETERS.index(name)
+        out["ambiguous"].append(int(found.ambiguous.sum()))
+        (crb, qcrb), kept = (setting.crb, setting.qcrb), found.usable
+        for name, k in scored.items():
             error = found.estimate[kept, k] - found.truth[kept, k]
             enough = error.size >= MIN_TRIALS
             line = lines[name]
             line["spread"].append(float(np.std(error, ddof=1)) if enough else math.nan)
             line["spread_ci95"].append(spread_interval(error) if enough else (math.nan, math.nan))
             line["bias"].append(float(np.mean(error)) if enough else math.nan)
-            line["crb"].append(float(bounds.crb_joint[k]))
-            line["qcrb"].append(float(bounds.qcrb[k]))
+            line["crb"].append(float(crb[k]))
+            line["qcrb"].append(float(qcrb[k]))
     return {**out, **lines}
 
 
 def _bounds_along(config: Config, setting: Setting) -> dict[str, Any]:
     """Tabulate the bounds between the heights of the curve: fringes are narrower than its steps."""
-    heights = np.linspace(*config.fit.z_range_nm, FINE_HEIGHTS)
-    bounds = [
-        make_setting(config, setting.mode, z_nm=float(z), context=setting.context).bounds
-        for z in heights
+    heights = np.linspace(*_heights_of(config), FINE_HEIGHTS)
+    settings = [
+        make_setting(config, setting.mode, z_nm=float(z), context=setting.context) for z in heights
     ]
+    crb, qcrb = (np.array([getattr(s, kind) for s in settings]) for kind in ("crb", "qcrb"))
     lines = {
-        name: {
-            "crb": [float(b.crb_joint[PARAMETERS.index(name)]) for b in bounds],
-            "qcrb": [float(b.qcrb[PARAMETERS.index(name)]) for b in bounds],
-        }
-        for name in setting.free
+        name: {"crb": crb[:, k].tolist(), "qcrb": qcrb[:, k].tolist()}
+        for name, k in setting.scored.items()
     }
     return {"at": heights.tolist(), **lines}
 
 
-def _heights(config: Config) -> list[float]:
+def _heights_of(config: Config) -> tuple[float, float]:
+    """Give the heights that are searched, as far as a sphere is not inside the coverslip."""
     low, high = config.fit.z_range_nm
+    radius = config.particle.nominal_diameter_nm / 2 if config.particle.is_sphere else low
+    return max(low, radius), high
+
+
+def _heights(config: Config) -> list[float]:
+    low, high = _heights_of(config)
     inset = (high - low) / (2 * HEIGHTS)
     return [float(z) for z in np.linspace(low + inset, high - inset, HEIGHTS)]
 

@@ -27,7 +27,7 @@ CHUNK = 16
 
 @dataclass(frozen=True)
 class Trials:
-    """Estimates of repeated experiments."""
+    """Estimates of repeated experiments: x, y, z and mass, or in mode `size` the diameter."""
 
     truth: FloatArray
     estimate: FloatArray
@@ -51,8 +51,13 @@ class Trials:
 
     @property
     def usable(self) -> BoolArray:
-        """Fits that a user would keep: neither failed nor of ambiguous height, shape (n,)."""
-        return ~self.failed & ~self.flagged(Status.AMBIGUOUS_Z)
+        """Fits that a user would keep: neither failed nor ambiguous, shape (n,)."""
+        return ~self.failed & ~self.ambiguous
+
+    @property
+    def ambiguous(self) -> BoolArray:
+        """Fits of which another height or diameter is likely, shape (n,)."""
+        return self.flagged(Status.AMBIGUOUS_Z) | self.flagged(Status.AMBIGUOUS_SIZE)
 
     @property
     def unflagged(self) -> BoolArray:
@@ -120,6 +125,8 @@ def run_trials(
     with threads(workers) as pool:
         seconds = sum(pool.map(work, range(0, count, chunk)))
     found = [fit for fit in fits if fit is not None]
+    estimate, sigma = setting.in_diameters(estimate, sigma)
+    truth, _ = setting.in_diameters(truth, sigma)
     return Trials(
         truth=truth,
         estimate=estimate,

@@ -2,6 +2,11 @@
 
 fits of single frames → D of each track → images averaged along its path → one diameter for all
 frames → fits of single frames with those images, near that diameter
+
+Images and motion together then compare two explanations of a track: the configured particle with
+any diameter, and a homogeneous sphere of any diameter and any refractive index up to
+`LARGEST_INDEX`.  Small spheres of both kinds have the same images, and only the diameter from the
+motion tells them apart; the light of larger ones says how far their matter lies from the centre.
 """
 
 from __future__ import annotations
@@ -24,12 +29,14 @@ from iscat_analysis.inference.common_size import (
     fit_common_size,
 )
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
+from iscat_analysis.optics.seated import LARGEST_INDEX, LEAST_CONTRAST
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
 from iscat_analysis.species.diffusion import estimate_diffusion, hydrodynamic_diameter
 from iscat_analysis.species.displacements import LEAST_POSITIONS
-from iscat_analysis.species.tracks import Correlation
+from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
 from iscat_analysis.tracking.moving_field import exposure_of
 from iscat_analysis.tracking.paths import ALONG, path_shifts_at
 
@@ -56,9 +63,12 @@ class SphereTrack:
     """Of the mass in each frame that is used, for one standard deviation of its path: (frames, 9),
     and for that of D: (frames,) in the last column."""
 
-    refraction: CommonSize | None = None
-    """Mass and index from images and motion together; none where the material absorbs light, or
-    D is not known."""
+    configured: CommonSize | None = None
+    """Mass of the configured particle from images and motion together; none where the material
+    absorbs light, or D is not known."""
+
+    homogeneous: CommonSize | None = None
+    """Mass and index of a homogeneous sphere, likewise."""
 
 
 def sphere_track(
@@ -104,25 +114,59 @@ def sphere_track(
         of_used = path_shifts_at(*place, sizes[0].places[:, 2], start_kda, variance)[:, 3]
         wider = of_used[:, :3].sum(axis=1) / ALONG * (sigma_d / d_um2_s)
         shifts = np.column_stack([of_used, wider])
-    refraction = None
+    configured = homogeneous = None
     if d_um2_s > 0 and abs(model.sphere.index.imag) < LEAST_ABSORPTION and sizes[0].converged:
-        refraction = fit_common_size(
-            [event.likelihood for event in used], averaged, sizes[0].places,
-            context.config.fit.z_range_nm,
-            mass_kda=sizes[0].mass_kda,
-            index=model.sphere.index.real,
-            motion=_motion(context.config, d_um2_s, sigma_d),
+        motion = _motion(context.config, d_um2_s, sigma_d, sizes[0])
+        likelihoods = [event.likelihood for event in used]
+        configured, homogeneous = (
+            explained(likelihoods, averaged, sizes, context.config.fit.z_range_nm, motion, free)
+            for free in (False, True)
+        )
+    return SphereTrack(averaged, fitted, sizes, shifts, configured, homogeneous)
+
+
+def explained(
+    likelihoods: Sequence[Likelihood],
+    model: SizedModel,
+    sizes: Sequence[CommonSize],
+    z_range_nm: tuple[float, float],
+    motion: tuple[float, float],
+    free_index: bool,
+) -> CommonSize | None:
+    """Fit images and motion with the configured particle, or a homogeneous sphere of any index.
+
+    The fits begin at every likely diameter.
+    """
+    found = []
+    for size in sizes:
+        tried, index = model, None
+        if free_index:
+            alike = model.sphere.of_mass(size.mass_kda).homogeneous()
+            tried, index = replace(model, sphere=alike), alike.index.real
+        one = fit_common_size(
+            likelihoods, tried, size.places, z_range_nm,
+            mass_kda=size.mass_kda, index=index, motion=motion,
         )  # fmt: skip
-    return SphereTrack(averaged, fitted, sizes, shifts, refraction)
+        if one is not None and one.converged:
+            found.append(one)
+    return max(found, key=lambda one: one.log_likelihood, default=None)
 
 
-def _motion(config: Config, d_um2_s: float, sigma_d: float) -> tuple[float, float]:
-    """Give 1/d of the hydrodynamic diameter, which goes with D, and its error [1/nm]."""
+def _motion(
+    config: Config, d_um2_s: float, sigma_d: float, size: CommonSize
+) -> tuple[float, float]:
+    """Give 1/d of the hydrodynamic diameter, which goes with D, and its error [1/nm].
+
+    Its error has the share by which the coverslip may slow the sphere, 9 d/(32 z).
+    """
     track = config.track
     diameter, _ = hydrodynamic_diameter(
         d_um2_s, viscosity_mpa_s=track.viscosity_mpa_s, temperature_c=track.temperature_c
     )
-    return 1 / float(diameter), sigma_d / d_um2_s / float(diameter)
+    slowed = SLOWED_BY_WALL * float(
+        np.mean(1 / np.maximum(size.places[:, 2] / float(diameter), 0.5))
+    )
+    return 1 / float(diameter), math.hypot(sigma_d / d_um2_s, slowed) / float(diameter)
 
 
 def _diffusion(context: AnalysisContext, events: Sequence[Event]) -> tuple[float, float]:
@@ -176,7 +220,7 @@ def _record(track: SphereTrack, correlation: Correlation | None) -> dict[str, fl
     per_kda = diameter / (3 * mass)
     weights = [one.log_weight - best.log_weight for one in track.sizes if one.converged]
     known = math.nan if not best.converged else 1.0
-    return _refraction(track, among, (own + paths) / own) | {
+    return _refraction(track, among, (own + paths) / own) | _odds(track, (own + paths) / bound) | {
         "mass_kda": known * mass, "sigma_mass_kda": known * sigma,
         "crb_mass_kda": known * math.sqrt(bound),
         "optical_diameter_nm": known * diameter,
@@ -190,11 +234,30 @@ def _refraction(
     track: SphereTrack, correlation: FloatArray | None, excess: float
 ) -> dict[str, float]:
     """Give the refractive index and its error, where images and motion determine them."""
-    found, n_sample = track.refraction, track.model.optics.n_sample
-    if found is None or not found.converged:
+    found, n_sample = track.homogeneous, track.model.optics.n_sample
+    if found is None:
         return {}
     index = found.index - float(found.bias[1])
     error = math.sqrt(found.covariance(correlation, excess=excess)[1, 1])
     if not error < UNDETERMINED * abs(index - n_sample):
         return {}
     return {"refractive_index": index, "sigma_refractive_index": error}
+
+
+def _odds(track: SphereTrack, excess: float) -> dict[str, float]:
+    """Compare the configured particle with homogeneous spheres whose index may be any.
+
+    Each has its likelihood times the volume of its parameters, by Laplace's method; before, all
+    diameters are equally likely, and all logarithms of n − n_s.  The noise that frames share counts
+    once: the difference of the log-likelihoods is over `excess`, the variance of the diameter over
+    what it would be in frames of their own.
+    """
+    own, other = track.configured, track.homogeneous
+    if own is None or other is None:
+        return {}
+    gain = own.log_likelihood - other.log_likelihood
+    volumes = own.log_weight - other.log_weight - gain
+    n_sample = track.model.optics.n_sample
+    range_of_index = math.log((LARGEST_INDEX - n_sample) / LEAST_CONTRAST)
+    prior = math.log(abs(other.index - n_sample) * range_of_index)
+    return {"log_odds_particle": gain / excess + volumes + prior}

@@ -363,6 +363,20 @@ def test_a_shell_of_the_same_index_is_none() -> None:
     assert np.abs(vesicle).max() < 0.7 * np.abs(solid).max()
 
 
+def test_a_small_sphere_with_a_shell_scatters_like_one_without() -> None:
+    """Of the index that Bohren and Huffman give, to the second order in its size."""
+    pytest.importorskip("scattnlay")
+    mu = np.array([-1.0, -0.5, 0.3], dtype=complex)
+    for core in (1.33, 1.38, 1.6, 0.5 + 2.2j):
+        shelled = Sphere(1.0, 1350.0, complex(core), shell_nm=0.5, shell_index=1.46)
+        alike = shelled.homogeneous()
+        assert alike.shell_nm == 0
+        own, other = (one.pattern(mu, 1.0, 1.33, 2 * np.pi / 525)[1] for one in (shelled, alike))
+        assert np.allclose(own, other, rtol=1e-3)
+    plain = Sphere(1.0, 1350.0, 1.46 + 0j)
+    assert plain.homogeneous() == plain
+
+
 def test_contrasts_that_are_all_wrong_make_masses_of_spheres_wrong_by_more() -> None:
     """Against a least-squares fit of a picture that is one per cent stronger."""
     config = of("iscat", particle={"diameter_nm": 180.0, "height_nm": "contact"})

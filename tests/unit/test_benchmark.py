@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from iscat_analysis.study import (
     pull_histogram,
     rank_test,
     run_benchmark,
+    run_trials,
     score,
     share_interval,
     spread_error,
@@ -181,6 +183,36 @@ def test_expected_counts_give_back_the_truth() -> None:
     score_vector = likelihood.score_fisher(theta)[1]
     sigma = 1 / np.sqrt(np.diag(likelihood.score_fisher(theta)[2]))
     assert np.abs(score_vector * sigma)[:4].max() < 1e-6
+
+
+SPHERE: dict[str, dict[str, object]] = {
+    "particle": {"kind": "silica", "model": "mie", "mass_kda": None, "diameter_nm": 120.0},
+    "calibration": None,  # type: ignore[dict-item]
+    "fit": {"mode": "size", "roi_nm": 900.0, "z_range_nm": [0.0, 300.0]},
+    "bounds": {"photons_per_pixel": 2e3},
+}
+
+
+def test_spheres_are_scored_in_their_diameter(repetitions: Callable[[int, int], int]) -> None:
+    """Pulls and efficiency; the diameter's bound is that of the mass over dm/dd."""
+    made = make_setting(configuration(**SPHERE), "size")
+    assert list(made.scored) == ["x_nm", "y_nm", "z_nm", "diameter_nm"]
+    mass, bound = made.truth[3], made.bounds.crb_joint[3]
+    assert made.crb[3] == pytest.approx(bound * 120.0 / (3 * mass))
+    trials = repetitions(30, 300)
+    found = run_trials(made, trials, seed=1)
+    error = (found.estimate - found.truth)[found.usable, 3]
+    assert found.truth[0, 3] == pytest.approx(120.0)
+    assert len(error) == trials
+    doubt = 4 / math.sqrt(trials)
+    assert abs(np.mean(error)) < doubt * made.crb[3]
+    for width in (made.crb[3], found.sigma[:, 3]):
+        assert abs(np.std(error / width) - 1) < doubt / math.sqrt(2)
+
+
+def test_what_others_do_is_of_dipoles() -> None:
+    with pytest.raises(ConfigError, match="of dipoles"):
+        make_setting(configuration(**SPHERE), "mass")
 
 
 def test_baselines_are_exact_without_noise() -> None:

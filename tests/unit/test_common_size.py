@@ -20,6 +20,7 @@ from iscat_analysis.optics.blur import wiggled
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import Candidate, Status
+from iscat_analysis.tracking.sizes import SphereTrack, explained, table_of_sizes
 
 FloatArray = NDArray[np.float64]
 
@@ -109,6 +110,42 @@ def test_index_and_diameter_need_the_motion_of_a_small_sphere() -> None:
     sizes, axes = np.linalg.eigh(scale @ joint.information.sum(axis=0) @ scale)
     assert sizes[1] > 1e3 * sizes[0]
     assert abs(axes[:, 1] @ [3, 1]) / math.sqrt(10) == pytest.approx(1, abs=0.02)
+
+
+def log_odds(model: SizedModel, true: SizedModel, light_e: float, seed: int) -> float:
+    """Log-odds of the particle of a model in ten frames of another, whose D is known to 15 %."""
+    rng = np.random.default_rng(seed)
+    likelihoods, places = frames_of(true, 10, light_e, rng)
+    diameter = true.sphere.diameter_nm
+    motion = rng.normal(1.0, 0.15) / diameter, 0.15 / diameter
+    likelihoods = [replace(one, model=model) for one in likelihoods]
+    sizes = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)
+    both = [
+        explained(likelihoods, model, sizes, Z_RANGE_NM, motion, free) for free in (False, True)
+    ]
+    track = SphereTrack(model, [], sizes, np.zeros((10, 10)), *both)
+    return float(table_of_sizes({0: track}, None)["log_odds_particle"].iloc[0])
+
+
+def test_tracks_of_another_material_are_told() -> None:
+    """Ten images of 150 nm know n − n_s to a few per cent, whatever the motion says."""
+    silica = model_of(150.0)
+    other = model_of(150.0, kind="custom", index=1.43, density_kg_m3=2200.0)
+    assert log_odds(silica, silica, 3000.0, seed=3) > 0
+    assert log_odds(other, silica, 3000.0, seed=3) < -math.log(1000)
+
+
+@pytest.mark.large
+def test_vesicles_are_told_from_solid_spheres() -> None:
+    """Those of 200 nm in ten frames are; those of 60 nm look like a solid sphere of n = 1.384."""
+    pytest.importorskip("scattnlay")
+    matter = {"kind": "custom", "density_kg_m3": 1010.0}
+    shell = {**matter, "model": "shell", "index": 1.33, "shell_nm": 5.0, "shell_index": 1.46}
+    large, small = model_of(200.0, **shell), model_of(60.0, **shell)
+    assert log_odds(large, large, 1e5, seed=4) > math.log(1000)
+    assert 0 < log_odds(small, small, 1e5, seed=4) < math.log(1000)
+    solid = model_of(150.0, index=1.36, **matter)
+    assert log_odds(large, solid, 1e5, seed=4) < -math.log(1000)
 
 
 def test_a_sphere_that_wiggles_is_averaged_at_every_diameter() -> None:

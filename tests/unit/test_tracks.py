@@ -324,6 +324,11 @@ def test_masses_of_the_exact_likelihood_take_the_place_of_means() -> None:
     )
     found, mean = describe_tracks(fits, SETUP, masses=exact), describe_tracks(fits, SETUP)
     assert found[list(exact)].iloc[0].tolist() == [390.0, 2.0, 1.9]
+    assert "other_particle" not in found["flags"].iloc[0]
+    exact["log_odds_particle"] = -7.0  # 1 : 1097
+    other = describe_tracks(fits, SETUP, masses=exact).iloc[0]
+    assert other["log_odds_particle"] == -7.0
+    assert "other_particle" in other["flags"]
     assert abs(found["contrast"].iloc[0] + 3.1e-5 * 390) < 1e-12
     assert found["mass_kda"].iloc[1] == mean["mass_kda"].iloc[1]
 
