@@ -10,8 +10,9 @@ of any length takes the room of a block.  Reported are megabytes of input per se
 time, the peak memory of all its processes and the seconds of its parts.  Of three series, in
 pixels, frames and particles, the slope of processor time is printed, on logarithmic scales: a job
 costs what its start costs, a job of the smallest kind, and what grows; the growing part may have a
-slope of 1.05 at most.  From one and two workers, and jobs of one and several chunks, follow what a
-job costs once, per chunk and per megabyte; more workers are extrapolated from that.
+slope of 1.05 at most.  From all jobs, and the longest one in a quarter of the memory, follow what a
+job costs once, per part (a chunk or a tile of one), per megabyte and per event.  More workers are
+extrapolated from that: parts are whole, and the process of the command hashes the movie meanwhile.
 
 ``--sensor`` analyses two movies of 1200 × 1920 pixels, of as many frames as it is given, and says
 what the longer one has more: speed, memory, and what a recording of 46 GB takes by that.
@@ -24,6 +25,7 @@ Exit status 1 where a slope or the memory breaks its promise.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import os
@@ -52,6 +54,8 @@ LARGEST_SLOPE, MOST_MEMORY_MB = 1.05, 1500.0
 SENSOR, SENSOR_PARTICLES, RECORDING_FRAMES, LEAST_MB_PER_S = (1200, 1920), 200, 10_000, 250.0
 BLOCK, LIGHT_ADU, HALF_PX = 400, 25_000.0, 40
 WORKERS = (1, 2, 4, 8, 16, 32, 64, 128)
+PER = ("once", "per part", "per MB", "per event")
+LONGER = 100  # times the longest movie, in parts of the same size
 MASSES_KDA = (66.0, 146.0, 480.0)
 
 
@@ -186,13 +190,44 @@ def slope(costs: Sequence[Cost], along: str, start_s: float) -> tuple[float, flo
     return value, math.sqrt(float(rest @ rest / (x @ x)) / free) if free else math.nan
 
 
-def parts_of_time(costs: Sequence[Cost]) -> tuple[float, float, float]:
-    """Fit what a job costs once, per part and per megabyte [processor seconds]."""
-    design = np.array([[1.0, c.chunks * c.tiles, c.job.megabytes] for c in costs])
+def amounts(cost: Cost) -> tuple[float, float, float, float]:
+    """Count what a job has: itself, its parts, megabytes and events."""
+    return 1.0, cost.chunks * cost.tiles, cost.job.megabytes, cost.events
+
+
+def prices(costs: Sequence[Cost]) -> tuple[np.ndarray, np.ndarray]:
+    """Fit what each of these costs, and the standard errors [processor seconds].
+
+    Errors of jobs are taken to be alike relative to what they take.
+    """
     weight = 1 / np.array([c.processor_s for c in costs])
-    # no part costs less than nothing
-    found, _ = nnls(design * weight[:, None], np.ones(len(costs)))
-    return float(found[0]), float(found[1]), float(found[2])
+    design = np.array([amounts(c) for c in costs]) * weight[:, None]
+    found, rest = nnls(design, np.ones(len(costs)))  # none costs less than nothing
+    used = found > 0
+    free = len(costs) - used.sum()
+    errors = np.full(len(found), math.nan)
+    if free > 0:
+        inverse = np.linalg.inv(design[:, used].T @ design[:, used])
+        errors[used] = rest * np.sqrt(np.diag(inverse) / free)
+    return found, errors
+
+
+def efficiency(
+    price: np.ndarray, amount: Sequence[float], hash_mb_per_s: float
+) -> dict[int, float]:
+    """Predict the share of so many workers' time that is spent on work.
+
+    The command does what is done once, by itself.  Workers have whole parts, and the command hashes
+    the movie while they work; a single worker is the command itself.
+    """
+    once, shared = price[0] * amount[0], float(np.dot(price[1:], amount[1:]))
+    hashing = amount[2] / hash_mb_per_s
+    predicted = {1: 1.0}
+    for number in WORKERS[1:]:
+        rounds = math.ceil(amount[1] / number) / amount[1]
+        elapsed = once + max(rounds * (shared - hashing), hashing)
+        predicted[number] = (once + shared) / (number * elapsed)
+    return predicted
 
 
 def sensor(options: argparse.Namespace, folder: Path) -> int:
@@ -227,7 +262,7 @@ def judged(promises: dict[str, bool]) -> int:
 
 
 def limits(folder: Path) -> dict[str, float]:
-    """Measure how fast memory is copied, and how fast a file is read that is in no cache [MB/s]."""
+    """Measure how fast memory is copied and hashed, and a file read that is in no cache [MB/s]."""
     block = np.zeros(2**27, dtype=np.uint8)
     copy = np.empty_like(block)
     seconds = []
@@ -235,6 +270,9 @@ def limits(folder: Path) -> dict[str, float]:
         start = time.process_time()
         copy[:] = block
         seconds.append(time.process_time() - start)
+    start = time.process_time()
+    hashlib.sha256(copy).digest()
+    hashed = copy.size / 1e6 / (time.process_time() - start)
     path = folder / "disk"
     path.write_bytes(np.random.default_rng(0).bytes(2**28))
     with path.open("rb") as file:
@@ -246,7 +284,11 @@ def limits(folder: Path) -> dict[str, float]:
             pass
         disk = 2**28 / 1e6 / (time.perf_counter() - start)
     path.unlink()
-    return {"memory_copy_mb_per_s": block.size / 1e6 / min(seconds), "disk_mb_per_s": disk}
+    return {
+        "memory_copy_mb_per_s": block.size / 1e6 / min(seconds),
+        "disk_mb_per_s": disk,
+        "hash_mb_per_s": hashed,
+    }
 
 
 def series(options: argparse.Namespace) -> dict[str, list[Job]]:
@@ -309,13 +351,17 @@ def main() -> int:
         }
         long = found["frames"][-1].job
         alone = measure(Job(**{**asdict(long), "workers": 1}), folder, options.memory_mb)
-    every = [start, *(cost for costs in found.values() for cost in costs)]
+        divided = measure(long, folder, options.memory_mb // 4)
+    every = [start, *(cost for costs in found.values() for cost in costs), divided]
     slopes = {along: slope(costs, along, start.processor_s) for along, costs in found.items()}
-    once, per_part, per_mb = parts_of_time(every)
+    price, errors = prices(every)
     two = found["frames"][-1]
-    efficiency = alone.processor_s / two.processor_s
-    shared = per_part * two.chunks * two.tiles + per_mb * long.megabytes
-    predicted = {n: (once + shared) / (n * (once + shared / n)) for n in WORKERS}
+    of_two = alone.processor_s / two.processor_s
+    one, *growing = amounts(divided)
+    predicted = {
+        times: efficiency(price, (one, *(times * n for n in growing)), bounds["hash_mb_per_s"])
+        for times in (1, LONGER)
+    }
     rate = max(c.job.megabytes / c.processor_s for c in every)
     for along, (value, error) in slopes.items():
         print(
@@ -323,11 +369,20 @@ def main() -> int:
             f"{LARGEST_SLOPE})"
         )
     print(
-        f"a job costs {once:.2f} s, {per_part:.3f} s for each part and {1e3 * per_mb:.2f} ms per MB"
+        "a job costs, in processor seconds: "
+        + ", ".join(
+            f"{value:.4f} ± {error:.4f} {per}"
+            for value, error, per in zip(price, errors, PER, strict=True)
+        )
     )
-    print(f"two workers: {efficiency:.2f} of the processor time of one is not lost")
-    print("efficiency by that model: " + ", ".join(f"{n}: {e:.2f}" for n, e in predicted.items()))
-    close = [name for name, speed in bounds.items() if rate > speed / 2]
+    print(f"two workers take {1 / of_two:.2f} times the processor time of one")
+    for times, each in predicted.items():
+        print(
+            f"efficiency by that for {times * long.megabytes / 1e3:.1f} GB in "
+            f"{times * growing[0]:g} parts: "
+            + ", ".join(f"{n}: {value:.2f}" for n, value in each.items())
+        )
+    close = [name for name in ("memory_copy_mb_per_s", "disk_mb_per_s") if rate > bounds[name] / 2]
     print(
         f"limits: memory is copied at {bounds['memory_copy_mb_per_s']:.0f} MB/s, the disk gives "
         f"{bounds['disk_mb_per_s']:.0f} MB/s; the fastest job takes {rate:.0f} MB per "
@@ -336,8 +391,8 @@ def main() -> int:
     memory = max(c.peak_memory_mb for c in every)
     numbers = {
         "limits": bounds, "jobs": [asdict(c) for c in (*every, alone)], "slopes": slopes,
-        "once_s": once, "per_part_s": per_part, "per_mb_s": per_mb,
-        "efficiency_of_two": efficiency, "efficiency_predicted": predicted,
+        "prices_s": dict(zip(PER, price.tolist(), strict=True)),
+        "efficiency_of_two": of_two, "efficiency_predicted": predicted,
         "peak_memory_mb": memory,
     }  # fmt: skip
     RESULTS.mkdir(exist_ok=True)

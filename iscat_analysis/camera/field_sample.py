@@ -8,6 +8,7 @@ squares scatter by more where the field is not alike everywhere, and that scatte
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -105,32 +106,39 @@ class FieldSample:
         }
 
 
-class SampledFrames:
-    """Frames of a movie, of which only a sample of the pixels is kept."""
+class CutFrames:
+    """Frames of a movie, of which only some of the pixels are kept.
 
-    def __init__(self, movie: CountSource, sample: FieldSample) -> None:
-        self._movie, self._sample = movie, sample
-        side = _SIDE * _ALONG
-        self.shape = (movie.shape[0], side, side)
+    Where frames lie in the file as they are, the others are not read.
+    """
+
+    def __init__(
+        self,
+        movie: CountSource,
+        shape: tuple[int, int],
+        cut: Callable[[NDArray[Any]], NDArray[Any]],
+    ) -> None:
+        self._movie, self._cut = movie, cut
+        self.shape = (movie.shape[0], *shape)
         self.name, self.dtype = movie.name, movie.dtype
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames.
 
-        Shapes: result (stop − start, 256, 256).
+        Shapes: result (stop − start, y, x).
         """
-        movie, sample = self._movie, self._sample
+        movie = self._movie
         placed = movie.in_place(start, stop) if isinstance(movie, PlacedSource) else None
         if placed is not None:
             placed.check()
-            out = sample.taken(placed.counts)
+            out = np.array(self._cut(placed.counts))
             placed.let_go()
             return out
         step = max(1, _READ_BYTES // (math.prod(movie.shape[1:]) * movie.dtype.itemsize))
         out = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
         for first in range(start, stop, step):
             end = min(first + step, stop)
-            out[first - start : end - start] = sample.taken(movie.read(first, end))
+            out[first - start : end - start] = self._cut(movie.read(first, end))
         return out
 
 
@@ -139,7 +147,8 @@ def sampled(movie: CountSource, camera: Camera) -> tuple[CountSource, Camera]:
     sample = FieldSample.of((movie.shape[1], movie.shape[2]))
     if sample is None:
         return movie, camera
-    return SampledFrames(movie, sample), sample.camera(camera)
+    side = _SIDE * _ALONG
+    return CutFrames(movie, (side, side), sample.taken), sample.camera(camera)
 
 
 def whole_frames(shape: tuple[int, ...], most: int, least: int = 16) -> int:

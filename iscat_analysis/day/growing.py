@@ -2,12 +2,13 @@
 
 The file is looked at again and again.  Each time it has grown by half, the frames that it holds are
 analysed and the masses are told as a histogram, so that all of these together cost twice the last
-one.  Once it rests, the whole movie is analysed as `iscat fit` does it, with the same result.
+one.  Once it rests, the whole movie is analysed as `iscat fit` does it, with the same result; if
+the file has grown meanwhile, because the camera had only paused, once more.
 """
 
 from __future__ import annotations
 
-import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,12 +16,15 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import ConfigError, IscatError
+from iscat_analysis.errors import ConfigError, DataError, IscatError
+from iscat_analysis.fitting.checkpoint import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.folders import files_of
+from iscat_analysis.movie.mapped import Writer, writer_of
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import Analysis, Progress, Status, silent
+from iscat_analysis.report.output import check_output
 from iscat_analysis.units import count
 
 RESTS = 3
@@ -41,9 +45,7 @@ def watch_movie(
     config: Config,
     *,
     out: Path,
-    overwrite: bool = False,
     interval_s: float = 10.0,
-    stop: threading.Event | None = None,
     progress: Progress = silent,
     notify: Notify = lambda _: None,
     command: str = "",
@@ -51,15 +53,27 @@ def watch_movie(
     """Analyse a movie while it is being recorded, and all of it once the file rests."""
     path = path_in("`movie`", movie)
     number_in("`interval_s`", interval_s, above=0.0)
-    ended, seen = stop or threading.Event(), _Growing(path, config, notify)
+    check_output(out, is_resumable(out))  # now, and not when the recording is over
+    seen, ours = _Growing(path, config, notify), False
     notify(f"looks at {path} every {interval_s:g} s, until it no longer grows")
-    while not (seen.rests() or ended.is_set()):
-        seen.analyse_what_is_there()
-        ended.wait(interval_s)
-    return fit_stack(
-        path, config, out=out, overwrite=overwrite, progress=progress, notify=notify,
-        command=command,
-    )  # fmt: skip
+    while True:
+        while not seen.rests():
+            seen.analyse_what_is_there()
+            time.sleep(interval_s)
+        notify(f"{path.name}: has not changed for {RESTS * interval_s:g} s; all of it is analysed")
+        try:
+            found = fit_stack(
+                path, config, out=out, overwrite=ours, progress=progress, notify=notify,
+                command=command,
+            )  # fmt: skip
+        except DataError:  # as of a file that was written to while it was read
+            if seen.rests():
+                raise
+        else:
+            if seen.rests():
+                return found
+            ours = True
+        notify(f"{path.name}: was written to meanwhile, and is watched again")
 
 
 class _Growing:
@@ -80,13 +94,23 @@ class _Growing:
             return False
         self._looks = self._looks + 1 if found == self._state else 0
         self._state = found
-        return bool(found) and self._looks >= RESTS
+        if not found or self._looks < RESTS:
+            return False
+        written = any(writer_of(Path(name)) is Writer.WITH_READERS for name, *_ in found)
+        if written:
+            self._say(
+                f"{self._path.name}: rests, but a program has it open to write and is waited for; "
+                "if that program is gone, press Ctrl-C: `iscat fit` analyses what it wrote"
+            )
+        return not written
 
     def analyse_what_is_there(self) -> None:
         """Analyse the frames that are there, if they are many more than before."""
         try:
             with open_stack(self._path) as movie:
                 frames = movie.shape[0]
+                if frames < self._analysed:  # the recording was begun again
+                    self._analysed = 0
                 if frames < max(_FEWEST_FRAMES, GROWTH * self._analysed):
                     return
                 # as an array, because a file that grows has no hash

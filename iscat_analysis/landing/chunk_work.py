@@ -163,7 +163,7 @@ def analyse_chunk(
         repeats=np.array([step.repeats for step in steps]),
         evidence=evidence_beside(context, events, mapper=pool.map),
         views=tuple(
-            _view_moved(
+            view_moved(
                 view_of(n, events[n], posterior=chains.get(n), trace=trace, clip=clip), corner
             )
             for n, (trace, clip) in enumerate(shown)
@@ -201,7 +201,7 @@ def _moved(lines: pd.DataFrame, corner: tuple[int, int], pixel_nm: float) -> pd.
     return lines.assign(**{name: lines[name] + shift for name, shift in shifts.items()})
 
 
-def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
+def view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
     """Count the pixels of a view from the corner of the field."""
     y, x = corner
     return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)

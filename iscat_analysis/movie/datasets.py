@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
+from iscat_analysis.movie.mapped import Writer
 from iscat_analysis.movie.refeyn import is_refeyn, open_refeyn
 from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
@@ -53,14 +54,19 @@ def open_hdf5(path: Path, part: str) -> Frames:
             if len(names) != 1:
                 raise DataError(f"{path}: {_which(path, names)}")
             stored = reader.array(names[0])
-            if stored is None or not _is_movie(stored):
+            if stored is None or not _is_movie(stored.shape):
                 held = "is not there" if stored is None else f"has the shape {stored.shape}"
                 others = ", ".join(f"/{name}" for name in list(_movies(reader))[:_SHOWN])
                 raise DataError(
                     f"{path}{MARK}{part}: {held}; frames (t, y, x) are in: {others or 'none'}"
                 )
-            notes = () if part else (f"its frames are those of the dataset /{names[0]}",)
-            return DatasetFrames(stored, reader, notes)
+            notes = [] if part else [f"its frames are those of the dataset /{names[0]}"]
+            if reader.writer is not Writer.NONE:
+                notes.append(
+                    f"a program has it open to write, or ended without closing it: the "
+                    f"{stored.shape[0]} frames are those that were written until now"
+                )
+            return DatasetFrames(stored, reader, tuple(notes))
         except BaseException:
             reader.data.close()
             raise
@@ -89,13 +95,12 @@ def _which(path: Path, names: list[str]) -> str:
     )
 
 
-def _is_movie(stored: StoredArray) -> bool:
-    shape = stored.shape
+def _is_movie(shape: tuple[int, ...]) -> bool:
     return len(shape) >= 3 and shape[0] > 1 and 0 not in shape and set(shape[1:-2]) <= {1}
 
 
 def _movies(reader: Hdf5Reader) -> Iterator[str]:
-    """Give the names of datasets that may be movies."""
+    """Give the names of datasets that may be movies, all of whose frames may not be there."""
     waiting, seen = [""], 0
     while waiting and seen < _MOST_NAMES:
         group = waiting.pop(0)
@@ -103,11 +108,11 @@ def _movies(reader: Hdf5Reader) -> Iterator[str]:
             seen += 1
             whole = f"{group}/{name}" if group else name
             try:
-                stored = reader.array(whole)
-            except DataError:  # text, links and whatever else is no movie
+                shape = reader.shape(whole)
+            except DataError:  # links that lead elsewhere
                 continue
-            if stored is None:
+            if shape is None:
                 if whole.count("/") < _MOST_GROUPS:
                     waiting.append(whole)
-            elif _is_movie(stored) and min(stored.shape[-2:]) > 1:
+            elif _is_movie(shape) and min(shape[-2:]) > 1:
                 yield whole

@@ -23,7 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, map_file, refuse_changed
+from iscat_analysis.movie.mapped import (
+    WHAT_LIBRARIES_RAISE,
+    Writer,
+    map_file,
+    refuse_changed,
+    writer_of,
+)
 from iscat_analysis.movie.slabs import Slabs
 
 _LARGEST_CHUNK_BYTES = 2**28
@@ -125,7 +131,15 @@ class Hdf5Reader:
     def __init__(self, path: Path) -> None:
         self._path = path
         with self._believing_nothing():
-            self._file = _opened(path)
+            self.writer = writer_of(path)
+            if self.writer is Writer.ALONE:
+                raise DataError(
+                    f"{path}: a program has it open to write and lets nobody read meanwhile, or "
+                    "ended without closing it: close it there, or record in SWMR mode; if that "
+                    "program is gone, `h5clear -s` of the HDF5 tools releases the file"
+                )
+            swmr = self.writer is Writer.WITH_READERS
+            self._file = h5py.File(path, "r", locking=False, swmr=swmr)
         try:
             with self._believing_nothing():
                 if self._file.userblock_size:
@@ -145,6 +159,14 @@ class Hdf5Reader:
         with self._believing_nothing():
             found = self._find(group)
             return sorted(found) if isinstance(found, h5py.Group) else []
+
+    def shape(self, name: str) -> tuple[int, ...] | None:
+        """Give the shape of a dataset of numbers, written or not; None where there is none."""
+        with self._believing_nothing():
+            dataset = self._dataset(name)
+            if dataset is None or dataset.dtype.kind not in "iuf":
+                return None
+            return None if dataset.is_virtual or dataset.external else dataset.shape
 
     def array(self, name: str) -> StoredArray | None:
         """Find a dataset of numbers and all of its bytes; None where there is none."""
@@ -318,16 +340,6 @@ class Hdf5Reader:
             f"{self._path}: {name} is incomplete ({how}); "
             "the recording or the copy was interrupted: export it again"
         )
-
-
-def _opened(path: Path) -> h5py.File:
-    """Open a file for reading, also one that a program goes on writing so that others may read."""
-    try:
-        return h5py.File(path, "r", locking=False)
-    except OSError as error:
-        if "already open for write" not in str(error):
-            raise
-        return h5py.File(path, "r", locking=False, swmr=True)
 
 
 def _single(dataset: h5py.Dataset) -> bool:

@@ -6,6 +6,7 @@ import mmap
 import os
 import struct
 from contextlib import suppress
+from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,29 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """How HDF5 files begin."""
 
 _MAPPED_ALONG = 2**16
+_WRITE_ACCESS, _READERS_ALLOWED = 1, 4  # bits of the flags in a superblock
+
+
+class Writer(Enum):
+    """Whether a program has an HDF5 file open to write, and lets others read meanwhile.
+
+    The file says so until it is closed; also if the program ended without that.
+    """
+
+    NONE = "none"
+    ALONE = "alone"
+    WITH_READERS = "with readers"
+
+
+def writer_of(path: Path) -> Writer:
+    """Read the flags of an HDF5 file, which superblocks have since version 2."""
+    with open_regular(path) as file:
+        head = file.read(12)
+    if len(head) < 12 or not head.startswith(HDF5_SIGNATURE) or head[8] < 2:
+        return Writer.NONE
+    if not head[11] & _WRITE_ACCESS:
+        return Writer.NONE
+    return Writer.WITH_READERS if head[11] & _READERS_ALLOWED else Writer.ALONE
 
 
 def map_file(path: Path) -> mmap.mmap:

@@ -19,15 +19,16 @@ from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray
 
-_SAMPLED = 5  # frames from which limits of the contrast are taken
+_SAMPLED = 5  # frames from which limits of the contrast are taken, at most
+_READ_BYTES = 2**29  # of frames that are looked at before a movie is shown, for either purpose
 _INSIDE = (0.001, 0.999)  # quantiles of the pixels that such limits leave inside
 
 
 def film_limits(
-    image: Callable[[int], NDArray[Any]], frames: tuple[int, int]
+    image: Callable[[int], NDArray[Any]], frames: tuple[int, int], most: int = _SAMPLED
 ) -> tuple[float, float]:
     """Give the limits between which most of the pixels of a few frames of a film lie."""
-    looked = np.unique(np.linspace(frames[0], frames[1] - 1, _SAMPLED).astype(int))
+    looked = np.unique(np.linspace(frames[0], frames[1] - 1, most).astype(int))
     seen = np.concatenate([np.ravel(image(int(t))) for t in looked]).astype(np.float64)
     seen = seen[np.isfinite(seen)]
     low, high = np.quantile(seen, _INSIDE) if seen.size else (0.0, 1.0)
@@ -109,12 +110,12 @@ class RatioFilm:
             return np.asarray(self._after / self._before - 1.0)
 
     def light(self, most: int = 400) -> pd.DataFrame:
-        """Give light and noise of frames all over the movie, at most so many.
+        """Give light and noise of frames all over the movie, at most so many, fewer of large ones.
 
         Columns: frame, light [counts above the offset, mean of the pixels], noise (standard
         deviation of the contrast of this frame to the next, of one frame).
         """
-        last = self.movie.shape[0] - 2
+        last, most = self.movie.shape[0] - 2, self._affordable(2, most)
         rows = []
         for frame in np.unique(np.linspace(0, last, min(most, last + 1)).astype(int)):
             pair = self.movie.read(int(frame), int(frame) + 2).astype(np.float64) - self._offset
@@ -133,9 +134,15 @@ class RatioFilm:
         """
         if not ratio:
             return film_limits(self.raw, (0, self.movie.shape[0]))
-        low, high = film_limits(self.contrast, self.frames)
+        looks = self._affordable(2 * self._window, _SAMPLED)
+        low, high = film_limits(self.contrast, self.frames, looks)
         most = max(abs(low), abs(high)) or 1.0
         return -most, most
+
+    def _affordable(self, frames: int, most: int) -> int:
+        """Say how many looks at so many frames may be taken."""
+        frame_bytes = math.prod(self.movie.shape[1:]) * self.movie.dtype.itemsize
+        return min(most, max(1, _READ_BYTES // (frames * frame_bytes)))
 
     def _frame(self, number: int) -> FloatArray:
         counts: FloatArray = self.movie.read(number, number + 1)[0].astype(np.float64)

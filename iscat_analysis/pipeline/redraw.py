@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.camera.burnt_in import find_text, without_text
 from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.field_sample import LARGEST_PX, CutFrames
 from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
 from iscat_analysis.camera.response import linear
 from iscat_analysis.config import Config
@@ -27,7 +28,7 @@ from iscat_analysis.diagnosis.light import judge_light
 from iscat_analysis.diagnosis.repeated_frames import without_repeats
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.context import make_context
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.pattern import corrected
@@ -35,14 +36,15 @@ from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, 
 from iscat_analysis.fitting.regions import Region, photons_scale, region_around, region_likelihood
 from iscat_analysis.fitting.results import view_of
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.landing.chunk_work import view_moved
 from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.landing.steps import StepEvent
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.landing.traces import patch_of, trace_of
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import Candidate, EventView, FloatArray, Windows, silent
-from iscat_analysis.search.sliding import StepFrame, stride_of
-from iscat_analysis.search.sliding.chunks import HALO, reader_of
+from iscat_analysis.records import Candidate, CountSource, EventView, FloatArray, Windows, silent
+from iscat_analysis.search.sliding import StepFrame, Tile, stride_of
+from iscat_analysis.search.sliding.chunks import HALO, Reader, halo_px, reader_of
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import row_view
 from iscat_analysis.tracking.joint.likelihood import MovingField
@@ -104,11 +106,22 @@ def _landings(
     """Draw rows of a landing movie: the windows before and after each step."""
     first, last = fitted_frames(movie, config)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
-    reader = reader_of(frames, config, camera, (first, last))
-    context = make_context(config, reader.shape, lines=lines, sliding=True)
+    shape = (movie.shape[1], movie.shape[2])
+    field = make_context(config, shape, lines=lines, sliding=True)
     stride = stride_of(window)
 
+    @lru_cache(1)
+    def seen(tile: Tile) -> tuple[Reader, AnalysisContext]:
+        """Read the pixels of a tile alone."""
+        part: CountSource = frames
+        if tile.shape != shape:
+            part = CutFrames(frames, tile.shape, lambda images: images[..., *tile.here])
+        reader = reader_of(part, config, camera.part(tile.here), (first, last))
+        return reader, field.on_tile(tile)
+
     def draw(row: int) -> EventView:
+        tile = _tile_around(table.iloc[row], config, shape)
+        reader, context = seen(tile)
         frame = int(table["frame"].iloc[row])
         held = (span for span in stretches if span[0] <= frame < span[1])
         begin, end = next(held, (first, last))
@@ -120,8 +133,9 @@ def _landings(
         neighbours = Neighbours(context, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window
         known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
+        known &= tile.holds(table["y_px"].to_numpy(float), table["x_px"].to_numpy(float))
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
-        steps = [_step(neighbours, table.iloc[i]) for i in numbers]
+        steps = [_step(neighbours, table.iloc[i], tile.corner) for i in numbers]
         tasks = TaskBuilder(context, chunk, window, neighbours, pattern)
         task = tasks.build(0, steps, neighbours.of(steps)[0])
         if task is None:
@@ -140,13 +154,24 @@ def _landings(
             replace(steps[0], at=task.at), tuple(steps[1:]), np.zeros(0),
         )  # fmt: skip
         trace = trace_of(fitted, patch_of(fitted, chunk, window), chunk, neighbours, tasks)
-        return view_of(number, Fitted(task.region, fit, task.likelihood), trace=trace)
+        view = view_of(number, Fitted(task.region, fit, task.likelihood), trace=trace)
+        return view_moved(view, tile.corner)
 
     return draw
 
 
-def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
-    """Make a `Step` of a row of the table."""
+def _tile_around(row: pd.Series[Any], config: Config, shape: tuple[int, int]) -> Tile:
+    """Give the pixels that tell of a row: all of a small field, its surroundings in a large one."""
+    reach = halo_px(config) if math.prod(shape) > LARGEST_PX else max(shape)
+    rows, columns = (
+        (max(round(place) - reach, 0), min(round(place) + reach + 1, size))
+        for place, size in zip((row["y_px"], row["x_px"]), shape, strict=True)
+    )
+    return Tile(rows, columns, rows, columns, shape)
+
+
+def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) -> Step:
+    """Make a `Step` of a row of the table, at its place in the tile at a corner."""
     frames = row["n_before"] * row["n_after"] / (row["n_before"] + row["n_after"])
     at = StepFrame(
         frame=int(row["frame"]), half_width=int(row["frame_ci95"]), height=1.0,
@@ -154,8 +179,9 @@ def _step(neighbours: Neighbours, row: pd.Series[Any]) -> Step:
     )  # fmt: skip
     mass = float(row["mass_kda"])
     start = Candidate(
-        float(row["x_px"]), float(row["y_px"]), float(row["z_nm"]), abs(mass), float(row["snr"])
-    )
+        float(row["x_px"]) - corner[1], float(row["y_px"]) - corner[0], float(row["z_nm"]),
+        abs(mass), float(row["snr"]),
+    )  # fmt: skip
     return neighbours.draw(-1 if mass < 0 else 1, at, start)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,8 +18,8 @@ from small_movies import LANDING
 
 from iscat_analysis.config import Config, configure
 from iscat_analysis.day import growing
-from iscat_analysis.day.growing import histogram, watch_movie
-from iscat_analysis.errors import ConfigError
+from iscat_analysis.day.growing import RESTS, histogram, watch_movie
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.study.simulate import Movie
@@ -36,11 +38,12 @@ with h5py.File(sys.argv[1], "w", libver="latest") as file:
     )
     file.swmr_mode = True
     for stop in range(60, len(counts) + 1, 60):
+        sys.stdin.readline()
         frames.resize((stop, *counts.shape[1:]))
         frames[stop - 60 : stop] = counts[stop - 60 : stop]
         frames.flush()
         print("written", flush=True)
-        sys.stdin.readline()
+    sys.stdin.readline()
 """
 
 
@@ -60,13 +63,13 @@ def counts(config: Config) -> np.ndarray:
 
 
 class Recorder:
-    """Writes a movie in parts; `more` writes one and tells whether it did."""
+    """Writes TIFF or Zarr in parts."""
 
     def __init__(self, kind: str, path: Path, counts: np.ndarray) -> None:
         self._kind, self._path, self._counts, self._written = kind, path, counts, 0
 
     def more(self) -> bool:
-        """Write the next part."""
+        """Write the next part, and tell whether there was one."""
         start, stop = self._written, self._written + STEP
         if start >= FRAMES:
             return False
@@ -88,16 +91,47 @@ class Recorder:
         return True
 
 
-@pytest.mark.parametrize("kind", [pytest.param("tif", marks=pytest.mark.large), "zarr"])
+class Program:
+    """A program that writes an HDF5 file; it closes it and ends after the last part."""
+
+    def __init__(self, path: Path, counts: np.ndarray) -> None:
+        np.save(path.with_suffix(".npy"), counts)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", SWMR, str(path), str(path.with_suffix(".npy"))],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def more(self) -> bool:
+        """Have the next part written, and tell whether there was one."""
+        if self._process.returncode is not None:
+            return False
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write("\n")
+        self._process.stdin.flush()
+        if self._process.stdout.readline() == "written\n":
+            return True
+        self._process.communicate()
+        assert self._process.returncode == 0
+        return False
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [*(pytest.param(kind, marks=pytest.mark.large) for kind in ("tif", "zarr")), "h5"],
+)
 def test_a_movie_that_grows_ends_as_the_finished_file(
     kind: str, config: Config, counts: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """An HDF5 file that is open to write is not finished, however long it rests."""
     path = tmp_path / f"movie.{kind}"
-    recorder = Recorder(kind, path, counts)
-    real = growing._Growing.rests
+    recorder = Program(path, counts) if kind == "h5" else Recorder(kind, path, counts)
+    real, looks = growing._Growing.rests, iter(range(1000))
+    pause = range(4, 4 + 2 * RESTS) if kind == "h5" else range(0)
 
     def growing_at_each_look(self: growing._Growing) -> bool:
-        recorder.more()
+        if next(looks) not in pause:
+            recorder.more()
         return real(self)
 
     monkeypatch.setattr(growing._Growing, "rests", growing_at_each_look)
@@ -105,30 +139,79 @@ def test_a_movie_that_grows_ends_as_the_finished_file(
     watch_movie(path, config, out=tmp_path / "live", interval_s=0.01, notify=said.append)
     lines = [line for line in said if " kDa" in line and "frames: " in line]
     assert [int(line.split()[0]) for line in lines] == [120, 180]
+    assert sum("a program has it open to write" in line for line in said) == (kind == "h5")
     fit_stack(path, config, out=tmp_path / "after")
     written = [(tmp_path / name / "fits.csv").read_bytes() for name in ("live", "after")]
     assert written[0] == written[1]
     assert len(pd.read_csv(tmp_path / "live" / "fits.csv")) == 3
 
 
-def test_an_hdf5_file_is_read_while_it_is_written(counts: np.ndarray, tmp_path: Path) -> None:
-    """Single writer, many readers: each flush shows more frames."""
+@pytest.mark.parametrize("refused", [False, True])
+def test_a_camera_that_goes_on_while_its_movie_is_analysed_is_watched_again(
+    refused: bool, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It had paused for longer than a file rests."""
+    path, given, said = tmp_path / "movie.tif", [], []
+
+    def analysed(movie: Path, *_: object, overwrite: bool, **__: object) -> int:
+        given.append((movie.stat().st_size, overwrite))
+        if len(given) == 1:
+            movie.write_bytes(bytes(20))
+            if refused:
+                raise DataError("was written to while it was open")
+        return len(given)
+
+    monkeypatch.setattr(growing, "fit_stack", analysed)
+    path.write_bytes(bytes(10))
+    out = tmp_path / "out"
+    found = watch_movie(path, config, out=out, interval_s=0.001, notify=said.append)
+    assert found == 2
+    assert given == [(10, False), (20, not refused)]
+    assert sum("written to meanwhile" in line for line in said) == 1
+
+
+def test_a_folder_that_is_taken_is_refused_before_the_recording(
+    config: Config, tmp_path: Path
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.txt").write_text("mine")
+    with pytest.raises(DataError, match=r"thesis\.txt.* is left alone"):
+        watch_movie(tmp_path / "movie.tif", config, out=tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("readers", "shape", "expected"),
+    [
+        (True, (60, 32, 32), ""),
+        (False, (60, 32, 32), "lets nobody read meanwhile"),
+        (True, (90, 32, 32), "frames is incomplete (it lists 4 chunks where it needs 6)"),
+    ],
+)
+def test_what_a_writer_left_open_is_said(
+    readers: bool, shape: tuple[int, ...], expected: str, tmp_path: Path
+) -> None:
+    """As of a program that ended without closing its file."""
     path = tmp_path / "movie.h5"
-    np.save(tmp_path / "counts.npy", counts)
-    command = [sys.executable, "-c", SWMR, str(path), str(tmp_path / "counts.npy")]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as writer:
-        assert writer.stdin is not None
-        assert writer.stdout is not None
-        for stop in range(STEP, FRAMES + 1, STEP):
-            assert writer.stdout.readline() == "written\n"
-            with open_stack(path) as movie:
-                assert movie.shape[0] == stop
-                np.testing.assert_array_equal(movie.read(0, stop), counts[:stop])
-            writer.stdin.write("\n")
-            writer.stdin.flush()
-    assert writer.returncode == 0
+    with h5py.File(tmp_path / "open.h5", "w", libver="latest") as file:
+        frames = file.create_dataset(
+            "frames", shape=(0, 32, 32), maxshape=(None, 32, 32), chunks=(16, 32, 32), dtype="u2"
+        )
+        if readers:
+            file.swmr_mode = True
+        frames.resize((60, 32, 32))
+        frames[:] = np.arange(60)[:, None, None]
+        frames.resize(shape)
+        file.flush()
+        shutil.copy(tmp_path / "open.h5", path)
+    if expected:
+        with pytest.raises(DataError, match=re.escape(expected)):
+            open_stack(path)
+        return
+    with open_stack(path) as movie:
+        assert movie.read(59, 60).max() == 59
+        assert "the 60 frames are those that were written until now" in " ".join(movie.notes)
+    with open_stack(tmp_path / "open.h5") as movie:  # control
+        assert "written until now" not in " ".join(movie.notes)
 
 
 def test_what_is_wrong_with_the_setup_is_not_waited_for(
@@ -155,12 +238,7 @@ def test_frames_beyond_those_that_are_left_out_are_waited_for(
 
 def test_it_waits_for_a_file_that_is_not_there_yet(config: Config, tmp_path: Path) -> None:
     said: list[str] = []
-    stop = threading.Event()
-    stop.set()
-    with pytest.raises(Exception, match=r"movie\.tif"):
-        watch_movie(
-            tmp_path / "movie.tif", config, out=tmp_path / "out", stop=stop, notify=said.append
-        )
+    assert not growing._Growing(tmp_path / "movie.tif", config, said.append).rests()
     assert "waiting" in said[-1]
 
 

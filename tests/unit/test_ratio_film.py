@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
+from iscat_analysis.pipeline import ratio_film
 from iscat_analysis.pipeline.ratio_film import RatioFilm
 
 FLICKER = 0.1
@@ -61,6 +62,30 @@ def test_light_and_noise_are_measured(counts: np.ndarray) -> None:
     light = counts.mean(axis=(1, 2)) - 100.0
     assert np.allclose(found["light"], light[found["frame"]])
     assert found["noise"].median() == pytest.approx(1 / np.sqrt(light.mean()), rel=0.15)
+
+
+def test_of_a_large_field_few_frames_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames of 8 × 8 pixels count as those of 1200 × 1920 do with 2**29 bytes."""
+    counts = 1000 + np.random.default_rng(2).poisson(100, (3000, 8, 8)).astype(np.uint16)
+    read: list[int] = []
+    real = ia.Stack.read
+
+    def counting(self: ia.Stack, start: int, stop: int) -> np.ndarray:
+        read.append(stop - start)
+        return real(self, start, stop)
+
+    monkeypatch.setattr(ia.Stack, "read", counting)
+    film, usual = RatioFilm(ia.open_stack(counts), window=25), []
+    for most in (ratio_film._READ_BYTES, round(2**29 * 64 / (1200 * 1920))):
+        monkeypatch.setattr(ratio_film, "_READ_BYTES", most)
+        read.clear()
+        light = film.light()
+        assert len(light) == sum(read) / 2
+        assert light["frame"].iloc[[0, -1]].tolist() == [0, 2998]
+        usual.append(sum(read))
+        film.limits(ratio=True)
+        usual.append(sum(read) - usual[-1])
+    assert usual == [800, 250, 116, 100]
 
 
 def test_dark_frames_and_impossible_windows_are_refused(counts: np.ndarray) -> None:

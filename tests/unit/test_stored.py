@@ -11,6 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
+from iscat_analysis.camera.field_sample import CutFrames
+from iscat_analysis.movie import Stack
+from iscat_analysis.pipeline import redraw as redraw_module
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 
@@ -83,6 +86,39 @@ def test_the_images_are_those_that_the_fit_saw(written, kind: str, rows: int) ->
         # the comparison notices another event
         one, other = result.images(0).model, result.images(1).model
         assert one.shape != other.shape or np.abs(one - other).max() > 10 * IMAGE_ATOL
+
+
+def test_of_a_large_field_only_the_surroundings_are_read(
+    written, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The image is the same but for its level, which follows the light of what is read."""
+    whole: list[int] = []
+    cut: list[int] = []
+    read, read_cut = Stack.read, CutFrames.read
+
+    def counting(self: Stack, start: int, stop: int) -> np.ndarray:
+        whole.append(stop - start)
+        return read(self, start, stop)
+
+    def counting_cut(self: CutFrames, start: int, stop: int) -> np.ndarray:
+        cut.append(self.shape[2])
+        return read_cut(self, start, stop)
+
+    with ia.open_result(written["landing"][0]) as result:
+        expected = [result.images(row) for row in range(4)]  # and the light is judged
+        monkeypatch.setattr(Stack, "read", counting)
+        monkeypatch.setattr(CutFrames, "read", counting_cut)
+        monkeypatch.setattr(redraw_module, "LARGEST_PX", 0)
+        monkeypatch.setattr(redraw_module, "halo_px", lambda _: 30)
+        for row, one in enumerate(expected):
+            seen = result.images(row)
+            assert (seen.row_px, seen.column_px) == (one.row_px, one.column_px)
+            np.testing.assert_allclose(seen.residual, one.residual, atol=0.01)  # sigma, as of tiles
+            np.testing.assert_allclose(seen.model, one.model, atol=1e-6)
+            np.testing.assert_allclose(seen.contrast, one.contrast, atol=2e-5)
+            assert np.ptp(seen.contrast - one.contrast) < 1e-6
+    assert whole == []
+    assert max(cut) <= 61
 
 
 def test_tables_and_configuration_are_those_of_the_folder(written) -> None:
