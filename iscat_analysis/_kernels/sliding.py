@@ -18,28 +18,36 @@ BoolArray = NDArray[np.bool_]
 @kernel()
 def block_sums(
     counts: NDArray[Any],
+    corner: tuple[int, int],
     good: BoolArray,
     total: NDArray[Any],
-    sums: MapArray,
+    sums: NDArray[Any],
     highest: NDArray[Any],
 ) -> None:
-    """Sum a block of frames.
+    """Add frames to the sums of a box of pixels, and find its highest counts where they are wanted.
 
-    Shapes: `counts` (t, y, x), `good` (t,), `total` (x,), `sums` (y, x), `highest` (y, x).
+    Shapes: `counts` (t, all y, all x), `good` (t,), `total` (x,), `sums` (y, x), `highest` (y, x)
+    or (0, 0).
     """
-    frames, rows, columns = counts.shape
+    frames = counts.shape[0]
+    rows, columns = sums.shape
+    top, left = corner
     for i in range(rows):
         for j in range(columns):
             total[j] = 0
         for t in range(frames):
             if not good[t]:
                 continue
-            for j in range(columns):
-                c = counts[t, i, j]
-                total[j] += c
-                highest[i, j] = max(highest[i, j], c)
+            row = counts[t, top + i, left : left + columns]
+            if highest.size:
+                for j in range(columns):
+                    total[j] += row[j]
+                    highest[i, j] = max(highest[i, j], row[j])
+            else:
+                for j in range(columns):
+                    total[j] += row[j]
         for j in range(columns):
-            sums[i, j] = total[j]
+            sums[i, j] += total[j]
 
 
 @kernel()
