@@ -18,28 +18,36 @@ BoolArray = NDArray[np.bool_]
 @kernel()
 def block_sums(
     counts: NDArray[Any],
+    corner: tuple[int, int],
     good: BoolArray,
     total: NDArray[Any],
-    sums: MapArray,
+    sums: NDArray[Any],
     highest: NDArray[Any],
 ) -> None:
-    """Sum a block of frames.
+    """Add frames to the sums of a box of pixels, and find its highest counts where they are wanted.
 
-    Shapes: `counts` (t, y, x), `good` (t,), `total` (x,), `sums` (y, x), `highest` (y, x).
+    Shapes: `counts` (t, all y, all x), `good` (t,), `total` (x,), `sums` (y, x), `highest` (y, x)
+    or (0, 0).
     """
-    frames, rows, columns = counts.shape
+    frames = counts.shape[0]
+    rows, columns = sums.shape
+    top, left = corner
     for i in range(rows):
         for j in range(columns):
             total[j] = 0
         for t in range(frames):
             if not good[t]:
                 continue
-            for j in range(columns):
-                c = counts[t, i, j]
-                total[j] += c
-                highest[i, j] = max(highest[i, j], c)
+            row = counts[t, top + i, left : left + columns]
+            if highest.size:
+                for j in range(columns):
+                    total[j] += row[j]
+                    highest[i, j] = max(highest[i, j], row[j])
+            else:
+                for j in range(columns):
+                    total[j] += row[j]
         for j in range(columns):
-            sums[i, j] = total[j]
+            sums[i, j] += total[j]
 
 
 @kernel()
@@ -108,6 +116,69 @@ def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray, out: MapA
             else:
                 out[i, j] = 0.0
     return ratio
+
+
+@kernel(fastmath={"reassoc", "nsz"})
+def step_energy(
+    earlier: MapArray,
+    later: MapArray,
+    moved: MapArray,
+    used: BoolArray,
+    read_e2: FloatArray,
+    power_ratio: float,
+    side: int,
+    excess: MapArray,
+    share: MapArray,
+) -> None:
+    """Squared change over its variance, less one, and share of used pixels, in squares of pixels.
+
+    `moved` is the contrast that motion makes, of shape (0, 0) where there is none; `read_e2` is the
+    read noise of the change.
+
+    Shapes: `earlier, later` (k, y, x), `moved, used, read_e2` (y, x), `excess, share` (y/n, x/n).
+    """
+    rows, columns = used.shape
+    before = np.zeros((rows, columns), dtype=np.float32)
+    after = np.zeros((rows, columns), dtype=np.float32)
+    total_before = 0.0
+    total_after = 0.0
+    for i in range(rows):
+        for k in range(earlier.shape[0]):
+            for j in range(columns):
+                before[i, j] += earlier[k, i, j]
+        for k in range(later.shape[0]):
+            for j in range(columns):
+                after[i, j] += later[k, i, j]
+        for j in range(columns):
+            lit = used[i, j] and before[i, j] > 0 and after[i, j] > 0
+            before[i, j] = before[i, j] if lit else 0.0
+            after[i, j] = after[i, j] if lit else 0.0
+        if moved.size:
+            for j in range(columns):
+                before[i, j] *= 1 + moved[i, j]
+        for j in range(columns):
+            total_before += before[i, j]
+            total_after += after[i, j]
+    level = np.float32(total_after / total_before)
+    squared = np.float32(power_ratio**2)
+    sums = np.empty(columns, dtype=np.float32)
+    seen = np.empty(columns, dtype=np.float32)
+    for cell in range(excess.shape[0]):
+        sums[:] = 0.0
+        seen[:] = 0.0
+        last = min((cell + 1) * side, rows)
+        for i in range(cell * side, last):
+            for j in range(columns):
+                lit = np.float32(1.0 if before[i, j] > 0 else 0.0)
+                change = after[i, j] - level * before[i, j]
+                variance = after[i, j] + squared * before[i, j] + np.float32(read_e2[i, j])
+                sums[j] += lit * (change * change / max(variance, np.float32(1e-30)) - lit)
+                seen[j] += lit
+        for m in range(excess.shape[1]):
+            end = min((m + 1) * side, columns)
+            pixels = np.float32((last - cell * side) * (end - m * side))
+            excess[cell, m] = sums[m * side : end].sum() / pixels
+            share[cell, m] = seen[m * side : end].sum() / pixels
 
 
 @kernel()

@@ -223,8 +223,8 @@ def _is_in_reach(likelihood: Likelihood, theta: FloatArray) -> bool:
 def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool) -> list[_Sphere]:
     """Maximise the likelihood of a sphere from the best diameters of a scan.
 
-    Where the index is fitted, the light of a sphere is scanned too.  Maxima below `least` are left
-    out.
+    Where the index is fitted, the light of a sphere is scanned too.  A sphere of the scan that
+    describes the image worse than no particle does is no start.  Maxima below `least` are left out.
     """
     model = model_of(seated)
     x, y, g = float(theta[0]), float(theta[1]), float(theta[LEVEL])
@@ -233,12 +233,14 @@ def _maxima(seated: Likelihood, theta: FloatArray, *, least: float, level: bool)
     own = model.strength_of(model.sphere.index.real) if model.fits_index else 1.0
     values = np.empty((masses.size, strengths.size))
     for i, mass in enumerate(masses.tolist()):
-        linear = model.at(mass)
+        linear = model.scanned(mass)
         for j, strength in enumerate(strengths.tolist()):
             signal = linear.amplitude_image(seated.grid, x, y, 0.0, strength / own * mass)
             values[i, j] = seated.noise.terms(seated.data, signal, g).value
     optima: list[_Sphere] = []
     for i, j in highest_maxima(values, _FOLLOWED):
+        if values[i, j] <= 0:
+            break
         begin = np.array([x, y, 0.0, masses[i], g])
         if model.fits_index:
             there = replace(seated, model=model.of_strength(float(strengths[j])))

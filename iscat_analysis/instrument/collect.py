@@ -126,16 +126,16 @@ def landing_particle_images(
             resolution_nm=config.optics.wavelength_nm / config.optics.na,
             roi_px=_roi_px(config),
             most=most,
-            rings=rings,
             motion=pattern,
             mapper=over_frames(pool, reader.shape),
         )
+        around = every if rings else ()
         if part.tile is not None:
             found += _in_field(alone, part.tile)
-            rest += _in_field(every, part.tile)
+            rest += _in_field(around, part.tile)
         else:
             found += alone
-            rest += every
+            rest += around
         bright = [step for step in found if step.snr > FAINTEST]
         if len(bright) >= enough and not whole:
             break
@@ -156,7 +156,7 @@ def landing_particle_images(
     return images[0], images[1]
 
 
-def _in_field(steps: Sequence[BrightStep], tile: Tile) -> list[BrightStep]:
+def _in_field(steps: Iterable[BrightStep], tile: Tile) -> list[BrightStep]:
     """Keep the steps of the core of a tile, and count their places from the corner of the field."""
     y, x = tile.corner
     moved = [

@@ -9,7 +9,7 @@ needs, and it finds it with a microscope of which nothing is known.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Protocol
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from iscat_analysis._kernels.sliding import step_energy
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
 from iscat_analysis.search.peaks import maxima
 from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
@@ -36,6 +37,7 @@ CONSTANT_P = 1e-3
 """A step whose height changes before or after it, with less than this chance, is left out."""
 
 _SPOT = 1.0  # standard deviation of the spot over λ/NA
+_LEAST_SPOT = 2.0  # standard deviation of the spot, in squares whose energy is looked at
 _SHADOW_NM = 1500.0  # a weaker maximum nearer than this to a stronger one is part of it
 _OTHERS_NM = 1700.0  # side of the region around a neighbour
 _CORE_NM = 900.0  # radius that dates a step
@@ -92,11 +94,10 @@ def find_bright_steps(
     resolution_nm: float,
     roi_px: int,
     most: int,
-    rings: bool = True,
     motion: Motion | None = None,
     mapper: Mapper = map,
-) -> tuple[tuple[BrightStep, ...], tuple[BrightStep, ...]]:
-    """Bright steps that stand alone, and all of them, brightest first."""
+) -> tuple[tuple[BrightStep, ...], Iterator[BrightStep]]:
+    """Bright steps that stand alone, and all of them, brightest first, cut when asked for."""
     moved = None if motion is None else motion.contrast
     spots = _spots(chunk, _SPOT * resolution_nm / pixel_nm, _SHADOW_NM / pixel_nm, moved, mapper)
     # one after the other: between small kernels threads wait for each other at the interpreter
@@ -106,11 +107,10 @@ def find_bright_steps(
     )
     alone = sorted(islice((step for step in cut if step), most), key=lambda step: -step.snr)
     small = max(5, round(_OTHERS_NM / pixel_nm))
-    around = spots if rings else ()
-    rest = (
-        _cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM, motion) for spot in around
+    every = (
+        _cut(chunk, spot, spots, window, pixel_nm, small, _SHADOW_NM, motion) for spot in spots
     )
-    return tuple(alone), tuple(step for step in rest if step)
+    return tuple(alone), (step for step in every if step)
 
 
 def _spots(
@@ -125,29 +125,30 @@ def _spots(
     power = np.add.reduceat(chunk.power, chunk.edges[:-1])
     frames = np.diff(chunk.edges)
     read = chunk.camera.read_variance_e2(chunk.shape)
-    used = chunk.usable
+    side = max(1, int(spot_px / _LEAST_SPOT))
+    cells = math.ceil(chunk.shape[0] / side), math.ceil(chunk.shape[1] / side)
+    energy = np.zeros((count, *cells), dtype=np.float32)
+    still = np.empty((0, 0), dtype=np.float32)
 
-    def one(j: int) -> NDArray[np.float32]:
+    def one(j: int) -> None:
         low, middle, high = max(j + 1 - STRIDES, 0), j + 1, min(j + 1 + STRIDES, count + 1)
         ratio = power[middle:high].sum() / max(power[low:middle].sum(), 1e-300)
-        before = chunk.blocks_e[low:middle].sum(axis=0, dtype=np.float64)
-        after = chunk.blocks_e[middle:high].sum(axis=0, dtype=np.float64)
         if not 0 < ratio < 1e6:
-            return np.zeros(chunk.shape, dtype=np.float32)
-        lit = used & (before > 0) & (after > 0)
-        if not lit.all():
-            before, after = np.where(lit, before, 0.0), np.where(lit, after, 0.0)
-        if moved is not None:
-            before *= 1 + moved[j]
-        change = after - ratio * before
-        change -= before * (change.sum() / before.sum())
-        variance = after + ratio**2 * before
-        variance += read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum())
-        return energy_of(change, variance, lit, spot_px)
+            return
+        excess, share = np.empty((2, *cells), dtype=np.float32)
+        step_energy(
+            chunk.blocks_e[low:middle], chunk.blocks_e[middle:high],
+            still if moved is None else moved[j], chunk.usable,
+            read * (frames[middle:high].sum() + ratio**2 * frames[low:middle].sum()),
+            ratio, side, excess, share,
+        )  # fmt: skip
+        energy[j] = _smoothed_energy(excess, share, spot_px / side, spot_px)
 
-    energy = np.stack(list(mapper(one, range(count))))
+    for _ in mapper(one, range(count)):
+        pass
     return [
-        _Spot(chunk.first + int(chunk.edges[k + 1]), i, j) for k, i, j in _maxima(energy, shadow_px)
+        _Spot(chunk.first + int(chunk.edges[k + 1]), *(side * c + side // 2 for c in place))
+        for k, *place in _maxima(energy, shadow_px / side)
     ]
 
 
@@ -161,11 +162,21 @@ def energy_of(
     with np.errstate(divide="ignore", invalid="ignore"):
         excess = (np.square(change) / variance - 1).astype(np.float32)
     excess[~used] = 0.0
-    spot = spot_response(used.shape, spot_px)
+    return _smoothed_energy(excess, used.astype(np.float32), spot_px, spot_px)
+
+
+def _smoothed_energy(
+    excess: NDArray[np.float32], share: NDArray[np.float32], spot: float, spot_px: float
+) -> NDArray[np.float32]:
+    """Average an excess over a spot, in standard deviations of its noise.
+
+    Shapes: `excess, share` (y, x), result (y, x).
+    """
+    response = spot_response(excess.shape, spot)
     noise = math.sqrt(2 / (4 * math.pi * spot_px**2))
-    energy = smoothed(excess, spot / noise)
-    if not used.all():
-        energy /= np.maximum(smoothed(used.astype(np.float32), spot), 1e-3)
+    energy = smoothed(excess, response / noise)
+    if share.min() < 1:
+        energy /= np.maximum(smoothed(share, response), 1e-3)
     return energy
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from iscat_analysis._kernels.sliding import step_energy
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import FloatArray
@@ -81,3 +82,26 @@ def test_frames_of_a_neighbour_are_left_out() -> None:
 def test_one_place_that_changes_twice_is_dated_apart_or_left_out() -> None:
     steps = _steps([(90, 30.0, 30.0, 0.15), (97, 30.0, 30.0, 0.15)], seed=8)
     assert all(step.n_before < WINDOW or step.n_after < WINDOW for step in steps)
+
+
+@pytest.mark.parametrize("side", [1, 2, 3])
+def test_energy_of_squares_is_the_mean_of_their_pixels(side: int) -> None:
+    """Also at the border, where squares are cut, and beside pixels that are left out."""
+    random = np.random.default_rng(9)
+    rows, columns = 11, 17
+    earlier, later = random.poisson(LEVEL, (2, 3, rows, columns)).astype(np.float32)
+    moved = (0.01 * random.standard_normal((rows, columns))).astype(np.float32)
+    used = random.random((rows, columns)) > 0.1
+    earlier[:, 0, 0] = 0.0
+    read = random.uniform(0, 50, (rows, columns))
+    cells = -(-rows // side), -(-columns // side)
+    excess, share = np.empty((2, *cells), dtype=np.float32)
+    step_energy(earlier, later, moved, used, read, 1.3, side, excess, share)
+    used[0, 0] = False
+    before, after = earlier.sum(axis=0) * (1 + moved), later.sum(axis=0)
+    change = after - before * after[used].sum() / before[used].sum()
+    each = np.where(used, change**2 / (after + 1.3**2 * before + read) - 1, 0.0)
+    for values, found in ((each, excess), (used, share)):
+        for i, j in np.ndindex(cells):
+            square = values[i * side : (i + 1) * side, j * side : (j + 1) * side]
+            assert found[i, j] == pytest.approx(square.mean(), rel=1e-3, abs=1e-3)

@@ -7,12 +7,13 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, repeat
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis._kernels.sliding import block_sums
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera, check_counts
 from iscat_analysis.camera.field_sample import sampled
@@ -31,8 +32,8 @@ from iscat_analysis.search.sliding import (
     make_chunk,
     make_tile_chunk,
     measure_frames,
+    row_of_sums,
     stride_of,
-    summed,
     sums_of,
     well_lit,
 )
@@ -52,7 +53,7 @@ _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are b
 MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fit into memory
 _FEWEST_AT_ONCE = 8
-_TOGETHER = 4  # sums over the field that are made at a time
+_BANDS = 4  # of rows, whose sums over the frames are made at a time
 _SPAN_BYTES = 4e9  # of the frames of a chunk of a large field: they stay in the system's cache
 _CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
 _TILE_BYTES = 100  # of a pixel of a tile, beside its blocks and maps
@@ -263,19 +264,19 @@ class Reader:
         good, light = self._lit(span, pool)
         counts = self._stored(*span)
         total, highest = np.zeros(self.shape), np.zeros(self.shape, dtype=self._movie.dtype)
+        bands = list(pairwise(np.linspace(0, self.shape[0], _BANDS + 1).astype(int).tolist()))
+
+        def add(band: tuple[int, int], frames: NDArray[Any], lit: BoolArray) -> None:
+            rows = slice(*band)
+            row = row_of_sums(counts.dtype, self.shape[1])
+            block_sums(frames, (band[0], 0), lit, row, total[rows], highest[rows])
+
         step = self._at_once(len(counts))
-        step = max(1, step // _TOGETHER) if step < len(counts) else step
-        starts = range(0, len(counts), step)
-
-        def one(start: int) -> tuple[NDArray[np.float32], NDArray[Any]]:
-            frames, kept = counts.array(start, start + step), good[start : start + step]
-            lit = frames if kept.all() else frames[kept]
-            return summed(lit) if len(lit) else (np.zeros(self.shape, np.float32), highest)
-
-        for first in range(0, len(starts), _TOGETHER):
-            for sums, most in pool.map(one, starts[first : first + _TOGETHER]):
-                total += sums
-                np.maximum(highest, most, out=highest)
+        for start in range(0, len(counts), step):
+            frames, _ = counts.whole(start, min(start + step, len(counts)))
+            lit = good[start : start + step]
+            for _ in pool.map(add, bands, repeat(frames), repeat(lit)):
+                pass
             self._let_go()
         return sums_of(span, good, light, total, highest, self.camera, find_defects)
 

@@ -248,17 +248,16 @@ def summed(counts: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[Any]]:
 
     Shapes: `counts` (t, y, x), `sums, highest` (y, x).
     """
-    sums, highest = np.empty(counts.shape[1:], dtype=np.float32), counts[0].copy()
-    block_sums(counts, np.ones(len(counts), dtype=np.bool_), _scratch(counts), sums, highest)
+    sums, highest = np.zeros(counts.shape[1:], dtype=np.float32), counts[0].copy()
+    good = np.ones(len(counts), dtype=np.bool_)
+    block_sums(counts, (0, 0), good, row_of_sums(counts.dtype, counts.shape[2]), sums, highest)
     return sums, highest
 
 
-def _scratch(counts: NDArray[Any]) -> NDArray[Any]:
-    """Room for a row of a block's sum."""
-    whole = np.issubdtype(counts.dtype, np.integer)
-    narrow = counts.dtype.itemsize <= 2
-    exact = (np.uint32 if narrow else np.int64) if whole else np.float64
-    return np.empty(counts.shape[2], dtype=exact)
+def row_of_sums(stored: np.dtype[Any], columns: int) -> NDArray[Any]:
+    """Room for a row of a block's sum, which holds it exactly."""
+    exact = (np.uint32 if stored.itemsize <= 2 else np.int64) if stored.kind in "ui" else np.float64
+    return np.empty(columns, dtype=exact)
 
 
 def make_chunk(
@@ -278,7 +277,7 @@ def make_chunk(
     Shapes: `counts` (t, y, x), `good` (t,), `light_e` (t,).
     """
     stored = StoredFrames([counts])
-    edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper)
+    edges, blocks, highest = _sum_blocks(stored, good, camera, stride, check, mapper, highest=True)
     sums = _judged(
         (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
         highest.max(axis=0), camera, defects,
@@ -346,7 +345,9 @@ def make_tile_chunk(
         check()
         let_go()
 
-    edges, blocks, _ = _sum_blocks(counts, sums.good, camera, stride, check_and_let_go, mapper)
+    edges, blocks, _ = _sum_blocks(
+        counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
+    )
     let_go()
     return _chunk(counts, sums, camera, edges, blocks, check, let_go)
 
@@ -378,29 +379,33 @@ def _sum_blocks(
     stride: int,
     check: Callable[[], None],
     mapper: Mapper,
+    *,
+    highest: bool,
 ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[Any]]:
-    """Sum blocks of so many frames, and find the highest count of each pixel in each.
+    """Sum blocks of so many frames, and find the highest count of each pixel in each if asked to.
 
-    Shapes: `counts` (t, y, x), `blocks_e, highest` (k, y, x).
+    Shapes: `counts` (t, y, x), `blocks_e` (k, y, x), `most` (k, y, x) or (k, 0, 0).
     """
     frames, rows, columns = counts.shape
     edges = np.append(np.arange(0, frames, stride), frames).astype(np.int64)
-    blocks = np.empty((edges.size - 1, rows, columns), dtype=np.float32)
+    blocks = np.zeros((edges.size - 1, rows, columns), dtype=np.float32)
     offset = np.asarray(camera.offset_adu)
-    highest = np.empty((edges.size - 1, rows, columns), dtype=counts.dtype)
+    most = np.empty(blocks.shape if highest else (len(blocks), 0, 0), dtype=counts.dtype)
 
     def one(k: int) -> None:
         check()
-        block = np.ascontiguousarray(counts.array(int(edges[k]), int(edges[k + 1])))
+        block, corner = counts.whole(int(edges[k]), int(edges[k + 1]))
         lit = good[edges[k] : edges[k + 1]]
-        highest[k] = block[np.argmax(lit)]
-        block_sums(block, lit, _scratch(block), blocks[k], highest[k])
+        if highest:
+            top, left = corner
+            most[k] = block[np.argmax(lit), top : top + rows, left : left + columns]
+        block_sums(block, corner, lit, row_of_sums(counts.dtype, columns), blocks[k], most[k])
         blocks[k] -= np.count_nonzero(lit) * offset
         blocks[k] *= camera.gain_e_per_adu
 
     for _ in mapper(one, range(edges.size - 1)):
         pass
-    return edges, blocks, highest
+    return edges, blocks, most
 
 
 def _region(

@@ -14,12 +14,18 @@ from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 
 
 class StoredFrames:
-    """Arrays of frames, one after the other, indexed as one array (t, y, x)."""
+    """Arrays of frames, one after the other, indexed as one array (t, y, x); or a box of them."""
 
-    def __init__(self, parts: Sequence[NDArray[Any]]) -> None:
+    def __init__(self, parts: Sequence[NDArray[Any]], box: Box = EVERYWHERE) -> None:
         self._parts = parts
+        ends = (part.indices(n)[:2] for part, n in zip(box, parts[0].shape[1:], strict=True))
+        self._rows, self._columns = ends
         self._edges = np.cumsum([0, *map(len, parts)]).tolist()
-        self.shape = (int(self._edges[-1]), int(parts[0].shape[1]), int(parts[0].shape[2]))
+        self.shape = (
+            int(self._edges[-1]),
+            self._rows[1] - self._rows[0],
+            self._columns[1] - self._columns[0],
+        )
         self.dtype = parts[0].dtype
 
     def __len__(self) -> int:
@@ -29,17 +35,33 @@ class StoredFrames:
         """View a box of pixels in frames ``[start, stop)``."""
         held = list(zip(pairwise(self._edges), self._parts, strict=True))
         near = [one for one in held if one[0][0] < stop and start < one[0][1]] or held[:1]
-        return StoredFrames(
-            [part[(slice(max(start - low, 0), stop - low), *box)] for (low, _), part in near]
+        parts = [part[max(start - low, 0) : stop - low] for (low, _), part in near]
+        ends = (part.indices(n)[:2] for part, n in zip(box, self.shape[1:], strict=True))
+        rows, columns = (
+            slice(first + low, first + high)
+            for (first, _), (low, high) in zip((self._rows, self._columns), ends, strict=True)
         )
+        return StoredFrames(parts, (rows, columns))
 
     def array(self, start: int, stop: int, box: Box = EVERYWHERE) -> NDArray[Any]:
         """Give a box of pixels in frames ``[start, stop)``: a view where one array has them all.
 
         Shapes: result (stop − start, y, x).
         """
-        parts = self.views(start, stop, box)._parts
+        seen = self.views(start, stop, box)
+        here = slice(None), slice(*seen._rows), slice(*seen._columns)
+        parts = [part[here] for part in seen._parts]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def whole(self, start: int, stop: int) -> tuple[NDArray[Any], tuple[int, int]]:
+        """Give contiguous frames ``[start, stop)``, and where in them these pixels begin.
+
+        Shapes: result (stop − start, all y, all x).
+        """
+        seen = self.views(start, stop)
+        if len(seen._parts) == 1 and seen._parts[0].flags.c_contiguous:
+            return seen._parts[0], (self._rows[0], self._columns[0])
+        return np.ascontiguousarray(seen.array(0, stop - start)), (0, 0)
 
 
 def frames_in_place(movie: CountSource, start: int, stop: int) -> list[InPlace]:
