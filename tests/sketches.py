@@ -1,19 +1,18 @@
-"""Reports whose figures are not written, which takes most of the time of a small run."""
+"""Reports whose figures are not drawn, which takes most of the time of a small run."""
 
 from __future__ import annotations
 
 import importlib
 import time
 from collections.abc import Iterable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from iscat_analysis.records import Analysis
 from iscat_analysis.report import page
-from iscat_analysis.report.event_figures import event_figures
 from iscat_analysis.report.style import Sketch
 
 PAGES = tuple(
@@ -31,6 +30,8 @@ PAGES = tuple(
     )
 )
 """Modules that publish figures."""
+
+_EMPTY = Figure()
 
 
 def sketch(
@@ -66,14 +67,14 @@ def sketch(
     return dict.fromkeys(names, Markup("<svg/>"))
 
 
-def without_images(analysis: Analysis, most: int) -> Iterator[Sketch]:
-    """Take the place of `event_figures` in a folder: the images take half of a small run's time."""
-    for name, _ in event_figures(analysis, most):
-        yield name, Figure
+def undrawn(sketches: Iterable[Sketch]) -> Iterator[tuple[str, Figure]]:
+    """Take the place of `drawn`: one empty figure stands for all that the page of a fit has."""
+    for name, _ in sketches:
+        yield name, _EMPTY
 
 
-def sketch_figures(patch: pytest.MonkeyPatch) -> None:
-    """Let every report be written without its figures."""
+def sketch_figures(patch: pytest.MonkeyPatch, *, pause_s: float = 0.0) -> None:
+    """Let every report be written without its figures, with a pause after each of their files."""
+    patch.setattr(page, "drawn", undrawn)
     for module in PAGES:
-        patch.setattr(module, "publish", sketch)
-    patch.setattr(page, "event_figures", without_images)
+        patch.setattr(module, "publish", partial(sketch, pause_s=pause_s))

@@ -23,12 +23,12 @@ import resource
 import signal
 import sys
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 sys.path.insert(0, str(pathlib.Path(__file__).resolve().parents[1]))
 
-from sketches import PAGES, sketch
+import pytest
+from sketches import sketch_figures
 
 from iscat_analysis import pipeline  # what a run imports, before the clock runs
 from iscat_analysis.report import page
@@ -36,13 +36,12 @@ from iscat_analysis.search.sliding import chunks
 from iscat_cli import main
 
 LOADED = (pipeline, page)
-_SKETCH = partial(sketch, pause_s=0.01)  # a moment to be killed in, at each figure
 
 
 def _run(order: dict[str, Any]) -> int:
     if not order.get("figures"):
-        for module in PAGES:
-            module.publish = _SKETCH
+        # a moment to be killed in, at each figure
+        sketch_figures(pytest.MonkeyPatch(), pause_s=0.01)
     if "limit" in order:
         resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:

@@ -49,6 +49,9 @@ SMALL = {
     },
 }
 
+AS_CONFIGURED = {"optics": {"calibrate": "never"}}
+"""Where what is judged needs no optics learned, which takes ten times as long as the rest."""
+
 
 def _small(**sections: dict[str, Any]) -> Config:
     merged = {name: {**SMALL.get(name, {}), **sections.get(name, {})}
@@ -350,9 +353,8 @@ def test_the_pixel_size_comes_from_the_movie(tmp_path: Path) -> None:
     assert analysis.pixel_size_nm == pytest.approx(84.4)
     _assert_true(analysis.table, truth, "mass")
     other = config.camera.model_copy(update={"pixel_size_nm": 90.0})
-    disagreeing = fit_stack(
-        movie, config.model_copy(update={"camera": other}), out=tmp_path / "other"
-    )
+    wrong = config.model_copy(update={"camera": other, "optics": _small(**AS_CONFIGURED).optics})
+    disagreeing = fit_stack(movie, wrong, out=tmp_path / "other")
     assert any("84.4" in text and "90" in text for text in disagreeing.warnings)
 
 
@@ -389,7 +391,7 @@ def test_neighbours_are_told_apart_and_flagged(tmp_path: Path) -> None:
         {"frame": 30, "x_px": 30.0, "y_px": 40.0, "mass_kda": 1500.0},
         {"frame": 30, "x_px": 34.6, "y_px": 40.0, "mass_kda": 2000.0},
     ]
-    analysis, truth = _run(_small(simulation={"events": events}), tmp_path)
+    analysis, truth = _run(_small(**AS_CONFIGURED, simulation={"events": events}), tmp_path)
     fits = _match(analysis.table, truth)
     assert set(fits["status"]) == {"too_close"}
     pulls = (fits["mass_kda"] - truth["mass_kda"]) / fits["sigma_mass_kda"]
@@ -446,7 +448,7 @@ def test_a_field_smaller_than_the_region_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("moves", [False, True])
 def test_noise_and_drift_of_the_background(moves: bool, tmp_path: Path) -> None:
     rate = (0.002, -0.001) if moves else (0.0, 0.0)
-    found, _ = _run(_small(simulation={"drift_px_per_frame": rate}), tmp_path)
+    found, _ = _run(_small(**AS_CONFIGURED, simulation={"drift_px_per_frame": rate}), tmp_path)
     background = found.summary["background"]
     assert background["noise_frames"] == [1, 2, 3, 5, 7, 10, 15]
     # 16 rows of 68 pixels: robust variances are good to 1.65 √(2/1088), a few per cent.
