@@ -88,21 +88,21 @@ class _Growing:
     def rests(self) -> bool:
         """Look at the files, and tell whether they have not changed for some looks."""
         try:
-            found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files_of(self._path)]
+            files = files_of(self._path)
+            found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+            self._looks = self._looks + 1 if found == self._state else 0
+            rests = bool(found) and self._looks >= RESTS
+            written = rests and any(writer_of(f) is Writer.WITH_READERS for f in files)
         except OSError as error:
             self._say(f"{self._path}: cannot be read ({error.strerror}); waiting for it")
             return False
-        self._looks = self._looks + 1 if found == self._state else 0
         self._state = found
-        if not found or self._looks < RESTS:
-            return False
-        written = any(writer_of(Path(name)) is Writer.WITH_READERS for name, *_ in found)
         if written:
             self._say(
                 f"{self._path.name}: rests, but a program has it open to write and is waited for; "
                 "if that program is gone, press Ctrl-C: `iscat fit` analyses what it wrote"
             )
-        return not written
+        return rests and not written
 
     def analyse_what_is_there(self) -> None:
         """Analyse the frames that are there, if they are many more than before."""

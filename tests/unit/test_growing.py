@@ -214,6 +214,18 @@ def test_what_a_writer_left_open_is_said(
         assert "written until now" not in " ".join(movie.notes)
 
 
+def test_flags_of_older_files_are_not_believed(tmp_path: Path) -> None:
+    """Before version 3 of the superblock they may be set in any file."""
+    path = tmp_path / "movie.h5"
+    with h5py.File(tmp_path / "open.h5", "w", libver=("v108", "v108")) as file:
+        file["frames"] = np.ones((60, 32, 32), "u2")
+        file.flush()
+        shutil.copy(tmp_path / "open.h5", path)
+    assert path.read_bytes()[8:12] == b"\x02\x08\x08\x01"
+    with open_stack(path) as movie:
+        assert movie.read(0, 60).min() == 1
+
+
 def test_what_is_wrong_with_the_setup_is_not_waited_for(
     config: Config, counts: np.ndarray, tmp_path: Path
 ) -> None:
