@@ -20,8 +20,7 @@ from iscat_analysis.errors import ConfigError, DataError, IscatError
 from iscat_analysis.fitting.checkpoint import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack
-from iscat_analysis.movie.folders import files_of
-from iscat_analysis.movie.mapped import Writer, writer_of
+from iscat_analysis.movie.folders import files_of, is_open_to_write
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import Analysis, Progress, Status, silent
 from iscat_analysis.report.output import check_output
@@ -88,11 +87,10 @@ class _Growing:
     def rests(self) -> bool:
         """Look at the files, and tell whether they have not changed for some looks."""
         try:
-            files = files_of(self._path)
-            found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files]
+            found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files_of(self._path)]
             self._looks = self._looks + 1 if found == self._state else 0
             rests = bool(found) and self._looks >= RESTS
-            written = rests and any(writer_of(f) is Writer.WITH_READERS for f in files)
+            written = rests and is_open_to_write(self._path)
         except OSError as error:
             self._say(f"{self._path}: cannot be read ({error.strerror}); waiting for it")
             return False
