@@ -82,7 +82,11 @@ class Recorder:
                 )  # fmt: skip
         elif start == 0:
             array = zarr.create_array(
-                self._path, shape=(0, *part.shape[1:]), chunks=(20, 64, 64), dtype="u2"
+                self._path,
+                shape=(0, *part.shape[1:]),
+                chunks=(20, 64, 64),
+                shards=(40, 64, 64),
+                dtype="u2",
             )
             array.append(part)
         else:
