@@ -20,8 +20,7 @@ from iscat_analysis.errors import ConfigError, DataError, IscatError
 from iscat_analysis.fitting.checkpoint import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack
-from iscat_analysis.movie.folders import files_of
-from iscat_analysis.movie.mapped import Writer, writer_of
+from iscat_analysis.movie.folders import files_of, is_open_to_write
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.records import Analysis, Progress, Status, silent
 from iscat_analysis.report.output import check_output
@@ -89,20 +88,19 @@ class _Growing:
         """Look at the files, and tell whether they have not changed for some looks."""
         try:
             found = [(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files_of(self._path)]
+            self._looks = self._looks + 1 if found == self._state else 0
+            rests = bool(found) and self._looks >= RESTS
+            written = rests and is_open_to_write(self._path)
         except OSError as error:
             self._say(f"{self._path}: cannot be read ({error.strerror}); waiting for it")
             return False
-        self._looks = self._looks + 1 if found == self._state else 0
         self._state = found
-        if not found or self._looks < RESTS:
-            return False
-        written = any(writer_of(Path(name)) is Writer.WITH_READERS for name, *_ in found)
         if written:
             self._say(
                 f"{self._path.name}: rests, but a program has it open to write and is waited for; "
                 "if that program is gone, press Ctrl-C: `iscat fit` analyses what it wrote"
             )
-        return not written
+        return rests and not written
 
     def analyse_what_is_there(self) -> None:
         """Analyse the frames that are there, if they are many more than before."""

@@ -25,7 +25,7 @@ from iscat_analysis.errors import ConfigError, IscatError, SchedulerError
 from iscat_analysis.executors import THREADS
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.folders import files_of, find_movies
+from iscat_analysis.movie.folders import files_of, find_movies, is_open_to_write
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.mass_action import Model
@@ -245,9 +245,10 @@ def _state(address: Path) -> State | None:
 
 
 def _opens(address: Path) -> bool:
+    """Tell whether a movie can be read to its end, which one that is recorded does not have."""
     try:
         with open_stack(address):
-            return True
+            return not is_open_to_write(address)
     except (IscatError, OSError):
         return False
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import split_address
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, Writer, writer_of
 from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy
 from iscat_analysis.movie.ome import files_of_set, is_ome
 from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
@@ -53,6 +53,11 @@ def files_of(address: Path) -> tuple[Path, ...]:
     if path.is_dir():
         return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
     return members_of(address)
+
+
+def is_open_to_write(address: Path) -> bool:
+    """Tell whether a program records a movie, and lets others read it: see `writer_of`."""
+    return any(writer_of(file) is Writer.WITH_READERS for file in files_of(address))
 
 
 def members_of(address: Path) -> tuple[Path, ...]:

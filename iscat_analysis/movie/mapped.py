@@ -43,10 +43,10 @@ class Writer(Enum):
 
 
 def writer_of(path: Path) -> Writer:
-    """Read the flags of an HDF5 file, which superblocks have since version 2."""
+    """Read the flags of an HDF5 file, which mean that in superblocks since version 3."""
     with open_regular(path) as file:
         head = file.read(12)
-    if len(head) < 12 or not head.startswith(HDF5_SIGNATURE) or head[8] < 2:
+    if len(head) < 12 or not head.startswith(HDF5_SIGNATURE) or head[8] < 3:
         return Writer.NONE
     if not head[11] & _WRITE_ACCESS:
         return Writer.NONE

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Pattern, middle_of, pattern_of
+from iscat_analysis.camera.field_sample import FieldSample
 from iscat_analysis.config import MOVES, Config
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.stretches import Stretches
@@ -33,10 +34,10 @@ _HIDDEN = "partly hidden by bright or ill-described particles"
 
 
 @dataclass(frozen=True)
-class _Seen:
+class Seen:
     """What some frames next to each other show; nothing where they have no light.
 
-    The image is that of the middle of the field.
+    Of a large field, the noise is that of a sample of its pixels, and the image that of its middle.
     """
 
     light_e: float = math.nan
@@ -53,9 +54,8 @@ def timeline_of(ready: Prepared, found: DetectionResult, table: pd.DataFrame) ->
     starts = np.unique(np.linspace(first, last - together, _PLACES).astype(int)).tolist()
     kept = ready.stretches.kept if ready.stretches.breaks else ((first, last),)
     inside = [next((k for k, s in enumerate(kept) if s[0] <= f < s[1]), None) for f in starts]
-    camera = ready.camera
     seen = [
-        _Seen() if held is None else _look(ready.whole, camera, start, start + together)
+        Seen() if held is None else look_at(ready.whole, ready.camera, start, start + together)
         for start, held in zip(starts, inside, strict=True)
     ]
     drift_y, drift_x = _drift(seen, inside, additive=found.context.additive)
@@ -77,30 +77,37 @@ def _span(compared: Compared) -> tuple[int, int]:
     return min(s[0] for s in spans), max(s[1] for s in spans)
 
 
-def _look(movie: Stack, camera: Camera, start: int, stop: int) -> _Seen:
+def look_at(movie: Stack, camera: Camera, start: int, stop: int) -> Seen:
     """Measure light and noise of some frames, and the middle of their mean image."""
     counts = movie.read(start, stop)
     light, repeats = measure_frames(counts, camera)
     good = well_lit(light, DARK) & ~repeats
     if good.sum() < _FEWEST:
-        return _Seen()
-    electrons = camera.to_electrons(counts[good])
+        return Seen()
+    few, theirs = counts[good], camera
+    sample = FieldSample.of((movie.shape[1], movie.shape[2]))
+    if sample is not None:
+        few, theirs = sample.taken(few), sample.camera(camera)
+    electrons = theirs.to_electrons(few)
     power = electrons.mean(axis=(1, 2), keepdims=True)
     if power.min() <= 0:
-        return _Seen()
-    electrons *= power.mean() / power
+        return Seen()
+    steady = power.mean() / power
+    electrons *= steady
     mean = electrons.mean(axis=0)
-    used = (mean > _LIT * float(np.median(mean))) & ~camera.saturated(counts.max(axis=0))
-    expected = mean + camera.dark_variance_e2(counts)
+    used = (mean > _LIT * float(np.median(mean))) & ~theirs.saturated(few.max(axis=0))
+    expected = mean + theirs.dark_variance_e2(few)
     noise = math.nan
     if used.any():
         steps = np.mean(np.diff(electrons, axis=0) ** 2, axis=0)
         noise = float(steps[used].sum() / (2 * expected[used].sum()))
-    return _Seen(float(power.mean()), noise, mean[middle_of(mean.shape, _PATTERN_PX)].copy())
+    middle = middle_of(movie.shape, _PATTERN_PX)
+    image = camera.part(middle).to_electrons(counts[good][..., *middle]) * steady
+    return Seen(float(light[good].mean()), noise, image.mean(axis=0))
 
 
 def _drift(
-    seen: Sequence[_Seen], inside: Sequence[int | None], *, additive: bool
+    seen: Sequence[Seen], inside: Sequence[int | None], *, additive: bool
 ) -> tuple[list[float | None], list[float | None]]:
     """Follow the fixed pattern within each stretch, from where the one before ended."""
     moved = np.full((len(seen), 2), np.nan)

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cluster_worker import busy
-from distributed import Client
+from distributed import Client, Future
 from small_movies import SETUP
 
 import iscat_analysis as ia
@@ -179,16 +179,44 @@ def here(landing: Path) -> Path:
     return folder
 
 
+@contextmanager
+def bytes_sent(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[str, int]]:
+    """Count what goes to the workers, and what comes back."""
+    counted = {"there": 0, "back": 0}
+    submit, result = Client.submit, Future.result
+
+    def submitting(self: Client, *arguments: object, **options: object) -> Future:
+        counted["there"] += sum(len(each) for each in arguments if isinstance(each, bytes))
+        return submit(self, *arguments, **options)
+
+    def receiving(self: Future, *arguments: object) -> bytes:
+        found = result(self, *arguments)
+        counted["back"] += len(found)
+        return found
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Client, "submit", submitting)
+        patch.setattr(Future, "result", receiving)
+        yield counted
+
+
 def test_chunks_of_a_movie_give_the_same_bytes_when_a_worker_is_killed(
-    cluster: Workers, landing: Path, here: Path, tmp_path: Path
+    cluster: Workers, landing: Path, here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Workers read the movie themselves; only what they find travels."""
     cluster.add(2)
     out, config, told = tmp_path / "far.iscat", ia.configure(LANDING), []
-    with one_killed(cluster), places.open_executor(scheduler_file=cluster.file) as executor:
+    with (
+        one_killed(cluster),
+        bytes_sent(monkeypatch) as counted,
+        places.open_executor(scheduler_file=cluster.file) as executor,
+    ):
         fit_stack(
             landing, config, out=out, command="iscat-fit", executor=executor,
             progress=lambda *step: told.append(step),
         )  # fmt: skip
+    assert 0 < counted["there"] < 0.002 * landing.stat().st_size
+    assert 0 < counted["back"] < 0.1 * landing.stat().st_size
     chunks = json.loads((here / "summary.json").read_text())["landing"]["chunks"]
     assert [total for stage, _, total in told if stage == "landing"] == chunks * [FRAMES]
     assert told[-1] == ("landing", FRAMES, FRAMES)

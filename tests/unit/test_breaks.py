@@ -18,6 +18,8 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.stretches import find_stretches
 from iscat_analysis.diagnosis.turns import channels_of
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.movie import open_stack
+from iscat_analysis.pipeline.timeline import look_at
 from iscat_analysis.report.movie_figure import movie_figure
 from iscat_analysis.schemas.course import LeftOut, Timeline
 from iscat_analysis.study.simulate import Movie
@@ -300,3 +302,27 @@ def test_wrong_numbers_of_the_camera_are_not_called_saturation() -> None:
         check_counts(
             np.full_like(counts, 65535), 0, "m.tif", camera=Camera(1.0, full_scale_adu=65535)
         )
+
+
+@pytest.mark.parametrize("shape", [(120, 140), (640, 520)])
+def test_a_large_field_tells_its_noise_by_a_sample_and_its_drift_by_its_middle(
+    shape: tuple[int, int],
+) -> None:
+    """The noise has the value of all pixels, and the image is that of the middle."""
+    rng = np.random.default_rng(7)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    light = 5000 * (1 + 0.3 * np.sin(y / 40) * np.cos(x / 37))
+    flicker = 1 + 0.02 * rng.standard_normal((6, 1, 1))
+    counts = rng.poisson(light * flicker).astype(np.uint16)
+    camera = Camera(gain_e_per_adu=np.full(shape, 1.0), offset_adu=np.full(shape, 100.0))
+    with open_stack(counts + np.uint16(100)) as movie:
+        seen = look_at(movie, camera, 0, 6)
+    assert seen.light_e == pytest.approx(counts.mean(), rel=1e-9)
+    assert abs(seen.noise - 1) < 4 * np.sqrt(3 / 5 / min(counts[0].size, 2**16))
+    power = counts.mean(axis=(1, 2), keepdims=True)
+    mean = (counts * (power.mean() / power)).mean(axis=0)
+    middle = tuple(slice((n - min(n, 256)) // 2, (n + min(n, 256)) // 2) for n in shape)
+    np.testing.assert_allclose(seen.image, mean[middle], rtol=1e-3)
+    # control: a place beside the middle is another image
+    beside = np.roll(mean, 1, axis=1)[middle]
+    assert np.abs(beside / seen.image - 1).max() > 0.02

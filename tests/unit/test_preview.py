@@ -194,3 +194,31 @@ def test_bad_arguments_are_refused(landing) -> None:
         long = ia.configure(config, settings={"background.window_frames": 100})
         with pytest.raises(ia.DataError, match="window_frames"):
             ia.Preview(movie, long)
+
+
+class _Long:
+    """Frames of a movie again and again, without end; counts how many are read."""
+
+    dtype = np.dtype(np.uint16)
+
+    def __init__(self, counts: np.ndarray, frames: int) -> None:
+        self._counts, self.read = counts, 0
+        self.shape = (frames, *counts.shape[1:])
+
+    def __getitem__(self, key: slice) -> np.ndarray:
+        self.read += key.stop - key.start
+        return self._counts[np.arange(key.start, key.stop) % len(self._counts)]
+
+
+def test_a_sample_of_the_frames_is_read_however_long_a_movie_is(landing) -> None:
+    path, config = landing
+    counts, read = tifffile.imread(path).astype(np.uint16), []
+    for frames in (6_000, 60_000):
+        movie = _Long(counts, frames)
+        with ia.open_stack(movie) as stack:
+            look = ia.Preview(stack, config).look(frames // 2)
+            sampled = movie.read
+            look.found()
+        assert movie.read == sampled  # what was looked at is searched
+        read.append(sampled)
+    assert read[0] == read[1] < 4_000

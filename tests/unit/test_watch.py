@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from small_movies import SETUP, analysed, put_in_place_of_fits
@@ -72,6 +74,18 @@ def test_a_movie_that_rests_but_cannot_be_read_is_waited_for_a_while(folder: Pat
     (folder / "a.npy").write_bytes((folder / "a.npy").read_bytes()[:-10])
     assert [_names(seen.check()) for _ in range(MOST_CHECKS)] == [None] * MOST_CHECKS
     assert _names(seen.check()) == ["a.npy"]
+
+
+def test_a_movie_that_a_program_has_open_is_waited_for_a_while(folder: Path) -> None:
+    seen = _looks(folder)
+    with h5py.File(folder / "a.h5", "w", libver="latest") as file:
+        file["frames"] = COUNTS
+        file.swmr_mode = True
+        assert [_names(seen.check()) for _ in range(MOST_CHECKS)] == [None] * MOST_CHECKS
+        assert _names(seen.check()) == ["a.h5"]
+    os.utime(folder / "a.h5", (1, 1))
+    assert seen.check() is None
+    assert _names(seen.check()) == ["a.h5"]  # once it is closed
 
 
 def test_nothing_is_done_while_a_movie_that_was_taken_changes_or_is_gone(folder: Path) -> None:
