@@ -270,7 +270,7 @@ class TaskBuilder:
         frames = np.arange(patch.first, patch.first + known.size)
         seen, images = [], []
         for other in neighbours:
-            near = distance_px(other, step) < self._roi_px
+            near = self._neighbours.are_spheres or distance_px(other, step) < self._roi_px
             both = self._neighbours.shared(other, region) if near else None
             if both is None or not frames[0] < other.at.frame <= frames[-1]:
                 continue
@@ -281,6 +281,13 @@ class TaskBuilder:
                 padded += self._neighbours.crossed(step, other, region)
             seen.append(other)
             images.append(padded)
+        if self._neighbours.are_spheres:  # frames are set against their mean light, theirs included
+            cut = self._chunk.cut(int(frames[0]), int(frames[-1]) + 1)
+            light = 1 + self._neighbours.presence(step, cut) * image
+            light += sum(
+                self._neighbours.presence(s, cut) * own for s, own in zip(seen, images, strict=True)
+            )
+            images = [one / light for one in images]
         for other, height in zip(seen, crosstalk(patch, image, images), strict=True):
             known += other.sign * height * (frames >= other.at.turns[:, None]).mean(axis=0)
         own = self._neighbours.shared(step, region)

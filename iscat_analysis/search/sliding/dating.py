@@ -115,8 +115,10 @@ def locate_step(
     snr = abs(height) * math.sqrt(scale)
     turn, gap = best + 1, _gap(snr)
     rise, profile = find_rise(heights, weight, turn, float(log[best]), expected_rise)
+    sides = slice(0, max(turn - gap, 0)), slice(min(turn + gap, heights.size), heights.size)
+    for side in sides:
+        weight[side] /= _noise_ratio(patch, image, side)
     if rise is None:
-        sides = (slice(0, max(turn - gap, 0)), slice(turn + gap, None))
         p = min(_p_constant(heights[side], weight[side]) for side in sides)
     else:
         turn, height = rise.centre, rise.height
@@ -146,6 +148,20 @@ def frame_heights(patch: Patch, image: FloatArray) -> tuple[FloatArray, FloatArr
     zero = float(np.sum(weights * patch.gain * patch.offset))
     heights = (scores[0] - zero) / np.where(lit, power, 1.0) / scale
     return heights, np.where(lit, power, 0.0) * scale, scale
+
+
+def _noise_ratio(patch: Patch, image: FloatArray, frames: slice) -> float:
+    """Variance of the heights of some frames over that in the mean light: a particle adds light.
+
+    Shapes: `image` (ny, nx).
+    """
+    total, number, power = patch.window(patch.first + frames.start, patch.first + frames.stop)
+    if not number:
+        return 1.0
+    weights, _ = _projector(patch, image)
+    read = np.square(patch.read_noise_e)
+    here, usual = (float(np.sum(weights**2 * (e + read))) for e in (total / power, patch.mean_e))
+    return here / usual
 
 
 def _p_constant(heights: FloatArray, weight: FloatArray) -> float:
