@@ -68,6 +68,7 @@ APART = 1 / 8
 
 _LEAST_KNOWN = 1e-6  # of what a frame of one height would tell, is told by one of several
 _PASSES = 40
+_TURNED = 0.5  # share of a step by which the next goes back, where both go too far
 _GROWTH = 0.2  # largest relative change of the mass in a step, and of n − n_s
 _HALVINGS = 12
 
@@ -152,7 +153,7 @@ def common_sizes(
             abs(one.mass_kda / other.mass_kda - 1) < 1e-3 for other in found
         ):
             found.append(one)
-    return sorted(found, key=lambda one: (not one.converged, -one.log_likelihood))
+    return sorted(found, key=lambda one: -one.log_likelihood)
 
 
 def fit_common_size(
@@ -188,12 +189,17 @@ def fit_common_size(
     if not math.isfinite(here.value):
         return None
     converged = False
+    before, damping = np.zeros_like(rows), np.ones(len(rows))
     for _ in range(_PASSES):
         kept = _still_likely(here, rows, owners, APART * model.fringe_nm)
         if not kept.all():
             rows, owners = rows[kept], owners[kept]
+            before, damping = before[kept], damping[kept]
             here = gathered(rows, common)
         step, moves, gain = _scoring_step(here)
+        back = -np.sum(moves * before, axis=1) > _TURNED * np.sum(before**2, axis=1)
+        damping = np.where(back, damping / 2, damping)
+        before, moves = moves, damping[:, None] * moves
         if gain < TOLERANCE:
             converged = True
             break
