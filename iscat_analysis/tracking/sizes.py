@@ -144,8 +144,8 @@ def explained(
             alike = model.sphere.of_mass(size.mass_kda).homogeneous()
             tried, index = replace(model, sphere=alike), alike.index.real
         one = fit_common_size(
-            likelihoods, tried, size.places, z_range_nm,
-            mass_kda=size.mass_kda, index=index, motion=motion,
+            likelihoods, tried, size.likely, z_range_nm,
+            frames=size.frames, mass_kda=size.mass_kda, index=index, motion=motion,
         )  # fmt: skip
         if one is not None and one.converged:
             found.append(one)

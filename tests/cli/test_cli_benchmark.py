@@ -50,6 +50,24 @@ def test_benchmark(
     assert "--overwrite" in capsys.readouterr().err
 
 
+@pytest.mark.large
+def test_benchmark_of_spheres(
+    sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The diameter is scored; estimators of others do not know it."""
+    config, out = str(sample_configs["size"]), tmp_path / "out"
+    arguments = ["benchmark", "--config", config, "--out", str(out), "--trials", "20", *SMALL]
+    assert main([*arguments, "--estimator", "iscat"]) == 2
+    assert "of dipoles" in capsys.readouterr().err
+    assert main([*arguments, "--set", "bounds.photons_per_pixel=1e4"]) == 0
+    assert "diameter_nm" in capsys.readouterr().out
+    written = json.loads((out / "benchmark.json").read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator(schema("benchmark")).validate(written)
+    assert not {"mass", "joint"} & set(written)
+    assert 0.5 < written["size"]["diameter_nm"]["spread_over_crb"] < 1.7
+    assert "diameter [nm]" in (out / "benchmark.html").read_text(encoding="utf-8")
+
+
 def test_benchmark_refuses_too_few_trials(
     sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
