@@ -177,7 +177,7 @@ def step_controls(
             parts, light = [], []
             for cut in _cuts(chunk, start, stop):
                 power = float(chunk.power[cut].sum())
-                sum_e = _summed(chunk, cut, box)
+                sum_e = chunk.electrons(cut, box)
                 known = np.zeros(chunk.shape)
                 for s in near:
                     known[neighbours.box(s)] += neighbours.presence(s, cut) * s.image
@@ -207,13 +207,6 @@ def _cuts(chunk: Chunk, start: int, stop: int) -> Iterator[slice]:
     for a, b in pairwise(edges):
         if b > a:
             yield slice(int(good[a]), int(good[b - 1]) + 1)
-
-
-def _summed(chunk: Chunk, cut: slice, box: Box) -> FloatArray:
-    """Sum frames over a box of pixels."""
-    span = chunk.first + cut.start, chunk.first + cut.stop
-    rows, columns = (part.indices(n)[:2] for part, n in zip(box, chunk.shape, strict=True))
-    return chunk.patch(*span, rows, columns).window(*span)[0]
 
 
 # ---- background frames -----------------------------------------------------------------------

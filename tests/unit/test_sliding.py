@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.camera.background import find_defects
@@ -26,7 +27,7 @@ from iscat_analysis.search.sliding import (
     measure_noise,
     sliding_maps,
 )
-from iscat_analysis.search.sliding.stored import StoredFrames
+from iscat_analysis.search.sliding.stored import HeldRegions, StoredFrames
 
 SHAPE = (40, 44)
 SIGMAS = 4.0
@@ -97,6 +98,25 @@ def test_maps_of_the_camera_enter_pixel_by_pixel() -> None:
     np.testing.assert_allclose(summed, electrons[4:8, 5:15, 7:20].sum(axis=0))
     assert frames == 4
     assert power == pytest.approx(chunk.power[4:8].sum())
+    here = slice(5, 15), slice(7, None)
+    np.testing.assert_allclose(
+        chunk.electrons(slice(4, 8), here), electrons[(slice(4, 8), *here)].sum(axis=0)
+    )
+
+
+def test_frames_of_a_region_are_copied_once() -> None:
+    """Whatever is asked for between, before and behind them, and of places that are long ago."""
+    counts = np.random.default_rng(2).integers(0, 200, (300, 8, 9)).astype("u2")
+    held, copied = HeldRegions(), []
+
+    def copy(frames: slice, rows: tuple[int, int], columns: tuple[int, int]) -> NDArray[Any]:
+        copied.append(frames.stop - frames.start)
+        return counts[frames, slice(*rows), slice(*columns)].copy()
+
+    for start, stop in ((50, 80), (60, 70), (40, 60), (75, 100), (45, 95), (280, 300), (90, 90)):
+        found = held.frames(slice(start, stop), (2, 6), (1, 9), copy)
+        np.testing.assert_array_equal(found, counts[start:stop, 2:6, 1:9])
+    assert copied == [30, 10, 20, 20]
 
 
 @pytest.mark.parametrize("stored", ["u1", ">u2", "u2", "i4", "f4", "f8"])

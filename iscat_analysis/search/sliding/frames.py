@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +13,8 @@ from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
-from iscat_analysis.search.sliding.stored import StoredFrames
-from iscat_analysis.search.sliding.tiles import FieldSums
+from iscat_analysis.search.sliding.stored import HeldRegions, StoredFrames
+from iscat_analysis.search.sliding.tiles import Box, FieldSums
 
 HALF = 0.5
 """Share of the usual light, below which a shutter is not open."""
@@ -48,6 +48,7 @@ class Chunk:
     check: Callable[[], None]
     let_go: Callable[[], None]  # of pages of the file, once a region was copied
     level_e: float  # mean light of a pixel and frame, of the whole field
+    _regions: HeldRegions = field(init=False, repr=False, default_factory=HeldRegions)
 
     @property
     def stop(self) -> int:
@@ -70,7 +71,7 @@ class Chunk:
         self.check()
         here, pixels = self.cut(start, stop), (slice(*rows), slice(*columns))
         camera = self.camera
-        counts = self._copied(here, rows, columns)
+        counts = self._regions.frames(here, rows, columns, self._copied)
         return Patch(
             first=self.first + here.start,
             counts=counts,
@@ -82,6 +83,24 @@ class Chunk:
             mean_e=self.mean_e[pixels],
             usable=self.usable[pixels],
         )
+
+    def electrons(self, frames: slice, box: Box) -> FloatArray:
+        """Sum the good ones of some frames of the chunk over a box of pixels, without a copy.
+
+        Shapes: result (ny, nx).
+        """
+        self.check()
+        counts, (top, left) = self.counts.whole(frames.start, frames.stop)
+        rows, columns = (part.indices(n) for part, n in zip(box, self.shape, strict=True))
+        sums = np.zeros((rows[1] - rows[0], columns[1] - columns[0]))
+        good = self.good[frames]
+        block_sums(
+            counts, (top + rows[0], left + columns[0]), good,
+            row_of_sums(counts.dtype, sums.shape[1]), sums, np.empty((0, 0), dtype=counts.dtype),
+        )  # fmt: skip
+        self.let_go()
+        dark = np.count_nonzero(good) * _at(self.camera.offset_adu, box)
+        return np.asarray(_at(self.camera.gain_e_per_adu, box) * (sums - dark))
 
     def _copied(
         self, frames: slice, rows: tuple[int, int], columns: tuple[int, int]
@@ -415,7 +434,8 @@ def _region(
     ends = zip((rows, columns), counts.shape[1:], strict=True)
     if not all(0 <= low <= high <= size for (low, high), size in ends):
         raise IndexError(f"rows {rows} and columns {columns} of frames of shape {counts.shape[1:]}")
-    return counts.array(frames.start, frames.stop, (slice(*rows), slice(*columns))).copy()
+    seen = counts.array(frames.start, frames.stop, (slice(*rows), slice(*columns)))
+    return seen if seen.base is None else seen.copy()
 
 
 def _at(value: float | FloatArray, here: tuple[slice, slice]) -> Any:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -11,6 +13,11 @@ from numpy.typing import NDArray
 
 from iscat_analysis.records import CountSource, InPlace, PlacedSource
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
+
+_REGION_BYTES = 1e8  # of regions that are held
+_SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
+_NO_COUNTS: NDArray[Any] = np.empty((0, 0, 0))
+_Region = tuple[tuple[int, int], tuple[int, int]]  # rows and columns
 
 
 class StoredFrames:
@@ -62,6 +69,43 @@ class StoredFrames:
         if len(seen._parts) == 1 and seen._parts[0].flags.c_contiguous:
             return seen._parts[0], (self._rows[0], self._columns[0])
         return np.ascontiguousarray(seen.array(0, stop - start)), (0, 0)
+
+
+class HeldRegions:
+    """The regions that were copied last: steps at one place ask for them in each of their fits."""
+
+    def __init__(self) -> None:
+        self._held: OrderedDict[_Region, tuple[int, NDArray[Any]]] = OrderedDict()
+        self._lock = Lock()
+
+    def frames(
+        self,
+        wanted: slice,
+        rows: tuple[int, int],
+        columns: tuple[int, int],
+        copied: Callable[[slice, tuple[int, int], tuple[int, int]], NDArray[Any]],
+    ) -> NDArray[Any]:
+        """Give frames of a region, of which those that are not held yet are copied.
+
+        Shapes: result (t, y, x).
+        """
+        with self._lock:
+            low, held = self._held.get((rows, columns), (wanted.start, _NO_COUNTS))
+        high = low + len(held)
+        first, last = min(low, wanted.start), max(high, wanted.stop)
+        if last - first > _SPREAD * (len(held) + wanted.stop - wanted.start):
+            return copied(wanted, rows, columns)
+        parts = [copied(slice(first, low), rows, columns)] if first < low else []
+        parts += [held] if len(held) else []
+        parts += [copied(slice(high, last), rows, columns)] if high < last or not parts else []
+        counts = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        with self._lock:
+            self._held[rows, columns] = first, counts
+            self._held.move_to_end((rows, columns))
+            size = sum(part.nbytes for _, part in self._held.values())
+            while size > _REGION_BYTES:
+                size -= self._held.popitem(last=False)[1][1].nbytes
+        return counts[wanted.start - first : wanted.stop - first]
 
 
 def frames_in_place(movie: CountSource, start: int, stop: int) -> list[InPlace]:
