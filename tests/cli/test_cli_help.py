@@ -139,7 +139,7 @@ def test_every_example_runs(
         arguments += [f"--set={change}" for change in SMALL]
     if "--trials" in arguments:
         arguments += ["--no-posterior", "--set", "fit.roi_nm=900"]
-        arguments[arguments.index("--trials") + 1] = "10"  # fewer; the shape stays the same
+        arguments[arguments.index("--trials") + 1] = "20"  # fewer; the shape stays the same
     if "pupil" in arguments:  # test_pupil_search goes the whole way
         arguments += ["--free", "focus,phase", "--set", "bounds.pixels=25"]
     capsys.readouterr()

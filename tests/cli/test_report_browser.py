@@ -121,7 +121,7 @@ def written(
              "--set", "simulation.frames=200", "--set", "simulation.events=[]"],
             ["calibrate", "camera", str(movie), "--dark", str(shade),
              "--out", str(folder / "camera")],
-            ["benchmark", "--config", str(sample_configs["joint"]), "--trials", "10",
+            ["benchmark", "--config", str(sample_configs["joint"]), "--trials", "20",
              "--set", "fit.roi_nm=900", "--set", "fit.z_range_nm=[0,300]",
              "--no-posterior", "--out", str(folder / "study")],
             ["bounds", "--preset", "dong2021", "--out", str(folder / "paper")],
