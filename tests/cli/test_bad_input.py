@@ -67,6 +67,7 @@ def _listing(folder: Path) -> dict[str, int]:
     }
 
 
+@pytest.mark.usefixtures("sketched")
 def test_the_movie_of_these_tests_is_good(movie: Path, capsys) -> None:
     """Control: without a fault it is analysed."""
     none = ["--set", "detection.false_alarms_per_movie=1e-6"]
@@ -298,6 +299,7 @@ def test_a_map_of_another_size(refused: Run, movie: Path, tmp_path: Path) -> Non
 # ---- output ----------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("sketched")
 def test_output_folder_with_results(refused: Run, movie: Path, capsys) -> None:
     assert main_fit([str(movie), *GOOD, "--quiet"]) == 0
     capsys.readouterr()

@@ -109,6 +109,7 @@ def test_every_example_runs(
     for source in laboratory.iterdir():
         (shutil.copytree if source.is_dir() else shutil.copy)(source, tmp_path / source.name)
     monkeypatch.chdir(tmp_path)
+    sketch_figures(monkeypatch)
     program, *arguments = shlex.split(example)
     redirected: Path | None = None
     if ">" in arguments:
@@ -126,7 +127,6 @@ def test_every_example_runs(
         Path("measurements/monday").mkdir(parents=True)
         monkeypatch.setattr("tornado.platform.asyncio.BaseAsyncIOLoop.start", _interrupt)
     if "samples.csv" in arguments:
-        sketch_figures(monkeypatch)
         Path("samples.csv").write_text("path,sample\nmovie.tif,protein\n", encoding="utf-8")
         assert main(["simulate", "--config", "setup.toml", "--out", "movie.tif"]) == 0
     if "movie.tif" in arguments and "simulate" not in arguments:
@@ -137,10 +137,7 @@ def test_every_example_runs(
         arguments += ["--free", "focus,phase"]
     if "simulate" in arguments:
         arguments += [f"--set={change}" for change in SMALL]
-    if "challenge" in arguments:
-        sketch_figures(monkeypatch)
     if "--trials" in arguments:
-        sketch_figures(monkeypatch)
         arguments += ["--no-posterior", "--set", "fit.roi_nm=900"]
         arguments[arguments.index("--trials") + 1] = "20"  # fewer; the shape stays the same
     if "pupil" in arguments:  # test_pupil_search goes the whole way

@@ -173,7 +173,7 @@ def test_particles_that_move_are_told_from_those_that_land(
     movie = tmp_path / "moving.tif"
     changes = [
         *LANDING[:3], "simulation.count=0", "fit.mode=track", "camera.frame_rate_hz=331",
-        "simulation.movers=[{count=4, mass_kda=900.0, d_um2_s=0.15}]", "simulation.shape=[96, 96]",
+        "simulation.movers=[{count=4, mass_kda=900.0, d_um2_s=0.15}]", "simulation.shape=[72, 72]",
     ]  # fmt: skip
     options = [f"--set={change}" for change in changes]
     assert main(["simulate", "--config", str(sample_configs["landing"]), "--out", str(movie),
@@ -226,7 +226,7 @@ def test_an_interrupted_question_writes_nothing(imagej: Path, monkeypatch, capsy
 def test_fit_finds_the_file_beside_the_movie(plain: Path, tmp_path: Path, capsys) -> None:
     assert main(["init", str(plain), "--yes", "--pixel-size-nm=84", "--na=1.4", "--quiet"]) == 0
     capsys.readouterr()
-    changes = ["--set", "optics.calibrate=never", "--json"]
+    changes = ["--set", "optics.calibrate=never", "--set", "fit.spheres=[]", "--json"]
     assert main_fit([str(plain), *changes]) == 0
     shown = capsys.readouterr()
     said = f"the configuration is {plain.with_name('iscat.toml')}, which lies beside the movie"

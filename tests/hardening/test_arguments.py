@@ -57,7 +57,7 @@ def one_line(error: Exception) -> None:
     assert len(str(error).splitlines()) == 1, repr(str(error))
 
 
-@settings(max_examples=400)
+@settings(max_examples=150)
 @given(values=TABLES)
 @example(values={"str": {}})
 @example(values={"optics": {"float": 1}})
@@ -67,7 +67,7 @@ def test_any_mapping_is_a_configuration_or_refused(values: dict[str, Any]) -> No
         assert parse_config(found.model_dump()) == found
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(text=st.text(max_size=200) | st.lists(st.sampled_from(
     ["[optics]", "[camera", "na = 1.3", "pixel_size_nm = ", "nan", "-inf", "[[simulation.events]]",
      "frame = 3", "\n", "=", "'", '"""', "{", "}", "[" * 300, "a." * 300, "1e999", "0x", "#", ","]
@@ -90,7 +90,7 @@ def test_any_bytes_are_a_configuration_or_refused(raw: bytes) -> None:
             load_config(path)
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(
     overrides=st.lists(
         st.text(max_size=20)
@@ -199,12 +199,12 @@ def test_watching_ends_nowhere(nowhere: Path) -> None:
 def test_any_command_line_ends_well(nowhere: Path, repetitions: Callable[[int, int], int]) -> None:
     before = set(nowhere.iterdir())
 
-    @settings(max_examples=repetitions(120, 300))
+    @settings(max_examples=repetitions(60, 300))
     @given(arguments=ARGUMENTS)
     def umbrella(arguments: list[str]) -> None:
         run(main, arguments)
 
-    @settings(max_examples=repetitions(80, 200))
+    @settings(max_examples=repetitions(40, 200))
     @given(arguments=ARGUMENTS)
     def fit(arguments: list[str]) -> None:
         run(main_fit, arguments)

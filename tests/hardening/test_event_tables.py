@@ -24,6 +24,10 @@ WRONG = [
     *({"mass_kda": value} for value in MASSES),
     *({"sigma_mass_kda": value} for value in ERRORS),
 ]
+ASKED = [
+    *itertools.product(("mass_kda", "sigma_mass_kda"), (1e300, NONE, 1e150, 1e-320)),
+    *itertools.product(("snr", "frame", "x_px"), (NONE, 1e-320)),
+]
 
 
 def events(**wrong: float) -> pd.DataFrame:
@@ -39,10 +43,17 @@ def events(**wrong: float) -> pd.DataFrame:
     return table
 
 
-@pytest.mark.parametrize("wrong", WRONG, ids=str)
-def test_species_leave_out_what_no_particle_has(wrong: dict[str, float]) -> None:
+@pytest.fixture(scope="module")
+def expected() -> ia.Distribution:
+    """Find the species of the others."""
     rest = events()[1:].reset_index(drop=True)
-    expected = ia.find_species(rest, k=2, draws=0, above_kda=20.0)
+    return ia.find_species(rest, k=2, draws=0, above_kda=20.0)
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
+def test_species_leave_out_what_no_particle_has(
+    wrong: dict[str, float], expected: ia.Distribution
+) -> None:
     said: list[str] = []
     found = ia.find_species(events(**wrong), k=2, draws=0, above_kda=20.0, notify=said.append)
     pd.testing.assert_frame_equal(found.species, expected.species)
@@ -58,8 +69,7 @@ def test_possible_masses_are_kept() -> None:
         assert not any("without a mass" in note for note in said)
 
 
-@pytest.mark.parametrize("value", [1e300, NONE, 1e150, 1e-320])
-@pytest.mark.parametrize("column", ["mass_kda", "sigma_mass_kda", "snr", "frame", "x_px"])
+@pytest.mark.parametrize(("column", "value"), ASKED)
 def test_any_question_about_them_has_an_answer(column: str, value: float) -> None:
     wrong = events(**{column: value})
     samples = pd.DataFrame({"concentration_nm": [3.0, 30.0]})

@@ -380,27 +380,24 @@ def test_nothing_that_is_read_can_run_code() -> None:
     sent = {ROOT / "iscat_analysis" / name for name in piped}
     forbidden_imports = {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "yaml"}
     forbidden_calls = {"eval", "exec", "read_pickle", "to_pickle"}
-    offenders = []
+    offenders: list[tuple[Path, int]] = []
     for path in [*(ROOT / "iscat_analysis").rglob("*.py"), *(ROOT / "cli").rglob("*.py")]:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            where = f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
+            bad = False
             if isinstance(node, ast.Import):
                 names = {alias.name.split(".")[0] for alias in node.names}
-                names -= {"pickle"} if path in sent else set()
-                offenders += [where] if names & forbidden_imports else []
+                bad = bool((names - ({"pickle"} if path in sent else set())) & forbidden_imports)
             elif isinstance(node, ast.ImportFrom):
-                root = (node.module or "").split(".")[0]
-                offenders += [where] if root in forbidden_imports else []
+                bad = (node.module or "").split(".")[0] in forbidden_imports
             elif isinstance(node, ast.Call):
-                name = ast.unparse(node.func)
-                if name.rpartition(".")[2] in forbidden_calls or name == "pickle.load":
-                    offenders.append(where)
+                last = getattr(node.func, "attr", getattr(node.func, "id", ""))
+                name = ast.unparse(node.func) if last == "load" else last
                 allowed = [word for word in node.keywords if word.arg == "allow_pickle"]
                 said = [ast.unparse(word.value) for word in allowed]
-                if name in ("np.load", "numpy.load") and said != ["False"]:
-                    offenders.append(where)
-                if said not in ([], ["False"]):
-                    offenders.append(where)
+                bad = last in forbidden_calls or name == "pickle.load"
+                bad = bad or (name in ("np.load", "numpy.load") and said != ["False"])
+                bad = bad or said not in ([], ["False"])
+            offenders += [(path, node.lineno)] if bad else []
     assert offenders == []
 
 

@@ -28,6 +28,7 @@ from report_factory import make_analysis
 from sketches import sketch_figures
 from small_movies import LANDING
 
+from iscat_analysis._kernels import record_checksums
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
@@ -138,13 +139,14 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     bench = tmp_path_factory.mktemp("bench")
     (bench / "setup.toml").write_text(SETUP)
     write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
-    # Kernels of their own, which no other test compiles again while files may not grow.
     kernels = tmp_path_factory.mktemp("kernels")
-    shutil.copytree(os.environ["NUMBA_CACHE_DIR"], kernels, dirs_exist_ok=True)
     runner = Runner(bench, kernels)
-    # In a process of its own, at whose end all that it compiled is kept for those that are killed.
-    (first,) = runner.run({"run": FIT, "cwd": str(bench)})
+    first = runner.here({"run": FIT, "cwd": str(bench)})
     assert first["status"] == 0, first["err"]
+    # All that this run compiled is kept for those that are killed, in a folder of their own, in
+    # which no other test compiles again while files may not grow.
+    record_checksums()
+    shutil.copytree(os.environ["NUMBA_CACHE_DIR"], kernels, dirs_exist_ok=True)
     return runner
 
 
@@ -268,8 +270,6 @@ def landing(
     (place / "setup.toml").write_text(LANDING)
     write_stack(load_config(place / "setup.toml"), place / "movie.tif")
     order = {"run": FIT, "cwd": str(place), "memory_share": 0.0031}
-    runner.run(order)  # compiles what landing movies need
-    shutil.rmtree(place / "result")
     whole = runner.here(order)
     assert whole["status"] == 0, whole["err"]
     assert not (place / ".result.partial").exists()

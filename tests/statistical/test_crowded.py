@@ -126,9 +126,11 @@ def test_the_same_particles_through_the_configured_optics_are_not_described(
     assert not (_analysed(bound[1], "never").table["status"] == "ok").any()
 
 
-def _fitted(instrument: Instrument, landings: Landings) -> tuple[list[Event], np.ndarray]:
+def _fitted(
+    instrument: Instrument, landings: Landings, side: int = 160
+) -> tuple[list[Event], np.ndarray]:
     """Give what is found in one frame after one, of 2e7 photoelectrons; distances to the truth."""
-    shape = (2, 160, 160)
+    shape = (2, side, side)
     movie = InstrumentMovie(
         instrument, shape, landings, seed=3, level_e=2e7, gain_e_per_adu=1000.0
     )  # fmt: skip
@@ -155,19 +157,24 @@ def _fitted(instrument: Instrument, landings: Landings) -> tuple[list[Event], np
     return found, apart
 
 
+def _dense() -> tuple[list[Event], np.ndarray, Landings]:
+    """Fit 30 particles of which many are hidden at first; give the true ones too."""
+    landings = draw_landings((2, 114, 114), 30, seed=3, frame=1, apart_px=14.0)
+    return *_fitted(Instrument(emission="reciprocal"), landings, 114), landings
+
+
 def test_particles_that_poor_fits_conceal_are_found_together() -> None:
     """Of several that are missing around a known one, none explains most of what it leaves over."""
-    landings = draw_landings((2, 160, 160), 60, seed=3, frame=1, apart_px=14.0)
-    found, apart = _fitted(Instrument(emission="reciprocal"), landings)
-    assert len(found) == 60
-    assert (apart < 2).sum() == 60
-    assert sum(not e.flags for e in found) >= 58
+    found, apart, landings = _dense()
+    assert len(found) == 30
+    assert (apart < 2).sum() == 30
+    assert sum(not e.flags for e in found) >= 29
     truth = landings.mass_kda[apart.argmin(axis=1)]
     pulls = np.array(
         [(e.fit.mass_kda - m) / e.fit.sigma[3] for e, m in zip(found, truth, strict=True)]
     )
-    assert abs(pulls.mean()) < SIGMAS / math.sqrt(60)
-    assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * 60)
+    assert abs(pulls.mean()) < SIGMAS / math.sqrt(30)
+    assert abs(pulls.std() - 1) < SIGMAS / math.sqrt(2 * 30)
 
 
 @pytest.mark.large
@@ -175,9 +182,8 @@ def test_particles_tried_one_by_one_stay_concealed(monkeypatch: pytest.MonkeyPat
     """Control, in which large ones, which are tried one by one, are not looked for either."""
     monkeypatch.setattr(field, "_with_concealed", lambda *_: None)
     monkeypatch.setattr(field, "_large_ones", lambda _, windows, *__: ([], windows))
-    landings = draw_landings((2, 160, 160), 60, seed=3, frame=1, apart_px=14.0)
-    found, _ = _fitted(Instrument(emission="reciprocal"), landings)
-    assert sum(not e.flags for e in found) < 50
+    found, *_ = _dense()
+    assert sum(not e.flags for e in found) < 25
 
 
 @pytest.mark.large

@@ -18,7 +18,7 @@ SETTINGS = [
     "calibration.gradient_per_kda=-3.1e-5", "posterior.enabled=false",
     "detection.false_alarms_per_movie=1e-3", f"simulation.shape=[{SIDE},{SIDE}]",
     f"simulation.frames={FRAMES}", "simulation.photons_per_pixel=2e5",
-    f"background.window_frames={WINDOW}",
+    f"background.window_frames={WINDOW}", "fit.spheres=[]",
 ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 from microscopes import configuration, setting
+from sketches import sketch_figures
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
@@ -255,7 +256,9 @@ def _text(value: object) -> str:
 
 def test_study_is_written_whole(study: dict[str, object], tmp_path) -> None:
     folder = tmp_path / "out"
-    write_benchmark(study, folder)
+    with pytest.MonkeyPatch.context() as patch:
+        sketch_figures(patch)
+        write_benchmark(study, folder)
     (folder / "benchmark.json").write_text("{}")
     with pytest.raises(DataError, match="overwrite"):
         write_benchmark(study, folder)

@@ -49,14 +49,24 @@ def test_frames_without_their_first_or_last_rows_are_told() -> None:
     assert not cut_off(dim, Camera()).any()  # as in dark field
 
 
+@pytest.fixture(scope="module")
+def wholes() -> dict[str, ia.Result]:
+    """Fit the movies of which no frame is cut off."""
+    return {
+        way: ia.fit_movie(_counts(_config(way)), config=_config(way))
+        for way in ("fixed", "sliding")
+    }
+
+
 @pytest.mark.parametrize("way", ["fixed", "sliding"])
 @pytest.mark.parametrize("filled", [0, OFFSET])
 @pytest.mark.parametrize("number", [20, 60])
-def test_half_a_frame_is_left_out_of_sums(way: str, filled: int, number: int) -> None:
+def test_half_a_frame_is_left_out_of_sums(
+    way: str, filled: int, number: int, wholes: dict[str, ia.Result]
+) -> None:
     """In the background as well as after it; what the others say of the particle stays."""
     config = _config(way)
-    counts = _counts(config)
-    whole = ia.fit_movie(counts, config=config)
+    counts, whole = _counts(config), wholes[way]
     assert not [text for text in whole.warnings if "cut off" in text]
     counts[number, 24:] = filled
     result = ia.fit_movie(counts, config=config)

@@ -141,6 +141,20 @@ def dimers() -> list[pd.DataFrame]:
     return draw_series(random, "dimer", totals, 10.0, [66.0], number=900, efficiency=EFFICIENCY)
 
 
+@pytest.fixture(scope="module")
+def free(dimers) -> ia.Binding:
+    """Fit K_D and the exponent of the landings."""
+    return ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0])
+
+
+@pytest.fixture(scope="module")
+def held(dimers) -> ia.Binding:
+    """Fit K_D alone."""
+    return ia.fit_kd(
+        DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=LANDING_POWER
+    )
+
+
 def test_kd_is_found_and_its_ends_are_where_the_profile_says(dimers) -> None:
     found = ia.fit_kd(DIMER, tables=dimers, model="dimer")
     assert any("the monomer was taken for the peak at" in note for note in found.notes)
@@ -177,12 +191,9 @@ def test_parameters_that_are_no_numbers_have_no_likelihood() -> None:
     assert np.isnan(slopes).any()
 
 
-def test_landings_that_are_taken_alike_change_kd(dimers) -> None:
-    right = ia.fit_kd(
-        DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=LANDING_POWER
-    ).fit
+def test_landings_that_are_taken_alike_change_kd(dimers, held) -> None:
     alike = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=0.0).fit
-    assert alike.kd_nm > 1.1 * right.kd_nm
+    assert alike.kd_nm > 1.1 * held.fit.kd_nm
 
 
 def test_a_mass_in_another_unit_is_refused(dimers) -> None:
@@ -218,15 +229,11 @@ def test_peaks_that_are_no_ladder_need_the_mass() -> None:
         ia.fit_kd(DIMER, tables=tables, model="dimer")
 
 
-def test_an_exponent_that_is_held_makes_the_interval_narrower(dimers) -> None:
-    free = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0]).fit
-    held = ia.fit_kd(
-        DIMER, tables=dimers, model="dimer", masses_kda=[66.0], landing_power=LANDING_POWER
-    ).fit
-    assert held.landing_power == LANDING_POWER
-    assert held.landing_power_se == 0
-    assert 0.05 < free.landing_power_se < 0.17
-    assert held.kd_high / held.kd_low < 0.85 * free.kd_high / free.kd_low
+def test_an_exponent_that_is_held_makes_the_interval_narrower(free, held) -> None:
+    assert held.fit.landing_power == LANDING_POWER
+    assert held.fit.landing_power_se == 0
+    assert 0.05 < free.fit.landing_power_se < 0.17
+    assert held.fit.kd_high / held.fit.kd_low < 0.85 * free.fit.kd_high / free.fit.kd_low
 
 
 def test_two_partners() -> None:
@@ -263,7 +270,7 @@ def test_an_end_that_the_data_do_not_set_is_open() -> None:
     assert any("higher concentrations" in note for note in found.notes)
 
 
-def test_samples_are_read_and_results_written(dimers, tmp_path: Path) -> None:
+def test_samples_are_read_and_results_written(dimers, free, tmp_path: Path) -> None:
     for number, table in enumerate(dimers):
         table.to_csv(tmp_path / f"{number}.csv", index=False)
     rows = DIMER.assign(path=[f"{n}.csv" for n in range(4)], replicate=1, role="sample")
@@ -271,8 +278,7 @@ def test_samples_are_read_and_results_written(dimers, tmp_path: Path) -> None:
     rows.to_csv(tmp_path / "samples.csv", index=False)
     out = tmp_path / "out"
     found = ia.fit_kd(tmp_path / "samples.csv", model="dimer", masses_kda=[66.0], out=out)
-    same = ia.fit_kd(DIMER, tables=dimers, model="dimer", masses_kda=[66.0])
-    assert found.fit.kd_nm == pytest.approx(same.fit.kd_nm, rel=1e-6)
+    assert found.fit.kd_nm == pytest.approx(free.fit.kd_nm, rel=1e-6)
     assert sorted(path.name for path in out.iterdir()) == [
         ".iscat-files", "figures", "kd.csv", "kd.json",
     ]  # fmt: skip

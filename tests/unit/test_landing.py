@@ -727,6 +727,7 @@ def test_without_a_pattern_there_is_nothing_to_correct() -> None:
     assert any("no fixed pattern" in line for line in told)
 
 
+@pytest.mark.usefixtures("sketched")
 def test_chains_reach_the_report(movie: Path, tmp_path: Path) -> None:
     config = _config("posterior.enabled=true", "posterior.steps=300", "fit.frames=[40, 190]")
     out = tmp_path / "sampled.iscat"
@@ -737,7 +738,7 @@ def test_chains_reach_the_report(movie: Path, tmp_path: Path) -> None:
     row = result.table.iloc[0]
     assert first.samples[..., 2].std() == pytest.approx(row["sigma_mass_kda"], rel=0.15)
     assert (out / "report.html").is_file()
-    assert list((out / "figures").glob("corner_*.png"))
+    assert list((out / "figures").glob("corner_*.svg"))
 
 
 def test_an_interrupt_of_the_chains_keeps_the_fits(

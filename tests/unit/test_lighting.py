@@ -213,8 +213,8 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
     ]
     config = make_config(
         background={"method": "sliding", "frames": None, "window_frames": 40},
-        fit={"frames": None}, camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
-        detection={"false_alarms_per_movie": 1e-3},
+        fit={"frames": None, "spheres": []}, camera={"gain_e_per_adu": 4.0},
+        optics={"calibrate": "never"}, detection={"false_alarms_per_movie": 1e-3},
         simulation={"shape": [64, 64], "frames": 150, "photons_per_pixel": 1e5, "events": events},
     )  # fmt: skip
     rng = np.random.default_rng(6)
@@ -238,7 +238,7 @@ def test_fringes_that_change_between_a_background_and_what_follows(
 ) -> None:
     """As where the laser hops to another mode: within either they stand still."""
     config = make_config(
-        background={"method": "fixed", "frames": [0, 40]}, fit={"frames": [40, 80]},
+        background={"method": "fixed", "frames": [0, 40]}, fit={"frames": [40, 80], "spheres": []},
         camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
         simulation={
             "shape": [64, 64], "frames": 80, "photons_per_pixel": 1e5,

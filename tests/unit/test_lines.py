@@ -107,7 +107,7 @@ def test_lines_are_found_as_often_by_chance_as_the_normal_law_says(
 ) -> None:
     """At 2 standard errors, where it can be counted; 4.5 of them are used."""
     monkeypatch.setattr("iscat_analysis.camera.spectrum.LEAST_SIGMAS", 2.0)
-    trials, found = 800, 0
+    trials, found = 400, 0
     rng = np.random.default_rng(6)
     for _ in range(trials):
         counts = rng.normal(LEVEL_E, math.sqrt(LEVEL_E), (16, 24, 24))

@@ -49,8 +49,8 @@ SMALL = {
     },
 }
 
-AS_CONFIGURED = {"optics": {"calibrate": "never"}}
-"""Where what is judged needs no optics learned, which takes ten times as long as the rest."""
+AS_CONFIGURED = {"optics": {"calibrate": "never"}, "fit": {"frames": [30, 60], "spheres": []}}
+"""Where nothing judged needs optics learned or spheres tried, which take most of the time."""
 
 
 def _small(**sections: dict[str, Any]) -> Config:
@@ -353,8 +353,9 @@ def test_the_pixel_size_comes_from_the_movie(tmp_path: Path) -> None:
     assert analysis.pixel_size_nm == pytest.approx(84.4)
     _assert_true(analysis.table, truth, "mass")
     other = config.camera.model_copy(update={"pixel_size_nm": 90.0})
-    wrong = config.model_copy(update={"camera": other, "optics": _small(**AS_CONFIGURED).optics})
-    disagreeing = fit_stack(movie, wrong, out=tmp_path / "other")
+    disagreeing = fit_stack(
+        movie, _small(**AS_CONFIGURED).model_copy(update={"camera": other}), out=tmp_path / "other"
+    )
     assert any("84.4" in text and "90" in text for text in disagreeing.warnings)
 
 

@@ -77,7 +77,9 @@ def kind(counts: Movie) -> str | None:
     return None if found is None else found.kind
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(
+    "seed", [0, 1, 2, *(pytest.param(seed, marks=pytest.mark.large) for seed in (3, 4, 5))]
+)
 @pytest.mark.parametrize("vibration_px", [0.0, 0.1, 0.3])
 def test_raw_counts_are_raw(seed: int, vibration_px: float) -> None:
     assert kind(raw(seed, vibration_px=vibration_px)) is None

@@ -195,10 +195,12 @@ def test_figures_are_matplotlibs_and_draw_themselves(result) -> None:
         draw(result.analysis, "pie")
 
 
-def test_pyplot_is_left_alone(movie) -> None:
+def test_pyplot_is_left_alone(movie, config, tmp_path) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(ia.config_to_toml(config), encoding="utf-8")
     code = (
-        f"import sys, iscat_analysis as ia; r = ia.fit_movie({str(movie)!r}, background=(0, 60), "
-        "posterior=False); r.view(0); print('matplotlib.pyplot' in sys.modules)"
+        f"import sys, iscat_analysis as ia; r = ia.fit_movie({str(movie)!r}, config={str(setup)!r})"
+        "; r.view(0); print('matplotlib.pyplot' in sys.modules)"
     )
     assert _in_a_new_process(code).strip() == "False"
 

@@ -44,7 +44,7 @@ def payload(page: str) -> dict[str, object]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    analysis = make_analysis(12, "joint", posteriors=2, refused=1)
+    analysis = make_analysis(8, "joint", posteriors=2, refused=1)
     return write_report(analysis, tmp_path_factory.mktemp("out") / "movie.iscat")
 
 
@@ -165,7 +165,7 @@ class TestPosterior:
         assert data.posterior["event"].values.tolist() == [1, 2]
         assert data.posterior["mass_kda"].dims == ("chain", "draw", "event")
         assert json.loads(data.posterior.attrs["events_not_converged"]) == [0]
-        source = make_analysis(12, "joint", posteriors=2, refused=1).views[2].posterior
+        source = make_analysis(8, "joint", posteriors=2, refused=1).views[2].posterior
         assert source is not None
         draws = data.posterior.sizes["draw"]
         np.testing.assert_array_equal(
@@ -245,8 +245,14 @@ def test_every_mode_and_scheme_makes_a_page(mode: str, scheme: str) -> None:
         assert Status(status).value in page
 
 
-@pytest.mark.parametrize("n", [0, 1])
-@pytest.mark.parametrize("mode", ["mass", "localize", "joint", "track"])
+@pytest.mark.parametrize(
+    ("n", "mode"),
+    [
+        (0, "mass"), (0, "track"), (1, "joint"), (1, "track"),
+        *(pytest.param(*case, marks=pytest.mark.large)
+          for case in ((0, "localize"), (0, "joint"), (1, "mass"), (1, "localize"))),
+    ],
+)  # fmt: skip
 def test_none_and_one_event_make_a_folder(tmp_path: Path, n: int, mode: str) -> None:
     analysis = make_analysis(1, mode)
     out = write_report(analysis if n else without_events(analysis), tmp_path / "out")

@@ -73,7 +73,7 @@ def _fitted(drift: float, setting: bool | str) -> tuple[bool, ia.Result]:
         "simulation.species": [480.0], "simulation.background": "speckle",
         "simulation.speckle_contrast": 0.1,
         "simulation.drift_px_per_frame": [drift, 0.0], "background.drift_correction": setting,
-        "compute.workers": 1,
+        "compute.workers": 1, "fit.spheres": (),
     }  # fmt: skip
     config = ia.configure(settings=settings)
     counts = np.array(list(Movie(config, 3).frames(3)))

@@ -42,6 +42,7 @@ class Judged(StepMaps):
 CALLS: list[tuple[int, float, float]] = []
 
 
+@pytest.mark.usefixtures("sketched")
 @pytest.mark.parametrize(
     "heaviest", [480.0, pytest.param(3000.0, marks=pytest.mark.large)], ids=["weak", "strong"]
 )

@@ -44,7 +44,7 @@ def test_what_a_terminal_would_act_on_is_written_as_an_escape(text: str, shown: 
     assert in_terminal(text) == in_page(text) == shown
 
 
-@settings(deadline=None, max_examples=60, derandomize=True)
+@settings(deadline=None, max_examples=25, derandomize=True)
 @given(EVERY)
 @example("a$\\frac$")
 @example("$x$ \\$ \\\\$")

@@ -21,13 +21,13 @@ from iscat_analysis.result import Result
 
 
 def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) -> None:
-    analysis = make_analysis(200, "track")
+    analysis = make_analysis(100, "track")
     assert analysis.tracks is not None
     out = write_report(analysis, tmp_path / "out")
     page = (out / "report.html").read_text(encoding="utf-8")
     drawn = {path.stem for path in (out / "figures").iterdir()}
     assert {"overview", "mass_d", "distributions", "msd", "track_0000"} <= drawn
-    assert page.count('<tr id="row-') == len(analysis.tracks) == 20
+    assert page.count('<tr id="row-') == len(analysis.tracks) == 10
     assert page.count("data:image/webp;base64,") == len(analysis.films) == 2
     assert "because it is &lt;b&gt;long" in page
     with Image.open(out / "figures" / "track_0000.webp") as film:
@@ -35,8 +35,8 @@ def test_a_page_of_tracks_shows_paths_masses_speeds_and_films(tmp_path: Path) ->
         assert film.info["loop"] == 0
         assert film.size == (3 * 24 + 2 * 2, 24)
     for gid in re.findall(r'id="\w+-rows-([\d_]+)"', page):
-        assert all(int(row) < 20 for row in gid.split("_"))
-    assert f"{len(analysis.tracks)} tracks of 200 fitted positions" in page
+        assert all(int(row) < 10 for row in gid.split("_"))
+    assert f"{len(analysis.tracks)} tracks of 100 fitted positions" in page
     written = pd.read_csv(out / "tracks.csv")
     assert list(written.columns) == list(TRACK_COLUMNS)
 
@@ -126,6 +126,7 @@ def test_the_colours_of_paths_cover_all_that_are_drawn() -> None:
     assert drawn.axes[-1].get_ylabel().startswith("mass")
 
 
+@pytest.mark.usefixtures("sketched")
 def test_a_height_that_was_held_fixed_is_in_no_table_of_precision() -> None:
     analysis = make_analysis(40, "track")
     assert free_parameters("track", analysis.table) == FREE_PARAMETERS["joint"]

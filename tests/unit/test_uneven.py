@@ -22,6 +22,8 @@ SETUP: dict[str, Any] = {
 }
 KNOWN = {"background.method": "known", "background.level_e": LEVEL_E}
 MEASURED = {"background.frames": (0, 60)}
+DIPOLES = {"fit.spheres": ()}
+"""No spheres are tried for poor fits, of which these movies are full, and most of the time goes."""
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +38,15 @@ def movies(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def _movie(path: Path, *, speckle: float, heavy: bool) -> Path:
-    """Record nine particles, or sixteen heavy ones whose rings are everywhere."""
-    side, apart, mass = (4, 20, 3000.0) if heavy else (3, 29, 1000.0)
+    """Record four particles, or sixteen heavy ones whose rings are everywhere."""
+    side, apart, mass, field = (4, 20, 3000.0, 96) if heavy else (2, 29, 1000.0, 72)
     events = [
         {"frame": 60, "x_px": 19.7 + apart * (k % side), "y_px": 20.2 + apart * (k // side),
          "mass_kda": mass}
         for k in range(side**2)
     ]  # fmt: skip
     light = {
-        "simulation.shape": (96, 96),
+        "simulation.shape": (field, field),
         "simulation.frames": 100,
         "simulation.photons_per_pixel": LEVEL_E,
         "simulation.background": "speckle",
@@ -66,7 +68,7 @@ def test_an_uneven_field_over_a_known_level_is_named(
 ) -> None:
     """Every row was a poor fit without a word."""
     movie = movies[kind]
-    (said,) = _said(movie, KNOWN)
+    (said,) = _said(movie, KNOWN | DIPOLES)
     percent = float(said.split("differs by ")[1].split(" %")[0])
     assert percent == pytest.approx(100 * speckle, rel=0.15)
     assert f'background.method = "known" has {LEVEL_E:g} in all of them' in said
@@ -79,11 +81,11 @@ def test_rings_of_particles_are_not_called_uneven(movies: dict[str, Path], kind:
 
 
 def test_what_a_wrong_focus_leaves_over_is_not_called_uneven(movies: dict[str, Path]) -> None:
-    assert not _said(movies["heavy"], {**KNOWN, "optics.focus_nm": -380.0})
+    assert not _said(movies["heavy"], {**KNOWN, **DIPOLES, "optics.focus_nm": -380.0})
 
 
 def test_an_uneven_field_is_not_followed(movies: dict[str, Path]) -> None:
     """Of particles that move the light is judged first, and what looks like some is its pattern."""
     track = {"fit.mode": "track", "track.free": "mass", "fit.frames": (60, 62)}
-    with pytest.raises(DataError, match=r'light differs by 3 %.*background\.method = "tracks"'):
+    with pytest.raises(DataError, match=r'light differs by 3\.1 %.*background\.method = "tracks"'):
         _said(movies["much"], {**KNOWN, **track})

@@ -163,8 +163,8 @@ def test_a_landing_movie_with_pixels_that_blink(monkeypatch: pytest.MonkeyPatch)
     event = {"frame": 80, "x_px": 22.0, "y_px": 25.0, "mass_kda": 800.0}
     config = make_config(
         background={"method": "sliding", "frames": None, "window_frames": 40},
-        fit={"frames": None}, camera={"gain_e_per_adu": 4.0}, optics={"calibrate": "never"},
-        detection={"false_alarms_per_movie": 1e-3},
+        fit={"frames": None, "spheres": []}, camera={"gain_e_per_adu": 4.0},
+        optics={"calibrate": "never"}, detection={"false_alarms_per_movie": 1e-3},
         simulation={"frames": 160, "photons_per_pixel": 1e5, "events": [event]},
     )  # fmt: skip
     rng = np.random.default_rng(27)
