@@ -22,7 +22,7 @@ information (T. A. Louis, J. R. Stat. Soc. B 44, 226, 1982)
     I_f = Σ_b p_b I_fb − Σ_b p_b u_fb u_fbᵀ + u_f u_fᵀ.
 
 The likeliest height alone would follow the noise: of 24 vesicles of 200 nm in twelve faint frames,
-it gave one the diameter 76 nm, and the others pulls 1.6 wide.
+it gave one the diameter 76 nm, and the others pulls 1.5 wide.
 """
 
 from __future__ import annotations

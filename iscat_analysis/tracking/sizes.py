@@ -20,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.config import Config
+from iscat_analysis.config.schema import INVISIBLE
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.inference.common_size import (
@@ -138,11 +139,13 @@ def explained(
     The fits begin at every likely diameter.
     """
     found = []
-    for size in sizes:
+    for size in (one for one in sizes if one.converged):
         tried, index = model, None
         if free_index:
             alike = model.sphere.of_mass(size.mass_kda).homogeneous()
             tried, index = replace(model, sphere=alike), alike.index.real
+            if abs(index / model.optics.n_sample - 1) < INVISIBLE:  # a shell may undo its core
+                continue
         one = fit_common_size(
             likelihoods, tried, size.likely, z_range_nm,
             frames=size.frames, mass_kda=size.mass_kda, index=index, motion=motion,

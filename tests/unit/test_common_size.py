@@ -190,6 +190,24 @@ def test_pulls_of_faint_tracks(kind: str, diameter: float, light_e: float, share
 
 
 @pytest.mark.large
+def test_frames_that_leave_several_heights_do_not_choose_another_diameter(share: float) -> None:
+    """The likeliest height of each frame alone gave one such track in six 76 or 410 nm."""
+    pytest.importorskip("scattnlay")
+    rng = np.random.default_rng(6)
+    model = model_of(
+        200.0, kind="custom", model="shell", index=1.33, shell_nm=5.0, shell_index=1.46,
+        density_kg_m3=1010.0,
+    )  # fmt: skip
+    model = replace(model, mass_range_kda=(model.sphere.mass_kda / 8, model.sphere.mass_kda * 8))
+    for _ in range(max(4, round(16 * share))):
+        likelihoods, places = frames_of(model, 12, 2000.0, rng)
+        best = common_sizes(likelihoods, model, near(places, rng), Z_RANGE_NM)[0]
+        assert len(best.frames) > 12
+        diameter = model.sphere.of_mass(best.mass_kda).diameter_nm
+        assert abs(diameter - 200.0) < 15.0
+
+
+@pytest.mark.large
 def test_the_posterior_visits_every_diameter() -> None:
     """With 15 photoelectrons per pixel 273 nm is the best fit, and 145 nm is as probable.
 
