@@ -68,5 +68,8 @@ def compile_kernels() -> None:
 
 
 if __name__ == "__main__":
+    os.environ.setdefault(
+        "OPENBLAS_NUM_THREADS", "1"
+    )  # as `iscat` sets it where the process is its own
     share_kernels(ROOT)
     compile_kernels()
