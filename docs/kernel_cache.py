@@ -68,5 +68,6 @@ def compile_kernels() -> None:
 
 
 if __name__ == "__main__":
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, not its function
     share_kernels(ROOT)
     compile_kernels()
