@@ -24,13 +24,12 @@ from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
     EventView,
-    FloatArray,
     PosteriorResult,
     Progress,
     make_rows,
     silent,
 )
-from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
+from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, MapArray, Tile, stride_of
 from iscat_analysis.search.sliding.chunks import Part, Reader, reader_of
 from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
@@ -204,11 +203,12 @@ def _view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
     return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)
 
 
-def _ends(chunk: Chunk, inside: slice) -> FloatArray:
+def _ends(chunk: Chunk, inside: slice) -> MapArray:
     """Mean images of the first and the last quarter of a core, shape (2, y, x)."""
     lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
     held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
     ends = blocks[:few], blocks[-few:]
-    return np.stack([chunk.blocks_e[part].mean(axis=0, dtype=np.float64) for part in ends])
+    means = [chunk.blocks_e[part].mean(axis=0, dtype=np.float64) for part in ends]
+    return np.array(means, dtype=np.float32)
