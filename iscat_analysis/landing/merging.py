@@ -109,7 +109,8 @@ class MergedChunks:
     @property
     def image(self) -> FloatArray:
         """Amplitude of the strongest step of each pixel."""
-        return self._strongest[1].astype(np.float64)
+        image: FloatArray = self._strongest[1].astype(np.float64)
+        return image
 
     def result(self) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
         """Events of all chunks, each once, numbered in order of frame; their views and repeats."""

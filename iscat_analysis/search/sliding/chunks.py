@@ -431,8 +431,8 @@ def choose_tiles(
             core = frames if room >= frames else (room - 2 * halo) // stride * stride
             if core < stride:
                 continue
-            work = (rows + 2 * side * (high - 1)) * (columns + 2 * side * (wide - 1))
-            work *= min(core + 2 * halo, frames) / core
+            looked_at = (rows + 2 * side * (high - 1)) * (columns + 2 * side * (wide - 1))
+            work = looked_at * (min(core + 2 * halo, frames) / core)
             if best is None or work < best[0]:
                 best = work, (high, wide), core
     if best is None:
