@@ -26,13 +26,12 @@ from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
     EventView,
-    FloatArray,
     PosteriorResult,
     Progress,
     make_rows,
     silent,
 )
-from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
+from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, MapArray, Tile, stride_of
 from iscat_analysis.search.sliding.chunks import Part, Reader, reader_of
 from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
@@ -209,7 +208,7 @@ def view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
 
 def _ends(
     chunk: Chunk, inside: slice, neighbours: Neighbours, fitted: Sequence[StepEvent]
-) -> FloatArray:
+) -> MapArray:
     """Mean images of the first and the last quarter of a core, without what lands or leaves.
 
     Shapes: result (2, y, x).
@@ -224,4 +223,4 @@ def _ends(
         frames = slice(int(chunk.edges[part[0]]), int(chunk.edges[part[-1] + 1]))
         light = chunk.blocks_e[part].mean(axis=0, dtype=np.float64)
         images.append(light / neighbours.light_in(frames, (one.step for one in fitted)))
-    return np.stack(images)
+    return np.array(images, dtype=np.float32)

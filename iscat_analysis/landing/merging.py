@@ -17,6 +17,7 @@ from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import FRAME_COLUMN, BoolArray, EventView, FloatArray, make_rows
 from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.search.sliding import MapArray
 
 VIEWS = 1000
 """Events whose images are kept for the report."""
@@ -42,8 +43,8 @@ class FinishedChunk:
     light: FloatArray
     masked: BoolArray
     saturated: BoolArray
-    strongest: FloatArray
-    ends_e: FloatArray  # mean images of its first and last quarter
+    strongest: MapArray
+    ends_e: MapArray  # mean images of its first and last quarter
     sampled: int = field(default=0)
     stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
@@ -64,7 +65,7 @@ class MergedChunks:
         self._ends = set(ends)  # of the stretches of the movie
         self._dated: dict[int, NDArray[np.int64]] = {}
         self._sampled: dict[int, int] = {}
-        self._strongest = np.zeros((2, *shape))
+        self._strongest = np.zeros((2, *shape), dtype=np.float32)
         self._masked, self._saturated = (np.zeros(shape, dtype=np.bool_) for _ in range(2))
         self.cause = ""
         self.untold: list[Told] = []
@@ -90,7 +91,7 @@ class MergedChunks:
     def add(self, done: FinishedChunk) -> None:
         """Append the next chunk."""
         stronger = done.strongest[0] > self._strongest[0]
-        self._strongest = np.where(stronger, done.strongest, self._strongest)
+        np.copyto(self._strongest, done.strongest, where=stronger)
         self._masked |= done.masked
         self._saturated |= done.saturated
         self.cause = self.cause or done.cause
@@ -98,7 +99,7 @@ class MergedChunks:
         if done.empty is not None:
             self.empty = done.empty if self.empty is None else self.empty + done.empty
         # the images are merged; holding them for every chunk would grow with the movie
-        small, none = np.empty((2, 0, 0)), np.empty((0, 0), dtype=np.bool_)
+        small, none = np.empty((2, 0, 0), dtype=np.float32), np.empty((0, 0), dtype=np.bool_)
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
         if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
             kept = tuple(replace(view, clip=None) for view in kept)
@@ -112,7 +113,7 @@ class MergedChunks:
     @property
     def image(self) -> FloatArray:
         """Amplitude of the strongest step of each pixel."""
-        image: FloatArray = self._strongest[1]
+        image: FloatArray = self._strongest[1].astype(np.float64)
         return image
 
     def result(self) -> tuple[pd.DataFrame, tuple[EventView, ...], tuple[FloatArray, ...]]:
@@ -224,7 +225,7 @@ class MergedChunks:
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
         middle = middle_of(first[0].ends_e.shape, _DRIFT_PX)
         moved = [
-            measure_drift(a.ends_e[0][middle], b.ends_e[1][middle])
+            measure_drift(*(part[middle].astype(np.float64) for part in (a.ends_e[0], b.ends_e[1])))
             for a, b in zip(first, last, strict=True)
         ]
         dy, dx = np.sum(moved, axis=0).tolist()

@@ -9,7 +9,7 @@ what steps do to each other's light, `tasks` sets up the likelihood of one.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import compress
@@ -116,7 +116,7 @@ class ChunkFitter:
         self._sieve = SidelobeFilter(chunk.first, self._stride, window, context.roi_px)
         self._doubtful: list[Peak] = []
         self._last: tuple[list[Peak], tuple[MapArray, FloatArray]] | None = None
-        self.strongest = np.zeros((2, *chunk.shape))
+        self.strongest = np.zeros((2, *chunk.shape), dtype=np.float32)  # of a figure
         self.rounds = 0
         self.searched: Searched | None = None
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
@@ -137,7 +137,8 @@ class ChunkFitter:
                 s
                 for s in self._search(maps, steps)
                 if not any(
-                    _apart(s, r) <= self._stride and distance_px(s, r) < _SAME_PX for r in rejected
+                    abs(s.at.frame - r.at.frame) <= self._stride and distance_px(s, r) < _SAME_PX
+                    for r in rejected
                 )
             ]
             if not fresh:
@@ -195,11 +196,13 @@ class ChunkFitter:
             if keep[0] <= s.at.frame < keep[1] and sign * s.sign >= 0
         ]
         own = [i for i in now if self._is_near_core(everything[i], _CORE_MARGIN_PX)]
-        found = self._pool.map(
-            lambda i: self._finish(i, everything, seen, around, lobe=i >= len(steps)), own
+        order = _by_place(everything, own)
+        finished = self._pool.map(
+            lambda i: self._finish(i, everything, seen, around, lobe=i >= len(steps)), order
         )
+        found = dict(zip(order, finished, strict=True))
         beside = [steps[i] for i in sorted({*now}.difference(own)) if i < len(steps)]
-        fitted = self._judged([one for one in found if one is not None], beside)
+        fitted = self._judged([one for i in own if (one := found[i]) is not None], beside)
         if fitted and not self._pattern and self._controlled:
             events = standing_out([f.event for f in fitted])
             self.empty = step_controls(
@@ -235,7 +238,7 @@ class ChunkFitter:
             strongest_maps(snr, where)
             best = np.take_along_axis(snr, where[None], axis=0)[0].astype(np.float64)
             frames = np.maximum(effective[where], 1e-9)
-            self.strongest = np.stack([np.abs(best), best / np.sqrt(frames * matched.norm)])
+            self.strongest[:] = np.abs(best), best / np.sqrt(frames * matched.norm)
         peaks = find_steps(chunk, matched, snr, effective, context.templates.threshold)
         self._last = peaks, (snr, effective)
         fresh, self._doubtful = self._sieve.sift(peaks, steps, snr)
@@ -323,8 +326,8 @@ class ChunkFitter:
             task = self._tasks.build(index, steps, near)
             return steps[index] if task is None else fitted(steps[index], task)
 
-        refitted = list(steps)
-        for index, step in zip(sorted(chosen), self._pool.map(one, sorted(chosen)), strict=True):
+        refitted, order = list(steps), _by_place(steps, chosen)
+        for index, step in zip(order, self._pool.map(one, order), strict=True):
             refitted[index] = step
         return refitted
 
@@ -467,6 +470,11 @@ class ChunkFitter:
         return list(compress(steps, kept))
 
 
+def _by_place(steps: Sequence[Step], chosen: Collection[int]) -> list[int]:
+    """Sort steps so that those of one place, which have a region in common, follow each other."""
+    return sorted(chosen, key=lambda i: (round(steps[i].start.y_px), steps[i].start.x_px))
+
+
 def _has_moved(old: Step, new: Step) -> bool:
     """Whether a fit changed what the neighbours see by more than its error."""
     if old.theta is None or old.at.frame != new.at.frame:
@@ -491,7 +499,3 @@ def _displaced(start: Candidate, y_px: float, x_px: float) -> Candidate:
     if y_px == x_px == 0:  # where nothing drifts
         return start
     return replace(start, x_px=start.x_px + x_px, y_px=start.y_px + y_px)
-
-
-def _apart(one: Step, two: Step) -> int:
-    return abs(one.at.frame - two.at.frame)

@@ -219,13 +219,13 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     tiles = cut_field(reader.shape, (high, wide), halo)
     largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
     blocks = (core + 2 * chunks_module.halo_frames(100, 25)) / 25
-    assert largest * blocks * 10 < 0.32 * 1000e6
+    assert largest * blocks * 8 < 0.32 * 1000e6
     seen = np.zeros(reader.shape, dtype=int)
     for tile in tiles:
         seen[tile.core] += 1
     assert (seen == 1).all()  # each pixel has one home
     work = sum(tile.shape[0] * tile.shape[1] for tile in tiles) * (core + 400) / core
-    assert work < 4 * seen.size
+    assert work < 3 * seen.size
     small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
         chunks_module.choose_tiles(reader, small, 100, 25, 10_000)

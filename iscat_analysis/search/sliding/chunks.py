@@ -56,7 +56,8 @@ _FEWEST_AT_ONCE = 8
 _BANDS = 4  # of rows, whose sums over the frames are made at a time
 _SPAN_BYTES = 4e9  # of the frames of a chunk of a large field: they stay in the system's cache
 _CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
-_TILE_BYTES = 100  # of a pixel of a tile, beside its blocks and maps
+_TILE_BYTES = 160  # of a pixel of a tile, beside its blocks and maps
+_HIGHEST_BYTES = 2  # of the highest count of a pixel in a block
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
@@ -418,19 +419,20 @@ def choose_tiles(
     """Choose rows and columns of tiles, and the frames of a core, that look at least at halos."""
     side, halo = halo_px(config), halo_frames(window, stride)
     smallest = _roi_px(config)
-    budget, per_frame = counts_budget(config), _per_block(config) / stride
+    # tiles need no highest counts of blocks
+    budget, per_frame = counts_budget(config), (_per_block(config) - _HIGHEST_BYTES) / stride
     longest = int(_SPAN_BYTES // reader.frame_bytes)
     best: tuple[float, tuple[int, int], int] | None = None
     rows, columns = reader.shape
     for high in range(1, rows // smallest + 1):
         for wide in range(1, columns // smallest + 1):
-            pixels = min(math.ceil(rows / high) + 2 * side, rows)
-            pixels *= min(math.ceil(columns / wide) + 2 * side, columns)
+            pixels = _largest(rows, high, side) * _largest(columns, wide, side)
             room = min(int((budget / pixels - _TILE_BYTES) / per_frame), longest)
             core = frames if room >= frames else (room - 2 * halo) // stride * stride
             if core < stride:
                 continue
-            work = high * wide * pixels * (min(core + 2 * halo, frames) / core)
+            looked_at = (rows + 2 * side * (high - 1)) * (columns + 2 * side * (wide - 1))
+            work = looked_at * (min(core + 2 * halo, frames) / core)
             if best is None or work < best[0]:
                 best = work, (high, wide), core
     if best is None:
@@ -449,6 +451,11 @@ def choose_tiles(
             "background.window_frames"
         )
     return best[1], best[2]
+
+
+def _largest(size: int, parts: int, halo: int) -> int:
+    """Count the rows of the largest of so many tiles; the first and the last have one halo."""
+    return min(math.ceil(size / parts) + min(parts - 1, 2) * halo, size)
 
 
 def _per_block(config: Config) -> int:

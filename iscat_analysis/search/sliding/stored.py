@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from iscat_analysis.records import CountSource, InPlace, PlacedSource
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 
-_REGION_BYTES = 1e8  # of regions that are held
+REGION_BYTES = 40_000_000
+"""Of the regions that a chunk or a tile holds."""
+
 _SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
 _NO_COUNTS: NDArray[Any] = np.empty((0, 0, 0))
 _Region = tuple[tuple[int, int], tuple[int, int]]  # rows and columns
@@ -103,7 +105,7 @@ class HeldRegions:
             self._held[rows, columns] = first, counts
             self._held.move_to_end((rows, columns))
             size = sum(part.nbytes for _, part in self._held.values())
-            while size > _REGION_BYTES:
+            while size > REGION_BYTES:
                 size -= self._held.popitem(last=False)[1][1].nbytes
         return counts[wanted.start - first : wanted.stop - first]
 
