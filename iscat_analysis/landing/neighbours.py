@@ -5,7 +5,7 @@ pixel: the factor (1 + φ_a C)/(1 + φ_b C), φ the share of the light of the fr
 in which it is there.
 
 Of two bright spheres the fields add up, and not their contrasts: with the fields e of all, the mean
-light over frames is 1 + Σ φ_k C_k + Σ φ_kl 2 Re(e_k · e_l*), φ_kl the share in which both are
+light over frames is 1 + Σ φ_k C_k + Σ φ_kl 2 Re(e_k · e_l*), with φ_kl the share in which both are
 there.
 
 Where the sample drifts, a particle moves with it: the mean of C over a window is its expansion to
