@@ -35,16 +35,15 @@ settings.load_profile("ci" if os.environ.get("CI") else "here")
 
 
 LONGEST_FIRST = (
-    "test_output", "test_day", "test_report_browser", "test_tracked_optics", "test_app_browser",
-    "test_moving", "test_compilation", "test_landing", "test_pipeline", "test_cluster",
-    "test_equilibrium", "test_crowded", "test_focus_scan", "test_cli_help", "test_cli_contract",
-    "test_stored",
-    "test_report", "test_planes", "test_benchmark", "test_bad_input", "test_fuzz", "test_movers",
-    "test_optics_calibration", "test_public", "test_arguments", "test_bounds_laws",
-    "test_distribution", "test_posterior", "test_mass_calibration", "test_systematic",
-    "test_cli_samples", "test_fast_fits", "test_photon_transfer", "test_tracking",
-    "test_short_tracks", "test_optics_at_heights", "test_equilibrium_spread",
-    "test_second_process", "test_many_movers",
+    "test_output", "test_app_browser", "test_report_browser", "test_report", "test_cluster",
+    "test_landing", "test_day", "test_optics_calibration", "test_pipeline", "test_movers",
+    "test_compilation", "test_cli_help", "test_public", "test_bad_input", "test_uneven",
+    "test_crowded", "test_tracked_optics", "test_detect", "test_cause", "test_equilibrium",
+    "test_posterior", "test_floating_optics", "test_photon_transfer", "test_camera_laws",
+    "test_together", "test_doors", "test_processed", "test_cli_contract", "test_distribution",
+    "test_mass_calibration", "test_breaks", "test_fuzz", "test_event_tables", "test_bounds",
+    "test_recognise", "test_learning", "test_cli_json", "test_cli_optics", "test_cli_init",
+    "test_napari",
 )  # fmt: skip
 """Modules that take longest; they are begun first, so that no worker is left with one."""
 
