@@ -176,13 +176,18 @@ def measure(job: Job, folder: Path, memory_mb: int) -> Cost:
 
 
 def slope(costs: Sequence[Cost], along: str, start_s: float) -> tuple[float, float]:
-    """Slope of the processor time beyond the start on logarithmic scales, and its error."""
+    """Slope of the processor time beyond the start on logarithmic scales, and its error.
+
+    Not a number where a job takes no longer than the start: nothing was measured then.
+    """
     sizes = {
         "pixels": [c.job.rows * c.job.columns for c in costs],
         "frames": [c.job.frames for c in costs],
         "particles": [c.job.particles for c in costs],
     }[along]
-    grown = [max(c.processor_s - start_s, 1e-2) for c in costs]
+    grown = np.array([c.processor_s - start_s for c in costs])
+    if grown.min() <= 0:
+        return math.nan, math.nan
     x, y = np.log(sizes) - np.mean(np.log(sizes)), np.log(grown)
     value = float(x @ y / (x @ x))
     rest = y - y.mean() - value * x
@@ -326,6 +331,8 @@ def main() -> int:
     parser.add_argument("--memory-mb", type=int, default=1000, help="compute.memory_limit_mb")
     parser.add_argument("--keep", type=Path, help="folder for the movies while they are analysed")
     options = parser.parse_args()
+    if options.keep is not None:
+        options.keep.mkdir(parents=True, exist_ok=True)
     if options.sensor:
         with tempfile.TemporaryDirectory(dir=options.keep) as name:
             return sensor(options, Path(name))
@@ -344,6 +351,8 @@ def main() -> int:
         folder = Path(name)
         bounds = limits(folder)
         small = options.fields[0]
+        print("not counted, because it may compile:")
+        measure(Job(*small, 2 * BLOCK, 10), folder, options.memory_mb)
         start = measure(Job(*small, BLOCK, 1), folder, options.memory_mb)
         found = {
             along: [measure(job, folder, options.memory_mb) for job in jobs]
