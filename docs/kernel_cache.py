@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
 import tempfile
 from importlib.metadata import version
@@ -31,13 +29,9 @@ def compile_kernels() -> None:
 
     What this leaves out is compiled where it is first needed.
     """
-    from iscat_cli import main
+    import pandas as pd
 
-    def run(*arguments: str) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):
-            status = main([*arguments, "--quiet"])
-        if status:
-            raise RuntimeError(f"iscat {' '.join(arguments)} ended with status {status}")
+    import iscat_analysis as ia
 
     small = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
     few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
@@ -55,16 +49,15 @@ def compile_kernels() -> None:
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as name:
         for number, (sample, changes) in enumerate(jobs):
-            movie = f"{name}/{number}.tif"
-            options = ["--config", str(ROOT / "sample_configs" / f"{sample}.toml")]
-            options += [f"--set={change}" for change in (*small, *changes)]
-            run("simulate", *options, "--out", movie)
-            run("fit", movie, *options)
-            run("bounds", *options)
-        events = Path(name, "events.csv")
-        rows = (f"{mass + 3 * (k % 11 - 5)},8\n" for mass in (66, 146) for k in range(40))
-        events.write_text("mass_kda,sigma_mass_kda\n" + "".join(rows), encoding="utf-8")
-        run("species", str(events))
+            movie = Path(name, f"{number}.tif")
+            config = ia.configure(
+                ROOT / "sample_configs" / f"{sample}.toml", settings=(*small, *changes)
+            )
+            ia.simulate_movie(config, movie)
+            ia.fit_movie(movie, config=config)  # without the report, which has no kernels
+            ia.compute_bounds(config)
+    masses = [mass + 3.0 * (k % 11 - 5) for mass in (66, 146) for k in range(40)]
+    ia.find_species(pd.DataFrame({"mass_kda": masses, "sigma_mass_kda": 8.0}))
 
 
 if __name__ == "__main__":
