@@ -4,10 +4,23 @@ from __future__ import annotations
 
 import os
 import tempfile
+from concurrent.futures import ProcessPoolExecutor
+from importlib import import_module
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+
+SMALL = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
+FEW = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
+ONE = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
+COMA = (*ONE, "optics.aberrations_nm.z8=10")
+MOVING = (
+    "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
+    "simulation.movers=[{count=1, mass_kda=900.0, d_um2_s=0.15}]",
+    "camera.frame_rate_hz=331.0", "fit.mode=track", "track.free=mass",
+)  # fmt: skip
 
 
 def share_kernels(root: Path) -> None:
@@ -27,35 +40,46 @@ def share_kernels(root: Path) -> None:
 def compile_kernels() -> None:
     """Do small jobs of every kind, so that no two processes compile the same kernel later.
 
-    What this leaves out is compiled where it is first needed.
+    What this leaves out is compiled where it is first needed.  Another process follows the particle
+    that moves, once the kernels that all jobs have in common are there.  It begins before them:
+    a process that begins removes files which are only half written.
     """
+    with ProcessPoolExecutor(1, get_context("spawn")) as another:
+        another.submit(load_kernels).result()
+        do_job("landing", FEW)
+        moving = another.submit(do_job, "landing", MOVING)
+        for sample, changes in (("mass", ONE), ("mass", COMA), ("joint", ONE)):
+            do_job(sample, changes)
+        find_two_species()
+        moving.result()
+
+
+def load_kernels() -> None:
+    """Import the kernels, and look through those that are compiled."""
+    import_module("iscat_analysis._kernels")
+
+
+def do_job(sample: str, changes: tuple[str, ...]) -> None:
+    """Simulate a small movie like that of a sample configuration, analyse it, compute its bounds.
+
+    No report is written: it has no kernels.
+    """
+    import iscat_analysis as ia
+
+    path = ROOT / "sample_configs" / f"{sample}.toml"
+    config = ia.configure(path, settings=(*SMALL, *changes))
+    with tempfile.TemporaryDirectory() as folder:
+        ia.simulate_movie(config, f"{folder}/movie.tif")
+        ia.fit_movie(f"{folder}/movie.tif", config=config)
+    ia.compute_bounds(config)
+
+
+def find_two_species() -> None:
+    """Find two species in eighty masses."""
     import pandas as pd
 
     import iscat_analysis as ia
 
-    small = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
-    few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
-    one = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
-    cobri = (*one, "optics.scheme=cobri")
-    coma = (*one, "optics.aberrations_nm.z8=10")
-    moving = (
-        "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
-        "simulation.movers=[{count=1, mass_kda=900.0, d_um2_s=0.15}]",
-        "camera.frame_rate_hz=331.0", "fit.mode=track", "track.free=mass",
-    )  # fmt: skip
-    jobs = [
-        ("landing", few), ("landing", moving), ("mass", one), ("mass", coma), ("joint", one),
-        ("joint", cobri),
-    ]  # fmt: skip
-    with tempfile.TemporaryDirectory() as name:
-        for number, (sample, changes) in enumerate(jobs):
-            movie = Path(name, f"{number}.tif")
-            config = ia.configure(
-                ROOT / "sample_configs" / f"{sample}.toml", settings=(*small, *changes)
-            )
-            ia.simulate_movie(config, movie)
-            ia.fit_movie(movie, config=config)  # without the report, which has no kernels
-            ia.compute_bounds(config)
     masses = [mass + 3.0 * (k % 11 - 5) for mass in (66, 146) for k in range(40)]
     ia.find_species(pd.DataFrame({"mass_kda": masses, "sigma_mass_kda": 8.0}))
 
