@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 ROOT = Path(__file__).resolve().parent.parent
+ANOTHER = "another"
 
 SMALL = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
 FEW = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
@@ -40,23 +41,24 @@ def share_kernels(root: Path) -> None:
 def compile_kernels() -> None:
     """Do small jobs of every kind, so that no two processes compile the same kernel later.
 
-    What this leaves out is compiled where it is first needed.  Another process follows the particle
-    that moves, once the kernels that all jobs have in common are there.  It begins before them:
-    a process that begins removes files which are only half written.
+    What this leaves out is compiled where it is first needed.  Once the kernels that all jobs have
+    in common are there, another process follows the particle that moves.
     """
-    with ProcessPoolExecutor(1, get_context("spawn")) as another:
-        another.submit(load_kernels).result()
-        do_job("landing", FEW)
-        moving = another.submit(do_job, "landing", MOVING)
+    do_job("landing", FEW)
+    with Popen([sys.executable, __file__, ANOTHER], stdout=PIPE, text=True) as another:
+        another.stdout.readline()  # a process that begins removes files which are half written
         for sample, changes in (("mass", ONE), ("mass", COMA), ("joint", ONE)):
             do_job(sample, changes)
         find_two_species()
-        moving.result()
+    if another.returncode:
+        raise RuntimeError(f"the particle that moves: status {another.returncode}")
 
 
-def load_kernels() -> None:
-    """Import the kernels, and look through those that are compiled."""
+def follow_particle() -> None:
+    """Do the part of the other process."""
     import_module("iscat_analysis._kernels")
+    print("begun", flush=True)
+    do_job("landing", MOVING)
 
 
 def do_job(sample: str, changes: tuple[str, ...]) -> None:
@@ -87,4 +89,4 @@ def find_two_species() -> None:
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, not its function
     share_kernels(ROOT)
-    compile_kernels()
+    follow_particle() if sys.argv[1:] == [ANOTHER] else compile_kernels()
