@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import os
+import sys
 import tempfile
+from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from subprocess import PIPE, Popen
 
 ROOT = Path(__file__).resolve().parent.parent
+ANOTHER = "another"
+
+SMALL = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
+FEW = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
+ONE = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
+COMA = (*ONE, "optics.aberrations_nm.z8=10")
+MOVING = (
+    "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
+    "simulation.movers=[{count=1, mass_kda=900.0, d_um2_s=0.15}]",
+    "camera.frame_rate_hz=331.0", "fit.mode=track", "track.free=mass",
+)  # fmt: skip
 
 
 def share_kernels(root: Path) -> None:
@@ -29,45 +41,52 @@ def share_kernels(root: Path) -> None:
 def compile_kernels() -> None:
     """Do small jobs of every kind, so that no two processes compile the same kernel later.
 
-    What this leaves out is compiled where it is first needed.
+    What this leaves out is compiled where it is first needed.  Once the kernels that all jobs have
+    in common are there, another process follows the particle that moves.
     """
-    from iscat_cli import main
+    do_job("landing", FEW)
+    with Popen([sys.executable, __file__, ANOTHER], stdout=PIPE, text=True) as another:
+        another.stdout.readline()  # a process that begins removes files which are half written
+        for sample, changes in (("mass", ONE), ("mass", COMA), ("joint", ONE)):
+            do_job(sample, changes)
+        find_two_species()
+    if another.returncode:
+        raise RuntimeError(f"the particle that moves: status {another.returncode}")
 
-    def run(*arguments: str) -> None:
-        with contextlib.redirect_stdout(io.StringIO()):
-            status = main([*arguments, "--quiet"])
-        if status:
-            raise RuntimeError(f"iscat {' '.join(arguments)} ended with status {status}")
 
-    small = ("simulation.shape=[64, 64]", "posterior.steps=100", "bounds.pixels=31")
-    few = ("simulation.count=6", "simulation.leavings=1", "simulation.frames=400")
-    one = ("simulation.events=[{frame=200, x_px=31.2, y_px=30.8, mass_kda=900.0}]",)
-    cobri = (*one, "optics.scheme=cobri")
-    coma = (*one, "optics.aberrations_nm.z8=10")
-    moving = (
-        "simulation.count=0", "simulation.leavings=0", "simulation.frames=60",
-        "simulation.movers=[{count=1, mass_kda=900.0, d_um2_s=0.15}]",
-        "camera.frame_rate_hz=331.0", "fit.mode=track", "track.free=mass",
-    )  # fmt: skip
-    jobs = [
-        ("landing", few), ("landing", moving), ("mass", one), ("mass", coma), ("joint", one),
-        ("joint", cobri),
-    ]  # fmt: skip
-    with tempfile.TemporaryDirectory() as name:
-        for number, (sample, changes) in enumerate(jobs):
-            movie = f"{name}/{number}.tif"
-            options = ["--config", str(ROOT / "sample_configs" / f"{sample}.toml")]
-            options += [f"--set={change}" for change in (*small, *changes)]
-            run("simulate", *options, "--out", movie)
-            run("fit", movie, *options)
-            run("bounds", *options)
-        events = Path(name, "events.csv")
-        rows = (f"{mass + 3 * (k % 11 - 5)},8\n" for mass in (66, 146) for k in range(40))
-        events.write_text("mass_kda,sigma_mass_kda\n" + "".join(rows), encoding="utf-8")
-        run("species", str(events))
+def follow_particle() -> None:
+    """Do the part of the other process."""
+    import_module("iscat_analysis._kernels")
+    print("begun", flush=True)
+    do_job("landing", MOVING)
+
+
+def do_job(sample: str, changes: tuple[str, ...]) -> None:
+    """Simulate a small movie like that of a sample configuration, analyse it, compute its bounds.
+
+    No report is written: it has no kernels.
+    """
+    import iscat_analysis as ia
+
+    path = ROOT / "sample_configs" / f"{sample}.toml"
+    config = ia.configure(path, settings=(*SMALL, *changes))
+    with tempfile.TemporaryDirectory() as folder:
+        ia.simulate_movie(config, f"{folder}/movie.tif")
+        ia.fit_movie(f"{folder}/movie.tif", config=config)
+    ia.compute_bounds(config)
+
+
+def find_two_species() -> None:
+    """Find two species in eighty masses."""
+    import pandas as pd
+
+    import iscat_analysis as ia
+
+    masses = [mass + 3.0 * (k % 11 - 5) for mass in (66, 146) for k in range(40)]
+    ia.find_species(pd.DataFrame({"mass_kda": masses, "sigma_mass_kda": 8.0}))
 
 
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, not its function
     share_kernels(ROOT)
-    compile_kernels()
+    follow_particle() if sys.argv[1:] == [ANOTHER] else compile_kernels()

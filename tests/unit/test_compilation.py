@@ -241,7 +241,7 @@ def test_kernels_that_cannot_be_kept_for_want_of_room_end_no_run(tmp_path):
     assert (result, hits) == ("True False", "0")
     assert said.startswith(f"compiled kernels cannot be kept in {tmp_path}")
     assert "File too large" in said
-    assert supported(tmp_path) == ["True False", "0"]
+    assert not list(tmp_path.rglob("*.nb?"))  # that a later run could take
 
 
 def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):

@@ -295,14 +295,14 @@ def test_fields_of_movers_add_before_they_are_squared(samples: int) -> None:
         {"d_um2_s": 0.3, "x_px": 22.0, "y_px": 20.5},
     ]
     config = _config(
-        {"movers": kinds, "events": [EVENT | {"frame": 0, "y_px": 23.5}], "frames": 3},
+        {"movers": kinds, "events": [EVENT | {"frame": 0, "y_px": 23.5}], "frames": 2},
         camera={"samples_per_pixel": samples}, particle=gold, calibrated=False,
     )  # fmt: skip
     movie = Movie(config, 5)
     frames = list(movie.expected_frames())
     model, grid = movie._model, movie._grid
     stands = movie._field_of(movie.particles[0], 0)
-    for t in range(3):
+    for t in range(2):
         total = np.zeros(grid.shape)
         pairs = [(a, b) for a in movie.movers[0].points_nm[t] for b in movie.movers[1].points_nm[t]]
         for places in pairs:
@@ -360,7 +360,7 @@ def test_the_same_seed_writes_the_same_bytes(tmp_path: Path) -> None:
     files = []
     for name, workers, seed in (("a", 1, 9), ("b", 1, 9), ("c", 3, 9), ("d", 1, 10)):
         config = _config(
-            {"movers": kinds, "events": [EVENT], "power_noise": 0.01, "frames": 40},
+            {"movers": kinds, "events": [EVENT], "power_noise": 0.01, "frames": 20},
             compute={"workers": workers},
         )
         write_stack(config, tmp_path / f"{name}.tif", seed=seed)
