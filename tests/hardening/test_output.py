@@ -96,8 +96,9 @@ class Runner:
     """Runs orders: in processes of their own, or here where none of them is ended.
 
     An order is one of `runner.py` with ``"cwd": folder``, and ``"kill": [signal, share]`` to be
-    ended after that share of an undisturbed run's duration, or of ``"duration": seconds``.  An
-    answer is ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
+    ended after that share of an undisturbed run's duration, or of ``"duration": seconds``; here,
+    ``"limit": bytes`` is for the largest file it may write.  An answer is
+    ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
     """
 
     def __init__(self, folder: Path, kernels: Path) -> None:
