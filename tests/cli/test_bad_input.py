@@ -38,6 +38,9 @@ def movie(tmp_path: Path) -> Path:
     return _save(tmp_path / "movie.tif", _counts())
 
 
+NONE = ["--set", "detection.false_alarms_per_movie=1e-6"]
+"""Finds nothing in a movie with nothing in it."""
+
 GOOD = ["--set", "camera.pixel_size_nm=84.4", "--background", "0:12", "--no-posterior"]
 
 
@@ -70,8 +73,7 @@ def _listing(folder: Path) -> dict[str, int]:
 @pytest.mark.usefixtures("sketched")
 def test_the_movie_of_these_tests_is_good(movie: Path, capsys) -> None:
     """Control: without a fault it is analysed."""
-    none = ["--set", "detection.false_alarms_per_movie=1e-6"]
-    assert main_fit([str(movie), *GOOD, *none, "--quiet"]) == 0
+    assert main_fit([str(movie), *GOOD, *NONE, "--quiet"]) == 0
     assert "0 events" in capsys.readouterr().out
     assert (movie.with_suffix(".iscat") / "report.html").is_file()
 
@@ -148,13 +150,13 @@ def test_a_pixel_without_a_number_in_every_frame(
     assert "frame 0 is NaN or infinite in 1 pixel, the first at y = 20, x = 9" in line
 
 
+@pytest.mark.usefixtures("sketched")
 def test_zero_frames(refused: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One is left out; a movie of nothing else cannot be analysed."""
     counts = _counts()
     counts[7] = 0
     path = _save(tmp_path / "dropped.tif", counts)
-    none = ["--out", str(tmp_path / "dropped.iscat")]
-    assert main_fit([str(path), *GOOD, *none]) == 0
+    assert main_fit([str(path), *GOOD, *NONE]) == 0
     assert "frame 7 of" in capsys.readouterr().err
     assert "are all the same" in refused(_save(tmp_path / "nothing.tif", np.zeros_like(counts)))
 
@@ -301,7 +303,7 @@ def test_a_map_of_another_size(refused: Run, movie: Path, tmp_path: Path) -> Non
 
 @pytest.mark.usefixtures("sketched")
 def test_output_folder_with_results(refused: Run, movie: Path, capsys) -> None:
-    assert main_fit([str(movie), *GOOD, "--quiet"]) == 0
+    assert main_fit([str(movie), *GOOD, *NONE, "--quiet"]) == 0
     capsys.readouterr()
     assert "--overwrite" in refused(movie)
 
@@ -383,16 +385,15 @@ def test_impossible_bounds(capsys) -> None:
 # ---- without --quiet, and interrupted ------------------------------------------------------------
 
 
-def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path) -> None:
-    """As a user sees it: another process, and nothing asked to be quiet."""
+def test_progress_does_not_hide_the_one_error(movie: Path, tmp_path: Path, capsys) -> None:
+    """As a user sees it: nothing is asked to be quiet."""
     counts = _counts("f4")
     counts[20, 5, 5] = np.nan
     path = _save(tmp_path / "late.tif", counts)
-    command = [sys.executable, "-c", "import sys, iscat_cli; sys.exit(iscat_cli.main_fit())"]
-    done = subprocess.run([*command, str(path), *GOOD], capture_output=True, text=True, check=False)
-    assert done.returncode == UNUSABLE
-    assert done.stdout == ""
-    errors = [line for line in done.stderr.splitlines() if "error" in line]
+    assert main_fit([str(path), *GOOD]) == UNUSABLE
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    errors = [line for line in shown.err.splitlines() if "error" in line]
     assert len(errors) == 1
     assert "frame 20" in errors[0]
     assert not path.with_suffix(".iscat").exists()

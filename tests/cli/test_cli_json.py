@@ -23,9 +23,9 @@ from iscat_analysis.config import config_to_toml, load_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.records import EVENT_COLUMNS, EVENTS, Status
 from iscat_analysis.schemas import schema, schema_names
-from iscat_cli import main, main_fit
+from iscat_cli import main
 
-pytestmark = pytest.mark.usefixtures("sketched")
+pytestmark = pytest.mark.usefixtures("all_sketched")
 
 
 def _check(value: Any, name: str) -> None:
@@ -37,6 +37,14 @@ def setup(tmp_path_factory, sample_configs) -> Path:
     """Write a small configuration."""
     path = tmp_path_factory.mktemp("json") / "setup.toml"
     path.write_text(config_to_toml(load_config(sample_configs["mass"], SMALL)), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def movie(setup: Path) -> Path:
+    """Simulate what it says."""
+    path = setup.with_name("movie.tif")
+    assert main(["simulate", "--config", str(setup), "--out", str(path), "--quiet"]) == 0
     return path
 
 
@@ -67,17 +75,41 @@ def test_the_schema_of_an_event_is_the_table() -> None:
 
 
 @pytest.mark.parametrize("mode", ["mass", "localize", "joint"])
-def test_simulate_fit_and_summary(mode: str, setup, capsys, tmp_path) -> None:
-    movie = tmp_path / "movie.tif"
-    written = _printed(capsys, "simulate", "--config", str(setup), "--out", str(movie))
-    _check(written, "simulate")
-    found = _printed(capsys, "fit", str(movie), "--config", str(setup), "--mode", mode)
+def test_fit_and_summary(mode: str, movie, setup, capsys, tmp_path) -> None:
+    out = tmp_path / "movie.iscat"
+    options = ["--config", str(setup), "--mode", mode, "--out", str(out)]
+    found = _printed(capsys, "fit", str(movie), *options)
     _check(found, "fit")
     assert len(found["events"]) == 1
-    summary = json.loads((tmp_path / "movie.iscat" / "summary.json").read_text(encoding="utf-8"))
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     _check(summary, "summary")
     empty = found | {"events": [], "status": {}}
     _check(empty, "fit")
+    if mode == "mass":
+        _refuses_what_is_wrong(found)
+
+
+def _refuses_what_is_wrong(good: dict[str, Any]) -> None:
+    """Make sure of the schema: one that accepts everything would pass all of these tests."""
+    for change in (
+        lambda fit: fit.pop("versions"),
+        lambda fit: fit["events"][0].pop("crb_x_nm"),
+        lambda fit: fit["events"][0].update(status="good"),
+        lambda fit: fit["events"][0].update(p_value=1.5),
+        lambda fit: fit["events"][0].update(sigma_x_nm=-1.0),
+        lambda fit: fit["events"][0].update(unknown=1),
+        lambda fit: fit.update(events=1),
+        lambda fit: fit["input"].update(sha256="abc"),
+    ):
+        bad = copy.deepcopy(good)
+        change(bad)
+        with pytest.raises(jsonschema.ValidationError):
+            _check(bad, "fit")
+
+
+def test_simulate(setup, capsys, tmp_path) -> None:
+    out = str(tmp_path / "movie.tif")
+    _check(_printed(capsys, "simulate", "--config", str(setup), "--out", out), "simulate")
 
 
 def test_simulated_movers(setup, capsys, tmp_path) -> None:
@@ -101,6 +133,7 @@ def test_what_fit_prints_holds_the_summary() -> None:
 def test_landing_movies(sample_configs, capsys, tmp_path) -> None:
     movie, config = str(tmp_path / "movie.tif"), str(sample_configs["landing"])
     small = ["simulation.count=4", "simulation.leavings=1", "simulation.shape=[64, 64]"]
+    small += ["simulation.frames=400", "fit.spheres=[]"]
     options = ["--config", config, *(f"--set={change}" for change in small)]
     _check(_printed(capsys, "simulate", "--out", movie, *options), "simulate")
     found = _printed(capsys, "fit", movie, *options, "--inject", "2")
@@ -127,9 +160,8 @@ def test_bounds(options: list[str], setup, capsys) -> None:
     _check(_printed(capsys, "bounds", "--config", str(setup), *options), "bounds")
 
 
-def test_camera(setup, capsys, tmp_path) -> None:
-    movie, shade = tmp_path / "movie.tif", tmp_path / "dark.tif"
-    main(["simulate", "--config", str(setup), "--out", str(movie), "--quiet"])
+def test_camera(movie, capsys, tmp_path) -> None:
+    shade = tmp_path / "dark.tif"
     dark = 100 + 4 * np.random.default_rng(1).standard_normal((60, 64, 64))
     tifffile.imwrite(shade, np.rint(dark).astype("u2"))
     for number, options in enumerate(
@@ -171,29 +203,6 @@ def test_calibration(capsys, tmp_path) -> None:
     assert set(printed) | set(written) == set(schema("calibration")["properties"])
     with pytest.raises(jsonschema.ValidationError):
         _check(printed | {"landing": "grey"}, "calibration")
-
-
-def test_the_schemas_refuse_what_is_wrong(setup, capsys, tmp_path) -> None:
-    """A schema that accepts everything would pass all of the above."""
-    movie = tmp_path / "movie.tif"
-    main(["simulate", "--config", str(setup), "--out", str(movie), "--quiet"])
-    capsys.readouterr()
-    assert main_fit([str(movie), "--config", str(setup), "--json", "--quiet"]) == 0
-    good = json.loads(capsys.readouterr().out)
-    for change in (
-        lambda fit: fit.pop("versions"),
-        lambda fit: fit["events"][0].pop("crb_x_nm"),
-        lambda fit: fit["events"][0].update(status="good"),
-        lambda fit: fit["events"][0].update(p_value=1.5),
-        lambda fit: fit["events"][0].update(sigma_x_nm=-1.0),
-        lambda fit: fit["events"][0].update(unknown=1),
-        lambda fit: fit.update(events=1),
-        lambda fit: fit["input"].update(sha256="abc"),
-    ):
-        bad = copy.deepcopy(good)
-        change(bad)
-        with pytest.raises(jsonschema.ValidationError):
-            _check(bad, "fit")
 
 
 def test_optics_bounds(capsys, tmp_path, setup) -> None:

@@ -6,7 +6,6 @@ The order is ``{"run": [argument, …]}``, with
 
 - ``"die": [word, number]`` to end by SIGKILL ``before`` or ``after`` its so manieth renaming
   or replacing of a file;
-- ``"limit": bytes`` for the largest file it may write;
 - ``"memory_share": share`` to cut a landing movie into many chunks;
 - ``"figures": true`` to draw the figures, which take nine tenths of a small run; otherwise files of
   a kilobyte take their places.
@@ -19,7 +18,6 @@ from __future__ import annotations
 import json
 import os
 import pathlib
-import resource
 import signal
 import sys
 from collections.abc import Callable
@@ -42,8 +40,6 @@ def _run(order: dict[str, Any]) -> int:
     if not order.get("figures"):
         # a moment to be killed in, at each figure
         sketch_figures(pytest.MonkeyPatch(), pause_s=0.01)
-    if "limit" in order:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (order["limit"], order["limit"]))
     if "memory_share" in order:
         chunks.MEMORY_SHARE = order["memory_share"]
     if "die" in order:

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import resource
 import shutil
 import signal
 import subprocess
@@ -33,7 +34,7 @@ from iscat_analysis.config import load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
 from iscat_analysis.report import write_report
-from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output, claim_output
+from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
 from iscat_analysis.search.sliding import chunks
 from iscat_analysis.study.simulate import write_stack
 from iscat_cli import main
@@ -47,6 +48,7 @@ SETUP = """
 [optics]
 na = 1.3
 attenuation = 0.1
+calibrate = "never"
 [camera]
 pixel_size_nm = 84.4
 frame_rate_hz = 200.0
@@ -55,6 +57,7 @@ exposure_ms = 5.0
 frames = [0, 20]
 [fit]
 roi_nm = 1300.0
+spheres = []
 [posterior]
 enabled = false
 [compute]
@@ -67,12 +70,35 @@ events = [{frame = 20, x_px = 23.2, y_px = 24.4, mass_kda = 3000.0}]
 FIT = ["fit", "movie.tif", "--config", "setup.toml", "--out", "result", "--overwrite"]
 
 
+HOLD = """
+import pathlib, sys
+from iscat_analysis.report.output import claim_output
+result = pathlib.Path("result")
+with claim_output(result):
+    with claim_output(result):  # the same process may: it is the same run
+        print(flush=True)
+        sys.stdin.read()
+"""
+
+
+@contextlib.contextmanager
+def files_limited(size: int | None) -> Iterator[None]:
+    """Let no file of this process grow beyond a size."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft if size is None else size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
 class Runner:
     """Runs orders: in processes of their own, or here where none of them is ended.
 
     An order is one of `runner.py` with ``"cwd": folder``, and ``"kill": [signal, share]`` to be
-    ended after that share of an undisturbed run's duration, or of ``"duration": seconds``.  An
-    answer is ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
+    ended after that share of an undisturbed run's duration, or of ``"duration": seconds``; here,
+    ``"limit": bytes`` is for the largest file it may write.  An answer is
+    ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
     """
 
     def __init__(self, folder: Path, kernels: Path) -> None:
@@ -89,6 +115,7 @@ class Runner:
         said, begin = io.StringIO(), time.monotonic()
         with (
             pytest.MonkeyPatch.context() as patch,
+            files_limited(order.get("limit")),
             contextlib.chdir(order["cwd"]),
             contextlib.redirect_stdout(io.StringIO()),
             contextlib.redirect_stderr(said),
@@ -143,8 +170,7 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     runner = Runner(bench, kernels)
     first = runner.here({"run": FIT, "cwd": str(bench)})
     assert first["status"] == 0, first["err"]
-    # All that this run compiled is kept for those that are killed, in a folder of their own, in
-    # which no other test compiles again while files may not grow.
+    # All that this run compiled is kept for those that are killed, in a folder of their own.
     record_checksums()
     shutil.copytree(os.environ["NUMBA_CACHE_DIR"], kernels, dirs_exist_ok=True)
     return runner
@@ -163,11 +189,14 @@ def names(folder: Path) -> list[str]:
 
 
 def assert_whole(result: Path, extra: tuple[str, ...] = ()) -> None:
-    """Every file is there and complete; `extra` are the table's further columns."""
+    """Every file is there and complete; `extra` are the table's further columns.
+
+    No spheres are tried, so that no column says what describes an image.
+    """
     assert REQUIRED <= set(names(result)) <= OUTPUT_NAMES
     table = pd.read_csv(result / "fits.csv")
     columns = tuple(c for c in table.columns if not c.startswith("systematic_"))
-    assert columns == (*EVENT_COLUMNS, *extra, *REPEAT_COLUMNS, "model")
+    assert columns == (*EVENT_COLUMNS, *extra, *REPEAT_COLUMNS)
     with (result / "fits.parquet").open("rb") as file:
         assert len(pd.read_parquet(file)) == len(table)
     summary = json.loads((result / "summary.json").read_text(encoding="utf-8"))
@@ -267,7 +296,8 @@ def landing(
 ) -> tuple[dict[str, Any], float, dict[str, bytes]]:
     """Return the order for a landing movie of several chunks, its duration and its result."""
     place = tmp_path_factory.mktemp("landing")
-    (place / "setup.toml").write_text(LANDING)
+    learns_nothing = LANDING.replace("[optics]", '[optics]\ncalibrate = "never"')
+    (place / "setup.toml").write_text(learns_nothing.replace("[fit]", "[fit]\nspheres = []"))
     write_stack(load_config(place / "setup.toml"), place / "movie.tif")
     order = {"run": FIT, "cwd": str(place), "memory_share": 0.0031}
     whole = runner.here(order)
@@ -381,12 +411,16 @@ def test_two_runs_into_one_folder(runner: Runner, place: Path, options: list[str
 
 
 def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> None:
-    with claim_output(place / "result"):
-        with claim_output(place / "result"):  # the same process may: it is the same run
-            pass
-        (answer,) = runner.run({"run": FIT, "cwd": str(place)})
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD], cwd=place, stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"\n"
+        answer = runner.here({"run": FIT, "cwd": str(place)})
+        holder.communicate()
+    assert holder.returncode == 0
     assert answer["status"] == 1
-    expected = f"result: another run (process {os.getpid()}) is about to write there"
+    expected = f"result: another run (process {holder.pid}) is about to write there"
     assert expected in one_line(answer)
     assert not (place / "result").exists()
     assert runner.here({"run": FIT, "cwd": str(place)})["status"] == 0
@@ -399,7 +433,7 @@ def test_a_run_that_is_under_way_is_respected(runner: Runner, place: Path) -> No
     "limit", [8_000, *(pytest.param(n, marks=pytest.mark.large) for n in (600, 30_000))]
 )
 def test_a_file_that_cannot_grow(runner: Runner, place: Path, limit: int) -> None:
-    (answer,) = runner.run({"run": FIT, "cwd": str(place), "limit": limit})
+    answer = runner.here({"run": FIT, "cwd": str(place), "limit": limit})
     assert answer["status"] == 1
     assert re.search(r"result: cannot be written \(.*File too large\)", one_line(answer))
     assert names(place) == ["movie.tif", "setup.toml"]
@@ -407,7 +441,7 @@ def test_a_file_that_cannot_grow(runner: Runner, place: Path, limit: int) -> Non
 
 def test_a_simulated_movie_that_cannot_grow(runner: Runner, place: Path) -> None:
     run = ["simulate", "--config", "setup.toml", "--out", "new.tif"]
-    (answer,) = runner.run({"run": run, "cwd": str(place), "limit": 50_000})
+    answer = runner.here({"run": run, "cwd": str(place), "limit": 50_000})
     assert answer["status"] == 1
     assert "new.tif: cannot be written" in one_line(answer)
     assert names(place) == ["movie.tif", "setup.toml"]
