@@ -37,7 +37,7 @@ from functools import cache
 from itertools import product
 
 import numpy as np
-from scipy.special import chdtrc
+from scipy.special import chdtrc, expit
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
@@ -119,7 +119,7 @@ def fit_equilibrium(
     dof = len(tables) * (series.kinds - 1) - 1 - int(inactive)
     logits, errors, complexes = _observed(series, free)
     shared, landed = series.shared(full), series.logits(full)
-    predicted = _share(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
+    predicted = expit(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
     reach = _SIGMAS * errors
     constants = equilibrium.constants(found.theta)
     constant_errors = equilibrium.constants(found.errors())
@@ -141,8 +141,8 @@ def fit_equilibrium(
         dof=dof,
         p_value=float(chdtrc(dof, chi2)) if dof > 0 else math.nan,
         complexes=complexes,
-        complexes_low=_share(logits - reach),
-        complexes_high=_share(logits + reach),
+        complexes_low=expit(logits - reach),
+        complexes_high=expit(logits + reach),
         predicted=predicted,
         pull=(logits - np.log(predicted / (1 - predicted))) / errors,
         background=series.weights(full)[:, -1],
@@ -283,7 +283,7 @@ def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, Fl
         slope[begin : begin + series.kinds - 1] = -one[1:] / (1 - one[-1])
         slope[begin + series.kinds - 2] = 1.0
         errors[number] = math.sqrt(max(float(slope @ covariance @ slope), 1e-12))
-    return logits, errors, _share(logits)
+    return logits, errors, expit(logits)
 
 
 def _profiled(
@@ -345,7 +345,3 @@ def _interval(
         points,
     )
     return ends, max(reached, key=lambda one: one.value)
-
-
-def _share(logits: FloatArray) -> FloatArray:
-    return np.asarray(1 / (1 + np.exp(-logits)))
