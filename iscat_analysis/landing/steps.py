@@ -396,9 +396,7 @@ class ChunkFitter:
             return None
         event, told = with_index(context, event)
         step = replace(step, at=task.at)
-        seen = (
-            near[index] if context.lines is None else [i for i in range(len(steps)) if i != index]
-        )
+        seen = near[index] if context.lines is None else sorted({*range(len(steps))} - {index})
         others = tuple(steps[i] for i in seen)
         far = others if context.lines is not None else [steps[i] for i in around[index]]
         spans, lighting = self._tasks.trace_spans(step, task.windows, far)
