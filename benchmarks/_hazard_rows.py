@@ -354,8 +354,8 @@ ROWS: Mapping[str, Row] = {
     "focus, gradient without record": Row(
         other_focus_unrecorded, (30.0, 0.0, 60.0), "nm", _CARRIED
     ),
-    "wavelength, gradient from elsewhere": Row(other_wavelength, (5.0, 2.0), "nm"),
-    "magnification, gradient from elsewhere": Row(other_magnification, (0.01, 0.005)),
+    "wavelength, gradient from elsewhere": Row(other_wavelength, (5.0, 1.0, 2.0), "nm"),
+    "magnification, gradient from elsewhere": Row(other_magnification, (0.01, 0.002, 0.005)),
     "focus step": Row(focus_step, (60.0, 30.0, 120.0), "nm", _MODEL),
     "gamma": Row(gamma, (0.8, 0.9, 0.95), "", "gamma|not in proportion"),
     "soft saturation": Row(saturation, (10.0, 2.0, 20.0), "mean light",
@@ -379,13 +379,13 @@ ROWS: Mapping[str, Row] = {
         halves_fitted, (100.0, 50.0, 70.0, 200.0), "nm", "wider|extended|apart"
     ),
     "aggregates among proteins": Row(aggregates, (5e3, 2e3, 1e4), "kDa"),
-    "vesicle among proteins": Row(vesicles, (200.0, 100.0), "nm"),
+    "vesicle among proteins": Row(vesicles, (200.0, 100.0, 150.0), "nm"),
     "second pattern moves": Row(moving_pattern, (0.1, 0.03, 0.3, 1.0), "px", "pattern|drift|move"),
     "uneven amplitude of the reference": Row(uneven_amplitude, (0.05, 0.03, 0.1), "", "differ"),
     "focus tilt": Row(focus_tilt, (100.0, 50.0, 200.0), "nm", _MODEL),
     "coma at the border": Row(coma, (25.0, 10.0, 40.0), "nm", _MODEL),
     "curved phase of the reference": Row(curved_phase, (0.3, 0.15, 0.6), "rad", _MODEL),
-    "8 bits": Row(few_bits, (0.001, 0.01), "of light"),
+    "8 bits": Row(few_bits, (0.001, 0.003, 0.01), "of light"),
     "dropped frames": Row(dropped, (0.1, 0.05, 0.3), "", "dropped", diffusion=True),
 }  # fmt: skip
 """What is tried.  To add one, write a function from strength and seed to a `Case`."""
