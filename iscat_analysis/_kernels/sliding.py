@@ -88,6 +88,17 @@ def region_sum(counts: NDArray[Any], good: BoolArray, out: FloatArray) -> None:
 
 
 @kernel(fastmath={"reassoc", "nsz"})
+def _add_rows(images: MapArray, i: int, out: MapArray) -> None:
+    """Add row i of every image.
+
+    Shapes: `images` (k, y, x), `out` (x,).
+    """
+    for k in range(images.shape[0]):
+        for j in range(out.size):
+            out[j] += images[k, i, j]
+
+
+@kernel(fastmath={"reassoc", "nsz"})
 def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray, out: MapArray) -> float:
     """Weighted contrast of two sums over the field, minus its weighted mean.
 
@@ -99,12 +110,8 @@ def contrast_map(earlier: MapArray, later: MapArray, weight: MapArray, out: MapA
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):
-        for k in range(earlier.shape[0]):
-            for j in range(columns):
-                before[i, j] += earlier[k, i, j]
-        for k in range(later.shape[0]):
-            for j in range(columns):
-                after[i, j] += later[k, i, j]
+        _add_rows(earlier, i, before[i])
+        _add_rows(later, i, after[i])
         for j in range(columns):
             total_before += before[i, j] if weight[i, j] > 0 else 0.0
             total_after += after[i, j] if weight[i, j] > 0 else 0.0
@@ -143,12 +150,8 @@ def step_energy(
     total_before = 0.0
     total_after = 0.0
     for i in range(rows):
-        for k in range(earlier.shape[0]):
-            for j in range(columns):
-                before[i, j] += earlier[k, i, j]
-        for k in range(later.shape[0]):
-            for j in range(columns):
-                after[i, j] += later[k, i, j]
+        _add_rows(earlier, i, before[i])
+        _add_rows(later, i, after[i])
         for j in range(columns):
             lit = used[i, j] and before[i, j] > 0 and after[i, j] > 0
             before[i, j] = before[i, j] if lit else 0.0
