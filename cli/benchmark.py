@@ -35,8 +35,6 @@ that can be named, and your own simulation compared with the bounds.
     iscat benchmark --config setup.toml --truth true.csv --results results.csv
 """
 
-MODES = ("mass", "size", "localize", "joint")
-
 
 @command
 def benchmark(
@@ -163,6 +161,8 @@ def estimators_table() -> Table:
 
 def left_out(study: Mapping[str, Any]) -> list[str]:
     """Say where fits are part of no bias and no spread though they did not fail."""
+    from iscat_analysis.report.benchmark import MODES
+
     notes = []
     for mode, (status, several, key) in product(MODES, _AMBIGUOUS):
         if mode not in study or not (ambiguous := study[mode]["flagged"][status]):
@@ -185,6 +185,8 @@ _AMBIGUOUS = (
 
 def benchmark_table(study: Mapping[str, Any]) -> Table:
     """Tabulate what benchmark.json holds: one row per mode and parameter."""
+    from iscat_analysis.report.benchmark import MODES
+
     headings = ("bias", "spread", "CRB", "QCRB", "spread/CRB", "95 % interval", "coverage 68 %")
     found = table("mode", "parameter", *headings, "failed")
     found.columns[1].justify = "left"

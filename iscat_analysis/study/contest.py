@@ -22,7 +22,7 @@ from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
 from iscat_analysis.study.estimator_process import Answer, Job, run_estimator
 from iscat_analysis.study.estimators import Estimator, EstimatorSetup
 from iscat_analysis.study.limits import Limits, detection_snr, limits_of_alike
-from iscat_analysis.study.setting import Setting, make_setting
+from iscat_analysis.study.setting import OF_DIPOLES, Setting, make_setting
 from iscat_analysis.study.trials import trial_generator
 from iscat_analysis.study.yardstick import (
     paired,
@@ -31,8 +31,6 @@ from iscat_analysis.study.yardstick import (
     resamples,
     score_estimates,
 )
-
-MODES = ("mass", "localize", "joint")
 
 RANGE_CRB = 5.0
 """Half-width of the truths' range, in bounds, as long as the following are not exceeded."""
@@ -158,8 +156,8 @@ def compare_estimators(
 ) -> dict[str, Any]:
     """Let estimators see the same counts, and score them: ``estimators``, ``paired``, curves."""
     place = executor or LocalExecutor()
-    mode = config.fit.mode if config.fit.mode in MODES else "mass"
-    settings = {m: make_setting(config, m) for m in MODES}
+    mode = config.fit.mode if config.fit.mode in OF_DIPOLES else "mass"
+    settings = {m: make_setting(config, m) for m in OF_DIPOLES}
     tables = {m: draw(s, trials, seed=seed, stream=1000 + k)
               for k, (m, s) in enumerate(settings.items())}  # fmt: skip
     fewer = max(trials // CURVE_SHARE, LEAST_CURVE)

@@ -19,6 +19,7 @@ from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 from iscat_analysis.study.limits import Limits, limits_at
+from iscat_analysis.study.setting import OF_DIPOLES
 from iscat_analysis.study.yardstick import resamples, score_estimates
 
 _MASS_STEP = 0.02
@@ -194,7 +195,7 @@ def _experiment(config: Config, highest_nm: float) -> Experiment:
 def _resolved(setup: Setup, mode: str | None) -> tuple[Config, tuple[str, ...]]:
     config = configure(setup)
     name = config.fit.mode if mode is None else mode
-    choice_in("mode", name, ("mass", "localize", "joint"))
+    choice_in("mode", name, OF_DIPOLES)
     config = config.model_copy(update={"fit": config.fit.model_copy(update={"mode": name})})
     return config, FREE_PARAMETERS[name]
 
