@@ -81,7 +81,7 @@ class CommonSize:
     mass_kda: float
     index: float
     likely: FloatArray
-    """x, y and z of every likely place in a frame [nm], shape (n, 3)."""
+    """x, y and z of every likely place in a frame [nm], perhaps the level, (n, 3) or (n, 4)."""
 
     frames: IntArray
     """Number of the frame of each, shape (n,)."""
