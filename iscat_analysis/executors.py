@@ -30,6 +30,7 @@ from contextvars import ContextVar
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
@@ -150,38 +151,54 @@ class LocalExecutor:
         work: Callable[[T], R],
         waiting: deque[tuple[int, T]],
     ) -> Generator[tuple[int, R]]:
-        """Do items here and in the second process, until none is left or that process dies."""
-        sent: tuple[int, T, Future[R]] | None = None
+        """Do items here and in the second process, until none is left or that process dies.
+
+        Whichever has done an item takes the next one.  This process has the first.
+        """
+        done: SimpleQueue[tuple[int, R]] = SimpleQueue()
+
+        def send() -> None:
+            while (sent_one := _next_of(waiting)) is not None:
+                number, item = sent_one
+                try:
+                    done.put((number, work(item)))
+                except BrokenProcessPool:
+                    waiting.append(sent_one)
+                    raise
+
         with ThreadPoolExecutor(1, initializer=_ELSEWHERE.set, initargs=(True,)) as sender:
+            own = _next_of(waiting)
+            sent = sender.submit(send)
             try:
-                while waiting or sent:
-                    own = waiting.popleft() if waiting else None
-                    if sent is None and waiting:
-                        number, item = waiting.popleft()
-                        sent = number, item, sender.submit(work, item)
-                    if own is not None:
-                        yield own[0], work(own[1])
-                    if sent is not None and (sent[2].done() or not waiting):
-                        number, item, future = sent
-                        try:
-                            result = future.result()
-                        except BrokenProcessPool:
-                            warnings.warn(_LOST, stacklevel=2)
-                            self._second = None
-                            waiting.append((number, item))
-                            return
-                        finally:
-                            sent = None if future.done() else sent
-                        yield number, result
+                while own is not None:
+                    yield own[0], work(own[1])
+                    while not done.empty():
+                        yield done.get()
+                    own = None if sent.done() else _next_of(waiting)
+                sent.result()
+            except BrokenProcessPool:
+                warnings.warn(_LOST, stacklevel=2)
+                self._second = None
             finally:
-                if sent is not None:  # nobody waits for it any more
+                if not sent.done():  # nobody waits for it any more
+                    waiting.clear()
                     second.end()
                     self._second = None
+            while not done.empty():
+                yield done.get()
 
     def warnings(self, memory_limit_mb: int) -> list[str]:
         """Return no warnings; see `Executor`."""
         del memory_limit_mb
         return []
+
+
+def _next_of(waiting: deque[T]) -> T | None:
+    """Take the first of what waits, which another thread may take as well; None if none is left."""
+    try:
+        return waiting.popleft()
+    except IndexError:
+        return None
 
 
 _ELSEWHERE: ContextVar[bool] = ContextVar("elsewhere", default=False)

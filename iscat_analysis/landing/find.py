@@ -13,6 +13,7 @@ import threading
 from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -178,8 +179,21 @@ def analyse_landings(
     )  # fmt: skip
     merged = MergedChunks(reader.shape, [stop for _, stop in stretches])
     fields = _Fields()
+    # of each chunk the tile before the last, and the frames of the next chunk
+    before_last = {
+        end - 2: after[0].span
+        for end, after in zip(np.cumsum([*map(len, chunks)]).tolist(), chunks[1:], strict=False)
+    }
     interrupted = False
     with threads(executor.threads(config.compute.workers, len(plan))) as pool:
+
+        def summed(span: tuple[int, int]) -> FieldSums:
+            return fields.of(
+                span,
+                lambda: executor.call(
+                    field_job, movie_job, span, here=lambda: reader.field_sums(span, pool)
+                ),
+            )
 
         def finish(number: int) -> FinishedChunk:
             done = None if posterior else store.load(number)
@@ -190,15 +204,11 @@ def analyse_landings(
                 if executor.distant:
                     reader.forget()  # whoever does it has a reader of its own
 
-                def summed() -> FieldSums:
-                    return executor.call(
-                        field_job, movie_job, part.span,
-                        here=lambda: reader.field_sums(part.span, pool),
-                    )  # fmt: skip
-
                 sums = None
                 if part.tile is not None:
-                    sums = fields.of(part.span, summed).part(part.tile.here)
+                    sums = summed(part.span).part(part.tile.here)
+                    if reader.in_place and number in before_last:
+                        summed(before_last[number])  # while another process does the other tiles
 
                 def here() -> FinishedChunk:
                     return analyse_part(
@@ -328,11 +338,19 @@ def _whole(parts: Sequence[Part], done: Sequence[FinishedChunk]) -> FinishedChun
     return joined(tiles, done) if tiles else done[0]
 
 
+@dataclass
+class _Field:
+    """What the frames of a chunk say of the whole field, once they are summed."""
+
+    lock: threading.Lock = field(default_factory=threading.Lock)
+    sums: FieldSums | None = None
+
+
 class _Fields:
-    """What the frames of chunks say of the whole field: summed once for all tiles of a chunk."""
+    """Sums over the whole field, made once for all tiles of a chunk."""
 
     def __init__(self) -> None:
-        self._known: dict[tuple[int, int], FieldSums] = {}
+        self._known: dict[tuple[int, int], _Field] = {}
         self._lock = threading.Lock()
 
     def of(self, span: tuple[int, int], make: Callable[[], FieldSums]) -> FieldSums:
@@ -341,8 +359,11 @@ class _Fields:
             if span not in self._known:
                 for old in sorted(self._known)[: 1 - _FIELDS]:
                     del self._known[old]
-                self._known[span] = make()
-            return self._known[span]
+            own = self._known.setdefault(span, _Field())
+        with own.lock:
+            if own.sums is None:
+                own.sums = make()
+            return own.sums
 
 
 def _median_snr(table: pd.DataFrame) -> float:
