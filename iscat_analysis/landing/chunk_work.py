@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,17 +20,17 @@ from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
 from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
-from iscat_analysis.landing.neighbours import Neighbours
 from iscat_analysis.landing.steps import ChunkFitter, StepEvent
 from iscat_analysis.records import (
     CountSource,
     EventView,
+    FloatArray,
     PosteriorResult,
     Progress,
     make_rows,
     silent,
 )
-from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, MapArray, Tile, stride_of
+from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
 from iscat_analysis.search.sliding.chunks import Part, Reader, reader_of
 from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
@@ -134,6 +133,8 @@ def analyse_chunk(
         context, still, window, pool, pattern, excess_noise=excess_noise, own=own,
         controlled=part.controlled,
     )  # fmt: skip
+    inside = slice(core[0] - chunk.first, core[1] - chunk.first)
+    ends = _ends(chunk, inside)  # before maps take the place of its blocks
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam), core)
     if tile is not None:
@@ -152,7 +153,10 @@ def analyse_chunk(
             stopped = True
             break
     shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
-    inside = slice(core[0] - chunk.first, core[1] - chunk.first)
+    empty_ends = [
+        mean_e / fitter.neighbours.light_in(frames, (one.step for one in steps))
+        for frames, mean_e in ends
+    ]
     light = np.where(chunk.good, chunk.power, np.nan) * chunk.level_e
     lines = make_rows(lines_of(context, events, mapper=pool.map))
     corner = (0, 0) if tile is None else tile.corner
@@ -170,9 +174,9 @@ def analyse_chunk(
         good=chunk.good[inside].copy(),
         light=light[inside],
         masked=~chunk.usable[own],
-        saturated=chunk.saturated[own],
-        strongest=fitter.strongest[(slice(None), *own)],
-        ends_e=_ends(chunk, inside, fitter.neighbours, steps)[(slice(None), *own)],
+        saturated=chunk.saturated[own].copy(),
+        strongest=fitter.strongest[(slice(None), *own)].copy(),  # not held with its halo
+        ends_e=np.array([image[own] for image in empty_ends], dtype=np.float32),
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,
@@ -206,21 +210,17 @@ def view_moved(view: EventView, corner: tuple[int, int]) -> EventView:
     return replace(view, row_px=view.row_px + y, column_px=view.column_px + x)
 
 
-def _ends(
-    chunk: Chunk, inside: slice, neighbours: Neighbours, fitted: Sequence[StepEvent]
-) -> MapArray:
-    """Mean images of the first and the last quarter of a core, without what lands or leaves.
+def _ends(chunk: Chunk, inside: slice) -> list[tuple[slice, FloatArray]]:
+    """Mean images of the first and the last quarter of a core, and their frames.
 
-    Shapes: result (2, y, x).
+    Shapes: each image (y, x).
     """
     lit = np.add.reduceat(chunk.good, chunk.edges[:-1], dtype=np.int64) > 0
     held = lit & (chunk.edges[:-1] >= inside.start) & (chunk.edges[1:] <= inside.stop)
     blocks = np.flatnonzero(held if held.any() else lit)
     few = max(1, blocks.size // 4)
-    ends = blocks[:few], blocks[-few:]
     images = []
-    for part in ends:
+    for part in (blocks[:few], blocks[-few:]):
         frames = slice(int(chunk.edges[part[0]]), int(chunk.edges[part[-1] + 1]))
-        light = chunk.blocks_e[part].mean(axis=0, dtype=np.float64)
-        images.append(light / neighbours.light_in(frames, (one.step for one in fitted)))
-    return np.array(images, dtype=np.float32)
+        images.append((frames, chunk.blocks_e[part].mean(axis=0, dtype=np.float64)))
+    return images

@@ -40,6 +40,7 @@ from iscat_analysis.landing.joining import joined
 from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.searched import searched_warning
+from iscat_analysis.landing.step_maps import maps_are_local
 from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import FieldSums, boundaries, stride_of
 from iscat_analysis.search.sliding.chunks import Part, plan_parts, reader_of
@@ -166,10 +167,11 @@ def analyse_landings(
             config, reader.shape, searches=count, noise=noise.spectrum, lines=lines, sliding=True
         )
     prepare(context)
+    in_place = maps_are_local(context, moving=config.background.follows_pattern)
     chunks = [
         chunk
         for stretch in stretches
-        for chunk in plan_parts(reader, config, window, stride, stretch)
+        for chunk in plan_parts(reader, config, window, stride, stretch, in_place=in_place)
     ]
     plan = [part for chunk in chunks for part in chunk]
     store = Store(partial, config, identity, reader.shape, (first, last), camera)

@@ -34,7 +34,7 @@ class StepMaps:
     ) -> None:
         self._context, self._chunk, self.matched = context, chunk, matched
         self._neighbours, self._pattern = neighbours, pattern
-        self.is_local = pattern is None and context.lines is None and matched.noise is None
+        self.is_local = maps_are_local(context, moving=pattern is not None)
         self._maps: tuple[MapArray, FloatArray] | None = None
         self._known: list[Step] = []
         self._near: list[list[Step]] = []  # of those known, which were taken off each map
@@ -42,7 +42,10 @@ class StepMaps:
     def without(self, steps: Sequence[Step], mapper: Mapper) -> tuple[MapArray, FloatArray]:
         """Subtract known steps."""
         if self.is_local:
-            maps = self._maps or sliding_maps(self._chunk, self.matched, STRIDES, mapper=mapper)
+            maps = self._maps or sliding_maps(
+                self._chunk, self.matched, STRIDES,
+                in_place=self._chunk.lends_blocks, mapper=mapper,
+            )  # fmt: skip
             for step in _missing(self._known, steps):
                 self._add(maps, step, 1.0)
             for step in _missing(steps, self._known):
@@ -105,6 +108,11 @@ class StepMaps:
             explained=explained if steps or moving else None,
             earlier=self._maps, changed=changed, mapper=mapper,
         )  # fmt: skip
+
+
+def maps_are_local(context: AnalysisContext, *, moving: bool) -> bool:
+    """Whether a step changes the maps near it alone, so that nobody makes them again."""
+    return not moving and context.lines is None and context.templates.noise is None
 
 
 def _ids(steps: Sequence[Step]) -> set[int]:

@@ -54,10 +54,10 @@ MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may tak
 _AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fit into memory
 _FEWEST_AT_ONCE = 8
 _BANDS = 4  # of rows, whose sums over the frames are made at a time
-_SPAN_BYTES = 4e9  # of the frames of a chunk of a large field: they stay in the system's cache
+_SPAN_BYTES = 6e9  # of the frames of a chunk of a large field: they stay in the system's cache
 _CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
+_SUM_BYTES, _MAP_BYTES, _HIGHEST_BYTES = 4, 4, 2  # of a pixel of a block
 _TILE_BYTES = 160  # of a pixel of a tile, beside its blocks and maps
-_HIGHEST_BYTES = 2  # of the highest count of a pixel in a block
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
 
@@ -372,16 +372,19 @@ def plan_parts(
     window: int,
     stride: int,
     stretch: tuple[int, int] | None = None,
+    *,
+    in_place: bool = True,
 ) -> list[list[Part]]:
     """Divide a movie, or a stretch of it, into chunks, and each chunk of a large field into tiles.
 
-    Block edges fall on the same frames in every chunk.
+    Block edges fall on the same frames in every chunk.  Maps of a tile take no memory of their own
+    where they are made in place.
     """
     first, last = stretch or (reader.first, reader.last)
     plan = plan_chunks(reader, config, window, stride, (first, last))
     if plan:
         return [[Part(core, span)] for core, span in plan]
-    parts, core = choose_tiles(reader, config, window, stride, last - first)
+    parts, core = choose_tiles(reader, config, window, stride, last - first, in_place=in_place)
     tiles = cut_field(reader.shape, parts, halo_px(config))
     count = math.ceil((last - first) / core)
     even = math.ceil((last - first) / count / stride) * stride
@@ -414,13 +417,13 @@ def halo_frames(window: int, stride: int) -> int:
 
 
 def choose_tiles(
-    reader: Reader, config: Config, window: int, stride: int, frames: int
+    reader: Reader, config: Config, window: int, stride: int, frames: int, *, in_place: bool
 ) -> tuple[tuple[int, int], int]:
     """Choose rows and columns of tiles, and the frames of a core, that look at least at halos."""
     side, halo = halo_px(config), halo_frames(window, stride)
     smallest = _roi_px(config)
-    # tiles need no highest counts of blocks
-    budget, per_frame = counts_budget(config), (_per_block(config) - _HIGHEST_BYTES) / stride
+    per_block = _SUM_BYTES + _moving_bytes(config) + (0 if in_place else _MAP_BYTES)
+    budget, per_frame = counts_budget(config), per_block / stride
     longest = int(_SPAN_BYTES // reader.frame_bytes)
     best: tuple[float, tuple[int, int], int] | None = None
     rows, columns = reader.shape
@@ -458,12 +461,9 @@ def _largest(size: int, parts: int, halo: int) -> int:
     return min(math.ceil(size / parts) + min(parts - 1, 2) * halo, size)
 
 
-def _per_block(config: Config) -> int:
-    """Bytes of a pixel of a block beside its counts: its sum, its map and its highest count.
-
-    Where the motion of the pattern is divided out, that and a spectrum as well.
-    """
-    return 22 if config.background.follows_pattern else 10
+def _moving_bytes(config: Config) -> int:
+    """Bytes of a pixel of a block for the motion of the pattern: its contrast and a spectrum."""
+    return 12 if config.background.follows_pattern else 0
 
 
 def plan_chunks(
@@ -479,7 +479,8 @@ def plan_chunks(
     budget = counts_budget(config)
     # beside counts and blocks, the field holds some images in doubles
     pixels = math.prod(reader.shape)
-    buffers_bytes = _per_block(config) * pixels // stride
+    per_block = _SUM_BYTES + _MAP_BYTES + _HIGHEST_BYTES + _moving_bytes(config)
+    buffers_bytes = per_block * pixels // stride
     if (last - first) * (reader.frame_bytes + buffers_bytes) <= budget - 40 * pixels:
         return [((first, last), (first, last))]
     room = (budget - 40 * pixels) // (reader.held_bytes + buffers_bytes)

@@ -48,6 +48,7 @@ class Chunk:
     check: Callable[[], None]
     let_go: Callable[[], None]  # of pages of the file, once a region was copied
     level_e: float  # mean light of a pixel and frame, of the whole field
+    lends_blocks: bool  # whether maps may take their memory: nobody else asks for this chunk
     _regions: HeldRegions = field(init=False, repr=False, default_factory=HeldRegions)
 
     @property
@@ -301,7 +302,7 @@ def make_chunk(
         (first, first + len(counts)), good, light_e, blocks.sum(axis=0, dtype=np.float64),
         highest.max(axis=0), camera, defects,
     )  # fmt: skip
-    return _chunk(stored, sums, camera, edges, blocks, check, _nothing)
+    return _chunk(stored, sums, camera, edges, blocks, check, _nothing, lends_blocks=False)
 
 
 def sums_of(
@@ -368,7 +369,7 @@ def make_tile_chunk(
         counts, sums.good, camera, stride, check_and_let_go, mapper, highest=False
     )
     let_go()
-    return _chunk(counts, sums, camera, edges, blocks, check, let_go)
+    return _chunk(counts, sums, camera, edges, blocks, check, let_go, lends_blocks=True)
 
 
 def _chunk(
@@ -379,11 +380,13 @@ def _chunk(
     blocks: NDArray[np.float32],
     check: Callable[[], None],
     let_go: Callable[[], None],
+    *,
+    lends_blocks: bool,
 ) -> Chunk:
     """Put frames, their blocks and what is known of them together."""
     return Chunk(
         sums.span[0], counts, sums.good, sums.power, camera, sums.mean_e, sums.usable,
-        sums.saturated, edges, blocks, check, let_go, sums.level_e,
+        sums.saturated, edges, blocks, check, let_go, sums.level_e, lends_blocks,
     )  # fmt: skip
 
 

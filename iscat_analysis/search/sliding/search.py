@@ -10,6 +10,7 @@ threshold allows for: what exceeds it at both is one false alarm.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,6 +32,9 @@ STRIDES = 4
 
 CORRELATION = 1 - 3 / (2 * STRIDES)
 """Of the noise at a boundary with that at the next, of w frames after less w frames before."""
+
+
+_MAPS_AT_ONCE = 4  # that threads make before they are stored
 
 
 def stride_of(window: int) -> int:
@@ -134,9 +138,12 @@ def sliding_maps(
     explained: Callable[[int, slice, slice], FloatArray | None] | None = None,
     earlier: tuple[MapArray, FloatArray] | None = None,
     changed: Sequence[int] = (),
+    in_place: bool = False,
     mapper: Mapper = map,
 ) -> tuple[MapArray, FloatArray]:
     """Signal-to-noise ratio of a step at every boundary between blocks and every pixel.
+
+    Maps that are made in place take the memory of the blocks, which are gone then.
 
     Shapes: `snr` (k − 1, y, x), `frames` (k − 1,).
     """
@@ -144,17 +151,17 @@ def sliding_maps(
     rows, columns = chunk.shape
     block_power = np.add.reduceat(chunk.power, chunk.edges[:-1])
     if earlier is None:
-        earlier = np.empty((count, rows, columns), dtype=np.float32), np.zeros(count)
+        room = chunk.blocks_e[:count] if in_place else np.empty((count, rows, columns), np.float32)
+        earlier = room, np.zeros(count)
         changed = range(count)
     snr, effective = earlier
     root = np.sqrt(matched.norm)
 
-    def one(j: int) -> None:
+    def one(j: int) -> MapArray:
         low, middle, high = max(j + 1 - strides, 0), j + 1, min(j + 1 + strides, count + 1)
         powers = block_power[low:middle].sum(), block_power[middle:high].sum()
         if min(powers) <= 0:
-            snr[j] = 0.0
-            return
+            return np.zeros((rows, columns), dtype=np.float32)
         blocks = chunk.blocks_e
         image = np.zeros(matched.size, dtype=np.float32)
         contrast_map(blocks[low:middle], blocks[middle:high], matched.weight, image)
@@ -173,10 +180,19 @@ def sliding_maps(
         spectrum *= matched.spectrum
         overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
         effective[j] = powers[0] * powers[1] / (powers[0] + powers[1])
-        np.divide(overlap * math.sqrt(effective[j]), root, out=snr[j])
+        overlap *= math.sqrt(effective[j])
+        overlap /= root
+        return overlap
 
-    for _ in mapper(one, changed):
-        pass
+    waiting: deque[tuple[int, MapArray]] = deque()
+    for start in range(0, len(changed), _MAPS_AT_ONCE):
+        some = changed[start : start + _MAPS_AT_ONCE]
+        waiting.extend(zip(some, list(mapper(one, some)), strict=True))
+        # blocks from here on are those of the next map
+        needed = some[-1] + 2 - strides if in_place and some[-1] != changed[-1] else count
+        while waiting and waiting[0][0] < needed:
+            j, made = waiting.popleft()
+            snr[j] = made
     return snr, effective
 
 
