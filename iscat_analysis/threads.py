@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -14,12 +13,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 if TYPE_CHECKING:
-    from iscat_analysis.records import Mapper
+    pass
 
 T = TypeVar("T")
-
-# light is judged a tenth sooner in one thread of 256 x 256 or 512 x 512 pixels, 5 % later of 1024
-_LARGE_PX = 2**19
 
 
 @dataclass(frozen=True)
@@ -103,15 +99,6 @@ def threads(count: int) -> Iterator[ThreadPoolExecutor]:
         pool = ThreadPoolExecutor(count) if count > 1 else _Inline()
     with one_thread_algebra(), pool:
         yield pool
-
-
-def over_frames(pool: ThreadPoolExecutor, shape: tuple[int, ...]) -> Mapper:
-    """Choose what goes through images of the size of a frame with a few calls of NumPy for each.
-
-    Below `_LARGE_PX` such calls are so short that threads wait longer for their turn at Python than
-    they save, in whatever number.
-    """
-    return pool.map if math.prod(shape) >= _LARGE_PX else map
 
 
 @contextmanager

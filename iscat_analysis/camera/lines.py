@@ -28,7 +28,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.lighting import Surface
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.movie.stack import Stack
-from iscat_analysis.records import CountSource, FloatArray, Mapper, StackMetadata
+from iscat_analysis.records import CountSource, FloatArray, StackMetadata
 
 _LEAST_LIT = 0.25  # of a line's pixels that must be usable
 
@@ -188,8 +188,6 @@ def find_lines(
     counts: NDArray[Any],
     camera: Camera,
     surface: Surface | None = None,
-    *,
-    mapper: Mapper = map,
 ) -> Lines | None:
     """Find rows and columns that flicker.
 
@@ -205,7 +203,7 @@ def find_lines(
     if surface is not None:  # both parts of what is divided out are relative to the same light
         lines = replace(lines, surface=replace(surface, light_e=lines.light_e))
         even = lines.divided(counts, camera)
-    spectrum = measure_spectrum(even, camera, mapper=mapper)
+    spectrum = measure_spectrum(even, camera)
     if spectrum is not None and any(spectrum.shared):
         return replace(lines, shares=spectrum.shared)
     return None if surface is None else lines

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.records import BoolArray, FloatArray
 
 REACH_PX = 6
 """Distance of pixels up to which their noise may be correlated, beyond what rows share."""
@@ -140,7 +140,6 @@ def measure_spectrum(
     camera: Camera,
     *,
     masked: BoolArray | None = None,
-    mapper: Mapper = map,
 ) -> NoiseSpectrum | None:
     """Measure the noise between neighbouring frames.
 
@@ -208,7 +207,7 @@ def measure_spectrum(
         return np.asarray(np.square(waves.real) + np.square(waves.imag))
 
     total, pairs = np.zeros((rows, columns // 2 + 1)), 0
-    for spectrum in mapper(periodogram, starts.tolist()):
+    for spectrum in map(periodogram, starts.tolist()):
         if spectrum is not None:
             total += spectrum
             pairs += 1

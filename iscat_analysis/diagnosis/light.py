@@ -21,7 +21,7 @@ from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.movie import Stack
 from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
-from iscat_analysis.threads import over_frames, threads
+from iscat_analysis.threads import one_thread_algebra
 
 PAIRS = 12
 """Places in a movie at which the light of some frames is compared with that of later ones.
@@ -100,9 +100,9 @@ def judge_lines(
     counts = counts[good_frames(counts, camera)]
     if not len(counts):
         return None
-    with threads(config.compute.workers) as pool:
+    with one_thread_algebra():
         surface = find_surface([(p.before, p.after) for p in pairs], camera, window)
-        return find_lines(counts, camera, surface, mapper=over_frames(pool, counts.shape[1:]))
+        return find_lines(counts, camera, surface)
 
 
 def _apart(pairs: Sequence[Pair]) -> list[NDArray[Any]]:

@@ -30,7 +30,7 @@ from iscat_analysis.diagnosis.camera_numbers import (
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Mapper, Windows
+from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Windows
 from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     NoiseCurve,
@@ -43,7 +43,7 @@ from iscat_analysis.search.sliding import (
 )
 from iscat_analysis.search.sliding.chunks import NOISE_FRAMES, Reader
 from iscat_analysis.search.templates import ExcessNoise
-from iscat_analysis.threads import over_frames, threads
+from iscat_analysis.threads import one_thread_algebra
 
 SPECTRUM_FRAMES = 128
 """Background frames on which the spectrum of the noise is measured."""
@@ -101,7 +101,6 @@ def judge_counts(
     masked: BoolArray | None = None,
     additive: bool = False,
     follows: bool | None = None,
-    mapper: Mapper = map,
     whole: tuple[NDArray[Any], Camera] | None = None,
 ) -> Noise:
     """Compare the noise between neighbouring frames with the camera's.
@@ -112,7 +111,7 @@ def judge_counts(
     Shapes: `counts` (t, y, x), `masked` (y, x).
     """
     seen, theirs = whole or (counts, camera)
-    spectrum = measure_spectrum(seen, theirs, masked=masked, mapper=mapper)
+    spectrum = measure_spectrum(seen, theirs, masked=masked)
     try:
         gain = diagnose_gain(counts[:_GAIN_FRAMES], camera, masked=masked)
     except DataError:  # too dark to tell
@@ -121,9 +120,7 @@ def judge_counts(
     gain = with_pattern_jitter(gain, counts[:_GAIN_FRAMES], camera, masked=masked)
     if follows and gain.shakes:
         still = without_pattern_jitter(counts, camera, masked=masked)
-        return judge_counts(
-            still, camera, masked=masked, additive=additive, mapper=mapper, whole=whole
-        )
+        return judge_counts(still, camera, masked=masked, additive=additive, whole=whole)
     shared = shared_light(counts, camera, masked=masked)
     if shared is not None:
         return Noise((_filtered(shared),), True)  # the spectrum is that of neighbours as well
@@ -238,9 +235,8 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     additive = config.optics.scheme == "darkfield"
     judged, field = reader.sampled, FieldSample.of(reader.shape)
     sample: dict[str, Any] | None = None
-    with threads(config.compute.workers) as pool:
-        mapper = over_frames(pool, reader.shape)
-        opening, curve, window = judge_window(judged, config, mapper)
+    with one_thread_algebra():
+        opening, curve, window = judge_window(judged, config)
         whole = None
         if field is not None:
             sample = field.summary(*field.scatter(opening[:_GAIN_FRAMES], judged.camera))
@@ -249,7 +245,7 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
             whole = counts[good_frames(counts, reader.camera)], reader.camera
         noise = judge_counts(
             opening, judged.camera, additive=additive,
-            follows=config.background.follows_pattern, mapper=mapper, whole=whole,
+            follows=config.background.follows_pattern, whole=whole,
         )  # fmt: skip
     if noise.excess is None:
         ratio = curve.at(window)
@@ -262,9 +258,7 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
     return NoiseSurvey(reader, noise, curve, window, sample)
 
 
-def judge_window(
-    reader: Reader, config: Config, mapper: Mapper = map
-) -> tuple[NDArray[Any], NoiseCurve, int]:
+def judge_window(reader: Reader, config: Config) -> tuple[NDArray[Any], NoiseCurve, int]:
     """Choose how many frames around a step are summed.
 
     Shapes: `opening` (t, y, x).
@@ -282,10 +276,10 @@ def judge_window(
             + (", or lower background.window_frames" if given else "")
             + "; or give the frames before the particles bind as background.frames = [0, N]"
         )
-    opening = reader.opening(mapper)
+    opening = reader.opening()
     longest = min(given or longest_window(frames), NOISE_FRAMES // 4)
     follows = config.background.follows_pattern
-    curve = measure_noise(opening, reader.camera, longest, follows=follows, mapper=mapper)
+    curve = measure_noise(opening, reader.camera, longest, follows=follows)
     window = given or choose_window(curve, frames)
     return opening, curve, window
 

@@ -39,7 +39,6 @@ from iscat_analysis.search.bright import (
 )
 from iscat_analysis.search.sliding import FieldSums, Tile, stride_of
 from iscat_analysis.search.sliding.chunks import Reader, plan_parts, reader_of
-from iscat_analysis.threads import over_frames
 
 APART_NM = 2000.0
 """Particles that all bound at once are used if no other is nearer; the rings are accounted for."""
@@ -77,7 +76,7 @@ def bright_particle_images(
                 opening.reader, opening.window, config, pool, rings, whole
             )
         reader = reader_of(movie, config, camera, fitted_frames(movie, config))
-        window = judge_window(reader.sampled, config, pool.map)[2]
+        window = judge_window(reader.sampled, config)[2]
         return landing_particle_images(reader, window, config, pool, rings, whole)
     if heights_free(config) and background_mode(config) == "fixed":
         return [], []
@@ -127,7 +126,6 @@ def landing_particle_images(
             roi_px=_roi_px(config),
             most=most,
             motion=pattern,
-            mapper=over_frames(pool, reader.shape),
         )
         around = every if rings else ()
         if part.tile is not None:

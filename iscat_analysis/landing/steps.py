@@ -118,6 +118,7 @@ class ChunkFitter:
         self._last: tuple[list[Peak], tuple[MapArray, FloatArray]] | None = None
         self.strongest = np.zeros((2, *chunk.shape), dtype=np.float32)  # of a figure
         self.rounds = 0
+        self._direction = 1  # through places: next from the end whose regions are still held
         self.searched: Searched | None = None
         self.empty: EmptySpread | None = None  # noise where nothing lands or leaves
 
@@ -272,8 +273,6 @@ class ChunkFitter:
         """Whether a step is in the core of a tile, or nearer to it than a margin."""
         return is_within(self._own, step.start.y_px, step.start.x_px, margin_px)
 
-    # ---- one step --------------------------------------------------------------------------
-
     def _improve(
         self, steps: Sequence[Step], chosen: set[int], near: Sequence[Sequence[int]]
     ) -> list[Step]:
@@ -326,7 +325,8 @@ class ChunkFitter:
             task = self._tasks.build(index, steps, near)
             return steps[index] if task is None else fitted(steps[index], task)
 
-        refitted, order = list(steps), _by_place(steps, chosen)
+        refitted, order = list(steps), _by_place(steps, chosen)[:: self._direction]
+        self._direction = -self._direction
         for index, step in zip(order, self._pool.map(one, order), strict=True):
             refitted[index] = step
         return refitted

@@ -229,7 +229,7 @@ def test_tiles_of_a_field_give_the_same_bytes(
 ) -> None:
     """Two tiles of each of two chunks are jobs; the sums over the field are made once for both."""
     monkeypatch.setattr(chunks_module, "plan_chunks", lambda *_: [])
-    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_: ((1, 2), FRAMES // 2))
+    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_, **__: ((1, 2), FRAMES // 2))
     cluster.add(2)
     config = ia.configure(LANDING)
     for name, file in (("here", None), ("far", cluster.file)):

@@ -28,6 +28,7 @@ from iscat_analysis.search.sliding import (
     sliding_maps,
 )
 from iscat_analysis.search.sliding.stored import HeldRegions, StoredFrames
+from iscat_analysis.threads import threads
 
 SHAPE = (40, 44)
 SIGMAS = 4.0
@@ -209,6 +210,23 @@ def test_the_map_is_the_matched_filter_written_out() -> None:
         )
         assert snr[3, y, x] == pytest.approx(expected, rel=1e-3, abs=0.02)
     assert effective[3] == pytest.approx(h)
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+@pytest.mark.parametrize("frames", [30, 80, 135])
+def test_maps_that_take_the_place_of_blocks_are_those_beside_them(
+    frames: int, workers: int
+) -> None:
+    chunk = _chunk(_movie(frames, 11, contrast=_spot(18, 20, 0.05), at=frames // 2))
+    matched = make_filter(chunk, TEMPLATE)
+    expected, shares = sliding_maps(chunk, matched, 4)
+    blocks = chunk.blocks_e.copy()
+    with threads(workers) as pool:
+        found, effective = sliding_maps(chunk, matched, 4, in_place=True, mapper=pool.map)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(effective, shares)
+    assert np.shares_memory(found, chunk.blocks_e)
+    assert not np.array_equal(chunk.blocks_e[:-1], blocks[:-1])  # control
 
 
 def test_noise_has_unit_variance_at_every_boundary() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from iscat_analysis.threads import over_frames, threads
+from iscat_analysis.threads import threads
 
 
 def _of_linear_algebra() -> list[int]:
@@ -18,9 +18,3 @@ def test_linear_algebra_keeps_to_the_thread_that_calls_it() -> None:
             seen = list(pool.map(lambda _: _of_linear_algebra(), range(6)))
         assert set(_of_linear_algebra()) == {2}
     assert all(set(each) == {1} for each in seen)
-
-
-def test_images_of_small_frames_are_gone_through_by_the_thread_that_asks() -> None:
-    with threads(2) as pool:
-        assert over_frames(pool, (512, 512)) is map
-        assert over_frames(pool, (1024, 512)) == pool.map

@@ -189,11 +189,9 @@ class Reader:
         first = self._held[0]
         return StoredFrames([self._buffer]).views(start - first, stop - first, box)
 
-    def counts(
-        self, start: int, stop: int, mapper: Mapper = map
-    ) -> tuple[NDArray[Any], BoolArray, FloatArray]:
+    def counts(self, start: int, stop: int) -> tuple[NDArray[Any], BoolArray, FloatArray]:
         """Frames [start, stop), which of them are good, and their light [e per pixel]."""
-        good, light = self._hold(start, stop, mapper)
+        good, light = self._hold(start, stop, map)
         return self._frames(start, stop), good, light
 
     def _hold(self, start: int, stop: int, mapper: Mapper) -> tuple[BoolArray, FloatArray]:
@@ -302,10 +300,10 @@ class Reader:
             )
         return good, light
 
-    def opening(self, mapper: Mapper = map) -> NDArray[Any]:
+    def opening(self) -> NDArray[Any]:
         """Good frames among the first, for judging the noise."""
         stop = min(self.last, self.first + NOISE_FRAMES)
-        counts, good, light = self.counts(self.first, stop, mapper)
+        counts, good, light = self.counts(self.first, stop)
         if self._dark_e > 0:  # of frames with a background
             good = good & well_lit(light)
         used = counts if good.all() else counts[good]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.records import FloatArray
 
 LONGEST_WINDOW = 100
 """Frames that a window chosen from the noise may have; beyond it events overlap too often."""
@@ -71,7 +71,6 @@ def measure_noise(
     longest: int,
     *,
     follows: bool = False,
-    mapper: Mapper = map,
 ) -> NoiseCurve:
     """Noise of averages over frames, as the Allan deviation has it: neighbours are compared.
 
@@ -85,7 +84,7 @@ def measure_noise(
     strip = _Strip.of(counts, camera, adjacent=follows)
     lengths = sorted({*_LENGTHS[:-1], max(longest, 1)})
     lengths = [n for n in lengths if n <= longest and 2 * n <= len(counts)]
-    found = mapper(strip.compared, lengths)
+    found = map(strip.compared, lengths)
     return NoiseCurve(tuple(lengths), tuple(each.rest if follows else each.noise for each in found))
 
 

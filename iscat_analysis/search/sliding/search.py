@@ -178,7 +178,7 @@ def sliding_maps(
             field[:] = matched.noise.whitened(field, matched.weight)
         spectrum = fft.rfft2(image)
         spectrum *= matched.spectrum
-        overlap = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
+        overlap: MapArray = fft.irfft2(spectrum, s=matched.size)[:rows, :columns]
         effective[j] = powers[0] * powers[1] / (powers[0] + powers[1])
         overlap *= math.sqrt(effective[j])
         overlap /= root
