@@ -134,7 +134,7 @@ def analyse_chunk(
         controlled=part.controlled,
     )  # fmt: skip
     inside = slice(core[0] - chunk.first, core[1] - chunk.first)
-    ends = _ends(chunk, inside)  # before maps take the place of its blocks
+    ends = _ends(chunk, inside) if {*core} & {*part.span} else []  # maps take the place of blocks
     seam = max(2, window // STRIDES)
     steps = fitter.run((core[0] - seam, core[1] + seam), core)
     if tile is not None:
@@ -153,10 +153,10 @@ def analyse_chunk(
             stopped = True
             break
     shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
-    empty_ends = [
-        mean_e / fitter.neighbours.light_in(frames, (one.step for one in steps))
-        for frames, mean_e in ends
-    ]
+    empty_ends = np.zeros((2, *(chunk.usable[own].shape if ends else (0, 0))), dtype=np.float32)
+    for image, (frames, mean_e) in zip(empty_ends, ends, strict=False):
+        light = fitter.neighbours.light_in(frames, (one.step for one in steps))
+        image[:] = (mean_e / light)[own]
     light = np.where(chunk.good, chunk.power, np.nan) * chunk.level_e
     lines = make_rows(lines_of(context, events, mapper=pool.map))
     corner = (0, 0) if tile is None else tile.corner
@@ -176,7 +176,7 @@ def analyse_chunk(
         masked=~chunk.usable[own],
         saturated=chunk.saturated[own].copy(),
         strongest=fitter.strongest[(slice(None), *own)].copy(),  # not held with its halo
-        ends_e=np.array([image[own] for image in empty_ends], dtype=np.float32),
+        ends_e=empty_ends,
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,

@@ -37,6 +37,7 @@ def joined(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> FinishedChun
             break
         view = part.views[row]
         views.append(view if number < CLIPS else replace(view, clip=None))
+    has_ends = done[0].ends_e.size > 0
     middle = next(part for tile, part in zip(tiles, done, strict=True) if tile.is_central)
     return replace(
         done[0],
@@ -49,7 +50,7 @@ def joined(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> FinishedChun
         masked=_field(tiles, [part.masked for part in done]),
         saturated=_field(tiles, [part.saturated for part in done]),
         strongest=_field(tiles, [part.strongest for part in done]),
-        ends_e=_field(tiles, [part.ends_e for part in done]),
+        ends_e=_field(tiles, [part.ends_e for part in done]) if has_ends else done[0].ends_e,
         sampled=sum(part.sampled for part in done),
         stopped=any(part.stopped for part in done),
         trajectory=middle.trajectory,

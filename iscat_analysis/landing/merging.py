@@ -44,7 +44,7 @@ class FinishedChunk:
     masked: BoolArray
     saturated: BoolArray
     strongest: MapArray
-    ends_e: MapArray  # mean images of its first and last quarter
+    ends_e: MapArray  # mean images of its first and last quarter, at the ends of a stretch alone
     sampled: int = field(default=0)
     stopped: bool = False  # in the middle of its chains
     trajectory: Trajectory | None = None  # of the pattern, in all frames that were read
@@ -103,12 +103,7 @@ class MergedChunks:
         kept = done.views if sum(len(d.views) for d in self._done) < 2 * VIEWS else ()
         if sum(view.clip is not None for d in self._done for view in d.views) >= 2 * CLIPS:
             kept = tuple(replace(view, clip=None) for view in kept)
-        ends = done.ends_e
-        if self._done and not self._opens(len(self._done) - 1) and not self._closes(self._done[-1]):
-            self._done[-1] = replace(self._done[-1], ends_e=small)
-        self._done.append(
-            replace(done, strongest=small, masked=none, saturated=none, views=kept, ends_e=ends)
-        )
+        self._done.append(replace(done, strongest=small, masked=none, saturated=none, views=kept))
 
     @property
     def image(self) -> FloatArray:
@@ -223,6 +218,8 @@ class MergedChunks:
             return [float(d) for d in way.shift_px[-1]]
         first = [done for k, done in enumerate(self._done) if self._opens(k)]
         last = [done for done in self._done[:-1] if self._closes(done)] + self._done[-1:]
+        if last[-1].ends_e.size == 0:  # it was interrupted in the middle of a stretch
+            return None
         middle = middle_of(first[0].ends_e.shape, _DRIFT_PX)
         moved = [
             measure_drift(*(part[middle].astype(np.float64) for part in (a.ends_e[0], b.ends_e[1])))

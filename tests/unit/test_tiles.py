@@ -230,9 +230,10 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     (high, wide), core = _chosen(reader, config, 100, 25, in_place=False)
     sides = (math.ceil(n / k) + halo for n, k in zip(reader.shape, (high, wide), strict=True))
     assert math.prod(sides) * (core + 400) / 25 * 8 < 0.32 * 1000e6
-    small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=40"])
+    small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
-        _chosen(reader, small, 100, 25)
+        _chosen(reader, small, 100, 25, in_place=False)
+    _chosen(reader, small, 100, 25)  # control
     longer = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64000"])
     with pytest.raises(DataError, match=r"6 GB hold 1302 of 1920 x 1200 pixels: lower"):
         _chosen(reader, longer, 400, 100)  # no memory is enough
