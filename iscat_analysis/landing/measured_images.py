@@ -133,7 +133,9 @@ def _measured(
     core = slice(y, y + 2 * half + 1), slice(x, x + 2 * half + 1)
     slopes = None if step.slopes is None else derivatives(image)
     excess = chi2_excess(((contrast - image) * weight)[core])
-    return replace(step, image=image, slopes=slopes, excess=excess, is_measured=True)
+    return replace(
+        step, image=image.astype(np.float32), slopes=slopes, excess=excess, is_measured=True
+    )
 
 
 def _centre(

@@ -21,6 +21,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
@@ -31,7 +32,7 @@ from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.records import Candidate, FitResult, FloatArray
-from iscat_analysis.search.sliding import Chunk, StepFrame
+from iscat_analysis.search.sliding import Chunk, MapArray, StepFrame
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
@@ -50,7 +51,7 @@ class Step:
     at: StepFrame
     start: Candidate
     corner: tuple[int, int]
-    image: FloatArray
+    image: MapArray  # in single precision, because a chunk holds hundreds
     slopes: FloatArray | None = None
     theta: FloatArray | None = None
     snr: float = math.inf
@@ -124,7 +125,7 @@ class Neighbours:
         image = model.image(grid, *place, start.z_nm, start.mass_kda)
         corner = sides[0][0], sides[1][0]
         slopes = None if self._pattern is None else derivatives(image)
-        return Step(sign, at, start, corner, image, slopes, theta, snr, excess)
+        return Step(sign, at, start, corner, image.astype(np.float32), slopes, theta, snr, excess)
 
     def _half(self, start: Candidate) -> int:
         """From the centre to the edge of a step's image [pixels].
@@ -184,7 +185,7 @@ class Neighbours:
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
     ) -> FloatArray:
         """Light after over light before that a step's particle makes, pixel by pixel."""
-        image = step.image[inside]
+        image = step.image[inside].astype(np.float64)
         shares = self.presence(step, before), self.presence(step, after)
         if self._pattern is None:
             factor: FloatArray = (1 + shares[1] * image) / (1 + shares[0] * image)
@@ -289,7 +290,7 @@ class Neighbours:
         factor: FloatArray = self.factor(step, before, after, inside) / model**step.sign
         return factor
 
-    def change(self, step: Step, before: slice, after: slice) -> tuple[FloatArray, float]:
+    def change(self, step: Step, before: slice, after: slice) -> tuple[NDArray[np.floating], float]:
         """Contrast that a step's particle makes between ranges of frames: a multiple of an image.
 
         A weak one has the same image, its own, at all times.
@@ -314,7 +315,7 @@ class Neighbours:
         self, step: Step, frames: slice, inside: tuple[slice, slice], *, smeared: bool = True
     ) -> FloatArray:
         """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
-        image = step.image[inside]
+        image = step.image[inside].astype(np.float64)
         if self._pattern is None or step.slopes is None:
             return image
         (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
@@ -355,7 +356,7 @@ class Neighbours:
         """Which pixels of a region show a step, and its contrast there, as frames are corrected."""
         shared = self.shared(step, region)
         if self._context.lines is None:
-            return None if shared is None else (shared[0], step.image[shared[1]])
+            return None if shared is None else (shared[0], step.image[shared[1]].astype(np.float64))
         total = np.zeros(self._chunk.shape)
         total[self.box(step)] = step.image
         return WHOLE, self._context.left(total)[region.slices]

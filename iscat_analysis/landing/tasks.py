@@ -231,7 +231,7 @@ class TaskBuilder:
         shared = self._neighbours.shared(step, region)
         if shared is None:
             return None
-        image = step.image[shared[1]]
+        image = step.image[shared[1]].astype(np.float64)
         if image.shape != (region.rows[1] - region.rows[0], region.columns[1] - region.columns[0]):
             return None
         known = self._added(step, neighbours, region, patch, pattern, image)

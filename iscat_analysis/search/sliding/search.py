@@ -60,7 +60,7 @@ class Filter:
     template: FloatArray
 
     def response(
-        self, corner: tuple[int, int], contrast: FloatArray
+        self, corner: tuple[int, int], contrast: NDArray[np.floating]
     ) -> tuple[tuple[slice, slice], MapArray]:
         """Filter a small image alone, on a field without contrast and with white noise.
 
@@ -68,7 +68,7 @@ class Filter:
         """
         half, field = self.half, self.weight.shape
         inside = tuple(slice(c, c + n) for c, n in zip(corner, contrast.shape, strict=True))
-        weighted = self.weight[inside] * contrast.astype(np.float32)
+        weighted = self.weight[inside] * contrast.astype(np.float32, copy=False)
         reach = contrast.shape[0] + 2 * half, contrast.shape[1] + 2 * half
         size = fft.next_fast_len(reach[0], real=True), fft.next_fast_len(reach[1], real=True)
         spectrum = fft.rfft2(weighted, s=size) * self._spectrum_of(size)
