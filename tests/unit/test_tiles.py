@@ -220,20 +220,19 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     tiles = cut_field(reader.shape, (high, wide), halo)
     largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
     blocks = (core + 2 * chunks_module.halo_frames(100, 25)) / 25
-    assert largest * blocks * 4 < 0.32 * 1000e6  # of sums, whose place the maps take
+    assert largest * blocks * 4 < 0.2016 * 1000e6  # of sums, whose place the maps take
     seen = np.zeros(reader.shape, dtype=int)
     for tile in tiles:
         seen[tile.core] += 1
     assert (seen == 1).all()  # each pixel has one home
     work = sum(tile.shape[0] * tile.shape[1] for tile in tiles) * (core + 400) / core
-    assert work < 2.1 * seen.size
+    assert work < 2.6 * seen.size
     (high, wide), core = _chosen(reader, config, 100, 25, in_place=False)
     sides = (math.ceil(n / k) + halo for n, k in zip(reader.shape, (high, wide), strict=True))
-    assert math.prod(sides) * (core + 400) / 25 * 8 < 0.32 * 1000e6
+    assert math.prod(sides) * (core + 400) / 25 * 8 < 0.2016 * 1000e6
     small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
-        _chosen(reader, small, 100, 25, in_place=False)
-    _chosen(reader, small, 100, 25)  # control
+        _chosen(reader, small, 100, 25)
     longer = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64000"])
     with pytest.raises(DataError, match=r"6 GB hold 1302 of 1920 x 1200 pixels: lower"):
         _chosen(reader, longer, 400, 100)  # no memory is enough

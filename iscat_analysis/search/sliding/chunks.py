@@ -57,6 +57,7 @@ _BANDS = 4  # of rows, whose sums over the frames are made at a time
 _SPAN_BYTES = 6e9  # of the frames of a chunk of a large field: they stay in the system's cache
 _CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
 _SUM_BYTES, _MAP_BYTES, _HIGHEST_BYTES = 4, 4, 2  # of a pixel of a block
+_TILE_SHARE = 0.63  # of what counts may take; the images and regions of its steps have the rest
 _TILE_BYTES = 160  # of a pixel of a tile, beside its blocks and maps
 _PIECE_BYTES = 2**20  # read at a time: still in a processor's cache as it is copied and looked at
 
@@ -421,7 +422,7 @@ def choose_tiles(
     side, halo = halo_px(config), halo_frames(window, stride)
     smallest = _roi_px(config)
     per_block = _SUM_BYTES + _moving_bytes(config) + (0 if in_place else _MAP_BYTES)
-    budget, per_frame = counts_budget(config), per_block / stride
+    budget, per_frame = _TILE_SHARE * counts_budget(config), per_block / stride
     longest = int(_SPAN_BYTES // reader.frame_bytes)
     best: tuple[float, tuple[int, int], int] | None = None
     rows, columns = reader.shape
@@ -445,7 +446,7 @@ def choose_tiles(
                 "background.window_frames, or cut the field"
             )
         pixels = (smallest + 2 * side) ** 2
-        least = pixels * (_TILE_BYTES + per_frame * needed) / MEMORY_SHARE / 1e6
+        least = pixels * (_TILE_BYTES + per_frame * needed) / _TILE_SHARE / MEMORY_SHARE / 1e6
         raise DataError(
             f"{reader.name}: windows of {window} frames of {columns} x {rows} pixels need "
             f"compute.memory_limit_mb = {math.ceil(least)}; raise it, or lower "

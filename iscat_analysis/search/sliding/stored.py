@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from iscat_analysis.records import CountSource, InPlace, PlacedSource
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 
-REGION_BYTES = 48_000_000
+REGION_BYTES = 40_000_000
 """Of the regions that a chunk or a tile holds."""
 
 _SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
