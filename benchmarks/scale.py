@@ -2,7 +2,7 @@
 
     python benchmarks/scale.py [--quick] [--full] [--fields 128x128,…] [--frames 500,…]
                                [--particles 10,…] [--memory-mb N] [--keep FOLDER]
-    python benchmarks/scale.py --sensor 1200,2400 [--memory-mb N] [--keep FOLDER]
+    python benchmarks/scale.py --sensor 2400,4800 [--particles 200] [--memory-mb N] [--keep FOLDER]
 
 Each job is ``iscat fit`` in a process of its own, on plain numbers: a block of frames with
 particles that land in its first half and leave in its second one, and links to it, so that a movie
@@ -15,7 +15,8 @@ job costs once, per part (a chunk or a tile of one), per megabyte and per event.
 extrapolated from that: parts are whole, and the process of the command hashes the movie meanwhile.
 
 ``--sensor`` analyses two movies of 1200 × 1920 pixels, of as many frames as it is given, and says
-what the longer one has more: speed, memory, and what a recording of 46 GB takes by that.
+what the longer one has more: speed, memory, and what a recording of 46 GB takes by that.  Each
+block of 400 frames has 200 particles, or as many as ``--particles`` says.
 
 Without options, the default takes less than ten minutes on two idle cores; ``--full`` goes to
 1200 × 1920 pixels, 100 000 frames and 10 000 particles.  ``--quick`` judges nothing.
@@ -237,13 +238,14 @@ def efficiency(
 
 def sensor(options: argparse.Namespace, folder: Path) -> int:
     """Analyse two movies of a large sensor, and judge what the longer one has more."""
+    particles = options.particles[0] if options.particles else SENSOR_PARTICLES
     short, long = (
-        measure(Job(*SENSOR, frames, SENSOR_PARTICLES), folder, options.memory_mb)
+        measure(Job(*SENSOR, frames, particles), folder, options.memory_mb)
         for frames in options.sensor
     )
     added = long.job.megabytes - short.job.megabytes
     rate, work = added / (long.seconds - short.seconds), long.processor_s - short.processor_s
-    whole = Job(*SENSOR, RECORDING_FRAMES, SENSOR_PARTICLES).megabytes
+    whole = Job(*SENSOR, RECORDING_FRAMES, particles).megabytes
     seconds = long.seconds + (whole - long.job.megabytes) / rate
     print(
         f"what grows: {rate:.0f} MB/s, {added / work:.0f} MB per processor-second, and "
@@ -326,8 +328,8 @@ def main() -> int:
     parser.add_argument("--full", action="store_true", help="up to 1200 × 1920 and 100 000 frames")
     parser.add_argument("--fields", type=_fields, help="as 128x128,1200x1920")
     parser.add_argument("--frames", type=_numbers, help="as 500,5000")
-    parser.add_argument("--particles", type=_numbers, help="in a field of the largest size")
-    parser.add_argument("--sensor", type=_numbers, help="frames of two movies, as 1200,2400")
+    parser.add_argument("--particles", type=_numbers, help="in a block of the largest field")
+    parser.add_argument("--sensor", type=_numbers, help="frames of two movies, as 2400,4800")
     parser.add_argument("--memory-mb", type=int, default=1000, help="compute.memory_limit_mb")
     parser.add_argument("--keep", type=Path, help="folder for the movies while they are analysed")
     options = parser.parse_args()
