@@ -158,12 +158,12 @@ class LocalExecutor:
         done: SimpleQueue[tuple[int, R]] = SimpleQueue()
 
         def send() -> None:
-            while (sent_one := _next_of(waiting)) is not None:
-                number, item = sent_one
+            while (taken := _next_of(waiting)) is not None:
+                number, item = taken
                 try:
                     done.put((number, work(item)))
                 except BrokenProcessPool:
-                    waiting.append(sent_one)
+                    waiting.append(taken)
                     raise
 
         with ThreadPoolExecutor(1, initializer=_ELSEWHERE.set, initargs=(True,)) as sender:
