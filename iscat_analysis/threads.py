@@ -8,12 +8,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar, copy_context
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
-
-if TYPE_CHECKING:
-    pass
 
 T = TypeVar("T")
 

@@ -126,6 +126,7 @@ def landing_particle_images(
             roi_px=_roi_px(config),
             most=most,
             motion=pattern,
+            mapper=pool.map,
         )
         around = every if rings else ()
         if part.tile is not None:

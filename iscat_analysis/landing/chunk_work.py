@@ -153,10 +153,10 @@ def analyse_chunk(
             stopped = True
             break
     shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
-    empty_ends = np.zeros((2, *(chunk.usable[own].shape if ends else (0, 0))), dtype=np.float32)
-    for image, (frames, mean_e) in zip(empty_ends, ends, strict=False):
-        light = fitter.neighbours.light_in(frames, (one.step for one in steps))
-        image[:] = (mean_e / light)[own]
+    found = [one.step for one in steps]
+    empty_ends = [
+        (mean_e / fitter.neighbours.light_in(frames, found))[own] for frames, mean_e in ends
+    ]
     light = np.where(chunk.good, chunk.power, np.nan) * chunk.level_e
     lines = make_rows(lines_of(context, events, mapper=pool.map))
     corner = (0, 0) if tile is None else tile.corner
@@ -176,7 +176,7 @@ def analyse_chunk(
         masked=~chunk.usable[own],
         saturated=chunk.saturated[own].copy(),
         strongest=fitter.strongest[(slice(None), *own)].copy(),  # not held with its halo
-        ends_e=empty_ends,
+        ends_e=np.array(empty_ends, dtype=np.float32),
         sampled=len(chains),
         stopped=stopped,
         trajectory=pattern.trajectory if pattern else None,

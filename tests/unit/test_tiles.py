@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -228,8 +227,9 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
     work = sum(tile.shape[0] * tile.shape[1] for tile in tiles) * (core + 400) / core
     assert work < 2.6 * seen.size
     (high, wide), core = _chosen(reader, config, 100, 25, in_place=False)
-    sides = (math.ceil(n / k) + halo for n, k in zip(reader.shape, (high, wide), strict=True))
-    assert math.prod(sides) * (core + 400) / 25 * 8 < 0.2016 * 1000e6
+    tiles = cut_field(reader.shape, (high, wide), halo)
+    largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
+    assert largest * (core + 400) / 25 * 8 < 0.2016 * 1000e6  # of sums and maps
     small = load_config(None, ["camera.pixel_size_nm=84.0", "compute.memory_limit_mb=64"])
     with pytest.raises(DataError, match=r"compute\.memory_limit_mb = "):
         _chosen(reader, small, 100, 25)

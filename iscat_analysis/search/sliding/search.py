@@ -33,7 +33,6 @@ STRIDES = 4
 CORRELATION = 1 - 3 / (2 * STRIDES)
 """Of the noise at a boundary with that at the next, of w frames after less w frames before."""
 
-
 _MAPS_AT_ONCE = 4  # that threads make before they are stored
 
 
@@ -184,16 +183,33 @@ def sliding_maps(
         overlap /= root
         return overlap
 
-    waiting: deque[tuple[int, MapArray]] = deque()
-    for start in range(0, len(changed), _MAPS_AT_ONCE):
-        some = changed[start : start + _MAPS_AT_ONCE]
-        waiting.extend(zip(some, list(mapper(one, some)), strict=True))
-        # blocks from here on are those of the next map
-        needed = some[-1] + 2 - strides if in_place and some[-1] != changed[-1] else count
-        while waiting and waiting[0][0] < needed:
-            j, made = waiting.popleft()
-            snr[j] = made
+    def stored(j: int) -> None:
+        snr[j] = one(j)
+
+    if in_place:
+        _store_behind(one, snr, strides, mapper)
+    else:
+        for _ in mapper(stored, changed):
+            pass
     return snr, effective
+
+
+def _store_behind(
+    make: Callable[[int], MapArray], room: MapArray, strides: int, mapper: Mapper
+) -> None:
+    """Store each map where a block was, once no other map is made of that block.
+
+    Shapes: `room` (k, y, x).
+    """
+    waiting: deque[tuple[int, MapArray]] = deque()
+    for start in range(0, len(room), _MAPS_AT_ONCE):
+        some = range(start, min(start + _MAPS_AT_ONCE, len(room)))
+        waiting.extend(zip(some, mapper(make, some), strict=True))
+        while waiting and waiting[0][0] < some.stop + 1 - strides:  # the first block of the next map
+            j, made = waiting.popleft()
+            room[j] = made
+    for j, made in waiting:
+        room[j] = made
 
 
 @dataclass(frozen=True)
