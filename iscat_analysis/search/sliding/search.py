@@ -205,7 +205,8 @@ def _store_behind(
     for start in range(0, len(room), _MAPS_AT_ONCE):
         some = range(start, min(start + _MAPS_AT_ONCE, len(room)))
         waiting.extend(zip(some, mapper(make, some), strict=True))
-        while waiting and waiting[0][0] < some.stop + 1 - strides:  # the first block of the next map
+        first = some.stop + 1 - strides  # block of the next map
+        while waiting and waiting[0][0] < first:
             j, made = waiting.popleft()
             room[j] = made
     for j, made in waiting:
