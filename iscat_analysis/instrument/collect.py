@@ -38,7 +38,8 @@ from iscat_analysis.search.bright import (
     find_bright_steps,
 )
 from iscat_analysis.search.sliding import FieldSums, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import Reader, plan_parts, reader_of
+from iscat_analysis.search.sliding.chunks import Reader, reader_of
+from iscat_analysis.search.sliding.planning import plan_parts
 
 APART_NM = 2000.0
 """Particles that all bound at once are used if no other is nearer; the rings are accounted for."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,10 +32,13 @@ from iscat_analysis.records import (
     silent,
 )
 from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import Part, Reader, reader_of
+from iscat_analysis.search.sliding.chunks import Reader, reader_of
+from iscat_analysis.search.sliding.planning import Part
 from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
+
+_LARGEST_SHARE = 2.0  # times its share of the field, that a tile may have of the events shown
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,9 @@ def analyse_chunk(
         except KeyboardInterrupt:  # the fits are done, and kept
             stopped = True
             break
-    shown = fitter.shown(steps[: max(VIEWS - earlier, 0)], CLIPS - earlier)
+    shown = fitter.shown(
+        steps[: _shown_of(tile, VIEWS - earlier)], _shown_of(tile, CLIPS - earlier)
+    )
     found = [one.step for one in steps]
     empty_ends = [
         (mean_e / fitter.neighbours.light_in(frames, found))[own] for frames, mean_e in ends
@@ -185,6 +191,12 @@ def analyse_chunk(
         searched=fitter.searched,
         untold=np.array([step.told for step in steps if step.told]).reshape(-1, 2),
     )
+
+
+def _shown_of(tile: Tile | None, left: int) -> int:
+    """Give how many of the events that are still to be shown may be of a tile."""
+    share = 1.0 if tile is None else min(_LARGEST_SHARE * tile.share, 1.0)
+    return math.ceil(share * max(left, 0))
 
 
 def _near_core(steps: list[StepEvent], tile: Tile, pixel_nm: float) -> list[StepEvent]:

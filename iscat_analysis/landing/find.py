@@ -43,7 +43,8 @@ from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.landing.step_maps import maps_are_local
 from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import FieldSums, boundaries, stride_of
-from iscat_analysis.search.sliding.chunks import Part, plan_parts, reader_of
+from iscat_analysis.search.sliding.chunks import reader_of
+from iscat_analysis.search.sliding.planning import Part, plan_parts
 from iscat_analysis.threads import one_thread_algebra, start_in_thread, threads
 
 HEIGHT_FRAMES = 2000

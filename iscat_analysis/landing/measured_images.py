@@ -20,7 +20,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import fft
 
-from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
 from iscat_analysis.records import FloatArray
@@ -131,11 +130,8 @@ def _measured(
     half = roi_px // 2
     y, x = (max(round(c) - half, 0) for c in place)
     core = slice(y, y + 2 * half + 1), slice(x, x + 2 * half + 1)
-    slopes = None if step.slopes is None else derivatives(image)
     excess = chi2_excess(((contrast - image) * weight)[core])
-    return replace(
-        step, image=image.astype(np.float32), slopes=slopes, excess=excess, is_measured=True
-    )
+    return replace(step, drawn=step.drawn.measured(image), excess=excess, is_measured=True)
 
 
 def _centre(

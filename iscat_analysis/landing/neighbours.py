@@ -17,8 +17,10 @@ out, it is held with the share f of the light that makes the pattern, which is t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import count
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +30,7 @@ from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
 from iscat_analysis.fitting.regions import Region
+from iscat_analysis.last_used import LastUsed
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.seated import SeatedModel
@@ -35,12 +38,50 @@ from iscat_analysis.records import Candidate, FitResult, FloatArray
 from iscat_analysis.search.sliding import Chunk, MapArray, StepFrame
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
+_IMAGE_BYTES = 64_000_000  # of the images of steps that a chunk holds
 _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
 WHOLE = (slice(None), slice(None))
 """All of an image."""
 
 _LEAST_CROSSED_SNR = 0.5  # contrast of a neighbour times the step's, below which fields do not meet
 _WEAK_CONTRAST = 0.05  # contrast up to which several add up
+
+
+_NUMBERS = count()
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The image of a step, drawn where it is needed: a chunk has thousands."""
+
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    draw: Callable[[], NDArray[np.floating]]
+    held: LastUsed[NDArray[Any]]
+    number: int = field(default_factory=_NUMBERS.__next__)  # by which it is held
+
+    @property
+    def image(self) -> MapArray:
+        """Contrast in single precision, (y, x)."""
+        return self._made("image", lambda: self.draw().astype(np.float32))
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Derivatives of the contrast, (5, y, x)."""
+        return self._made("slopes", lambda: derivatives(self.image.astype(np.float64)))
+
+    def measured(self, image: FloatArray) -> Drawn:
+        """Give what the movie shows there."""
+        kept = image.astype(np.float32)
+        return Drawn(self.rows, self.columns, lambda: kept, self.held)
+
+    def _made(self, kind: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        """Give what is held of a kind, or make it."""
+        values = self.held.get((self.number, kind))
+        if values is None:
+            values = make()
+            self.held.hold((self.number, kind), values, values.nbytes)
+        return values
 
 
 @dataclass(frozen=True)
@@ -50,14 +91,22 @@ class Step:
     sign: int
     at: StepFrame
     start: Candidate
-    corner: tuple[int, int]
-    image: MapArray  # in single precision, because a chunk holds hundreds
-    slopes: FloatArray | None = None
+    drawn: Drawn
     theta: FloatArray | None = None
     snr: float = math.inf
     excess: float = 0.0
     is_measured: bool = False  # its image is the movie's, and not the model's
     sphere: tuple[SeatedModel, FitResult] | None = None  # that it is, and not a dipole
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        """First row and first column of its image."""
+        return self.drawn.rows[0], self.drawn.columns[0]
+
+    @property
+    def image(self) -> MapArray:
+        """Its contrast, (y, x)."""
+        return self.drawn.image
 
 
 class Neighbours:
@@ -83,11 +132,12 @@ class Neighbours:
             / nominal
         )
         self._power = np.concatenate([[0.0], np.cumsum(chunk.power)])
+        self._images: LastUsed[NDArray[Any]] = LastUsed(_IMAGE_BYTES)
 
     def draw_sphere(
         self, sign: int, at: StepFrame, sphere: SeatedModel, fit: FitResult, excess: float = 0.0
     ) -> Step:
-        """Make a step of a sphere, with its contrast drawn where it is."""
+        """Make a step of a sphere, whose contrast is drawn where it is."""
         pixel = self._context.pixel_nm
         start = Candidate(fit.x_nm / pixel, fit.y_nm / pixel, fit.z_nm, fit.mass_kda, fit.snr)
         drawn = self.draw(
@@ -106,7 +156,7 @@ class Neighbours:
         excess: float = 0.0,
         sphere: SeatedModel | None = None,
     ) -> Step:
-        """Make a step, with its contrast drawn where it is.
+        """Make a step, whose contrast is drawn where it is.
 
         Shapes: `theta` (5,).
         """
@@ -115,17 +165,19 @@ class Neighbours:
         for centre, size in zip((start.y_px, start.x_px), self._chunk.shape, strict=True):
             middle = round(centre)
             sides.append((max(middle - half, 0), min(middle + half + 1, size)))
-        grid = PixelGrid.region(sides[0], sides[1], context.pixel_nm)
-        pixel = context.pixel_nm
         shown = at.frame + sign * self._window // 2
-        place = (start.x_px * pixel, start.y_px * pixel)
-        model = context.wide_at(*place, shown)
-        if sphere is not None:
-            model = sphere.in_place_of(model)
-        image = model.image(grid, *place, start.z_nm, start.mass_kda)
-        corner = sides[0][0], sides[1][0]
-        slopes = None if self._pattern is None else derivatives(image)
-        return Step(sign, at, start, corner, image.astype(np.float32), slopes, theta, snr, excess)
+
+        def image() -> FloatArray:
+            pixel = context.pixel_nm
+            place = start.x_px * pixel, start.y_px * pixel
+            model = context.wide_at(*place, shown)
+            if sphere is not None:
+                model = sphere.in_place_of(model)
+            grid = PixelGrid.region(sides[0], sides[1], pixel)
+            return model.image(grid, *place, start.z_nm, start.mass_kda)
+
+        drawn = Drawn(sides[0], sides[1], image, self._images)
+        return Step(sign, at, start, drawn, theta, snr, excess)
 
     def _half(self, start: Candidate) -> int:
         """From the centre to the edge of a step's image [pixels].
@@ -178,8 +230,7 @@ class Neighbours:
 
     def box(self, step: Step) -> tuple[slice, slice]:
         """Pixels of the field that a step's image covers."""
-        (y, x), (height, width) = step.corner, step.image.shape
-        return slice(y, y + height), slice(x, x + width)
+        return slice(*step.drawn.rows), slice(*step.drawn.columns)
 
     def factor(
         self, step: Step, before: slice, after: slice, inside: tuple[slice, slice] = WHOLE
@@ -248,9 +299,9 @@ class Neighbours:
                 share = self.presence(one, frames)
                 total = total + share * contrasts[k]
                 product = product * (1 + share * contrasts[k])
-                for field, other in zip(fields[:k], shown, strict=False):
+                for one_field, other in zip(fields[:k], shown, strict=False):
                     both = self._together(one, other, frames)
-                    total = total + both * _crossed(field, fields[k])
+                    total = total + both * _crossed(one_field, fields[k])
             light.append(total / product)
         ratio *= light[1] / light[0]
 
@@ -316,13 +367,13 @@ class Neighbours:
     ) -> FloatArray:
         """Mean of a moving particle's contrast over frames, or its contrast at the mean place."""
         image = step.image[inside].astype(np.float64)
-        if self._pattern is None or step.slopes is None:
+        if self._pattern is None:
             return image
         (y, x), (yy, yx, xx) = self._pattern.moments(frames, step.at.frame)
         if not smeared:
             yy, yx, xx = y * y, y * x, x * x
         seen: FloatArray = image + np.einsum(
-            "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.slopes[(slice(None), *inside)]
+            "k,kyx->yx", [-y, -x, yy / 2, yx, xx / 2], step.drawn.slopes[(slice(None), *inside)]
         )
         return seen
 
@@ -365,10 +416,10 @@ class Neighbours:
         self, step: Step, region: Region
     ) -> tuple[tuple[slice, slice], tuple[slice, slice]] | None:
         """Where a step's image and a region overlap: in the region, and in the image."""
-        (y, x), (height, width) = step.corner, step.image.shape
+        (y, below), (x, beyond) = step.drawn.rows, step.drawn.columns
         (first, last), (begin, end) = region.rows, region.columns
-        top, bottom = max(y, first), min(y + height, last)
-        left, right = max(x, begin), min(x + width, end)
+        top, bottom = max(y, first), min(below, last)
+        left, right = max(x, begin), min(beyond, end)
         if top >= bottom or left >= right:
             return None
         here = slice(top - first, bottom - first), slice(left - begin, right - begin)

@@ -40,7 +40,8 @@ from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.search.sliding.chunks import reader_of, sum_first_chunk
+from iscat_analysis.search.sliding.chunks import reader_of
+from iscat_analysis.search.sliding.planning import sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread
 
 _FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field

@@ -44,7 +44,8 @@ from iscat_analysis.landing.traces import patch_of, trace_of
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Candidate, CountSource, EventView, FloatArray, Windows, silent
 from iscat_analysis.search.sliding import StepFrame, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import HALO, Reader, halo_px, reader_of
+from iscat_analysis.search.sliding.chunks import Reader, reader_of
+from iscat_analysis.search.sliding.planning import HALO, halo_px
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import row_view
 from iscat_analysis.tracking.joint.likelihood import MovingField

@@ -27,7 +27,7 @@ from iscat_analysis import executors as places
 from iscat_analysis.errors import SchedulerError
 from iscat_analysis.fitting.checkpoint import partial_folder
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.search.sliding import chunks as chunks_module
+from iscat_analysis.search.sliding import planning
 from iscat_cli import main_fit
 
 pytestmark = [
@@ -228,8 +228,8 @@ def test_tiles_of_a_field_give_the_same_bytes(
     cluster: Workers, landing: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two tiles of each of two chunks are jobs; the sums over the field are made once for both."""
-    monkeypatch.setattr(chunks_module, "plan_chunks", lambda *_: [])
-    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_, **__: ((1, 2), FRAMES // 2))
+    monkeypatch.setattr(planning, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(planning, "choose_tiles", lambda *_, **__: ((1, 2), FRAMES // 2))
     cluster.add(2)
     config = ia.configure(LANDING)
     for name, file in (("here", None), ("far", cluster.file)):

@@ -35,6 +35,7 @@ from iscat_analysis.pipeline.injection import inject_and_recover
 from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
 from iscat_analysis.search.sliding import chunks as chunks_module
+from iscat_analysis.search.sliding import planning
 from iscat_analysis.study.simulate import Movie
 
 PIXEL_NM = 84.0
@@ -393,7 +394,7 @@ def test_what_is_shown_of_events_is_made_of_the_first_alone(
     monkeypatch.setattr(ChunkFitter, "shown", shown)
     found = _run(counts, _config("compute.workers=1"))[0]
     # cores begin at 0, 130, 230 and 330; what is a window earlier is known to come before
-    assert made == [(1, 1), (1, 0), (0, -1), (0, -2)]
+    assert made == [(1, 1), (1, 0), (0, 0), (0, 0)]
     assert [view.event for view in found.views] == [0, 1]
     assert [view.clip is not None for view in found.views] == [True, False]
     for mine, whole in zip(found.views, plain[0].views[:2], strict=True):
@@ -522,7 +523,7 @@ def test_chunks_follow_one_another_and_fit_into_memory(frames: int, cores: list[
     config = _config("compute.memory_limit_mb=136", "background.window_frames=20")
     movie = Memory(np.zeros((frames, 256, 256), dtype="u2"))
     reader = chunks_module.reader_of(movie, config, Camera(), (0, frames))
-    plan = chunks_module.plan_chunks(reader, config, 20, 5)
+    plan = planning.plan_chunks(reader, config, 20, 5)
     edges = np.cumsum([0, *cores]).tolist()
     assert plan == [
         ((begin, end), (max(begin - 40, 0), min(end + 40, frames)))

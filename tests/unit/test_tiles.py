@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,11 +18,12 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.landing import joining, steps
+from iscat_analysis.landing import chunk_work, joining, neighbours, steps
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
 from iscat_analysis.search.sliding import chunks as chunks_module
+from iscat_analysis.search.sliding import planning
 from iscat_analysis.search.sliding.chunks import Reader
 from iscat_analysis.search.sliding.stored import frames_in_place
 from iscat_analysis.search.sliding.tiles import Tile, cut_field
@@ -71,8 +74,8 @@ def _run(movie: Any, config: Config | None = None, **options: Any) -> Any:
 
 
 def _tiled(monkeypatch: pytest.MonkeyPatch, parts: tuple[int, int], core: int) -> None:
-    monkeypatch.setattr(chunks_module, "plan_chunks", lambda *_: [])
-    monkeypatch.setattr(chunks_module, "choose_tiles", lambda *_, **__: (parts, core))
+    monkeypatch.setattr(planning, "plan_chunks", lambda *_: [])
+    monkeypatch.setattr(planning, "choose_tiles", lambda *_, **__: (parts, core))
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +125,36 @@ def test_tiles_change_nothing(
     _check(found, whole)
     places = (part.counts.sum(axis=1) for part in (found.empty, whole.empty))
     assert np.divide(*places) == pytest.approx(1.0, abs=0.05)  # none in two tiles
+
+
+def test_images_that_are_drawn_again_are_the_same(
+    counts: np.ndarray, whole: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No image of a step is held, and what a chunk took is free without a search for cycles."""
+    monkeypatch.setattr(neighbours, "_IMAGE_BYTES", 0)
+    left: list[weakref.ref[Any]] = []
+    build = neighbours.Neighbours.__init__
+
+    def watched(self: Any, *arguments: Any) -> None:
+        build(self, *arguments)
+        left.extend((weakref.ref(self), weakref.ref(self._images)))
+
+    monkeypatch.setattr(neighbours.Neighbours, "__init__", watched)
+    gc.disable()
+    try:
+        found = _run(Stack(counts))
+        assert [one() for one in left] == [None, None]
+    finally:
+        gc.enable()
+    pd.testing.assert_frame_equal(found.fits, whole.fits)
+
+
+def test_a_tile_shows_no_more_than_twice_its_share() -> None:
+    first, last = (cut_field((100, 400), (1, 4), 10)[k] for k in (0, -1))
+    assert first.share == last.share == 0.25
+    assert [chunk_work._shown_of(first, left) for left in (1000, 3, 0, -7)] == [500, 2, 0, 0]
+    half = cut_field((100, 400), (1, 2), 10)[0]
+    assert chunk_work._shown_of(half, 9) == chunk_work._shown_of(None, 9) == 9
 
 
 def test_frames_of_several_files_lie_where_they_are(
@@ -174,7 +207,7 @@ def test_without_halos_rows_change(
 ) -> None:
     """Control: particles on seams are cut in half."""
     _tiled(monkeypatch, (2, 2), FRAMES)
-    monkeypatch.setattr(chunks_module, "halo_px", lambda _: 6)
+    monkeypatch.setattr(planning, "halo_px", lambda _: 6)
     found = _run(Stack(counts))
     assert len(found.fits) != len(whole.fits) or _difference(found, whole) > 0.1
 
@@ -215,10 +248,10 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
         shape=(1200, 1920), frame_bytes=1200 * 1920 * 2, first=0, last=10_000, name="movie"
     )
     (high, wide), core = _chosen(reader, config, 100, 25)
-    halo = chunks_module.halo_px(config)
+    halo = planning.halo_px(config)
     tiles = cut_field(reader.shape, (high, wide), halo)
     largest = max(tile.shape[0] * tile.shape[1] for tile in tiles)
-    blocks = (core + 2 * chunks_module.halo_frames(100, 25)) / 25
+    blocks = (core + 2 * planning.halo_frames(100, 25)) / 25
     assert largest * blocks * 4 < 0.2016 * 1000e6  # of sums, whose place the maps take
     seen = np.zeros(reader.shape, dtype=int)
     for tile in tiles:
@@ -242,4 +275,4 @@ def test_the_division_of_a_field_minds_memory_and_halos() -> None:
 def _chosen(
     reader: Any, config: Config, window: int, stride: int, *, in_place: bool = True
 ) -> tuple[tuple[int, int], int]:
-    return chunks_module.choose_tiles(reader, config, window, stride, 10_000, in_place=in_place)
+    return planning.choose_tiles(reader, config, window, stride, 10_000, in_place=in_place)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from iscat_analysis.last_used import LastUsed
 from iscat_analysis.records import CountSource, InPlace, PlacedSource
 from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box
 
@@ -19,7 +18,6 @@ REGION_BYTES = 40_000_000
 
 _SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
 _NO_COUNTS: NDArray[Any] = np.empty((0, 0, 0))
-_Region = tuple[tuple[int, int], tuple[int, int]]  # rows and columns
 
 
 class StoredFrames:
@@ -77,8 +75,7 @@ class HeldRegions:
     """The regions that were copied last: steps at one place ask for them in each of their fits."""
 
     def __init__(self) -> None:
-        self._held: OrderedDict[_Region, tuple[int, NDArray[Any]]] = OrderedDict()
-        self._lock = Lock()
+        self._held: LastUsed[tuple[int, NDArray[Any]]] = LastUsed(REGION_BYTES)
 
     def frames(
         self,
@@ -91,8 +88,7 @@ class HeldRegions:
 
         Shapes: result (t, y, x).
         """
-        with self._lock:
-            low, held = self._held.get((rows, columns), (wanted.start, _NO_COUNTS))
+        low, held = self._held.get((rows, columns)) or (wanted.start, _NO_COUNTS)
         high = low + len(held)
         first, last = min(low, wanted.start), max(high, wanted.stop)
         if last - first > _SPREAD * (len(held) + wanted.stop - wanted.start):
@@ -101,12 +97,7 @@ class HeldRegions:
         parts += [held] if len(held) else []
         parts += [copied(slice(high, last), rows, columns)] if high < last or not parts else []
         counts = parts[0] if len(parts) == 1 else np.concatenate(parts)
-        with self._lock:
-            self._held[rows, columns] = first, counts
-            self._held.move_to_end((rows, columns))
-            size = sum(part.nbytes for _, part in self._held.values())
-            while size > REGION_BYTES:
-                size -= self._held.popitem(last=False)[1][1].nbytes
+        self._held.hold((rows, columns), (first, counts), counts.nbytes)
         return counts[wanted.start - first : wanted.stop - first]
 
 

@@ -6,6 +6,7 @@ strong particle reaches, so that every particle of the core is seen with all its
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -79,6 +80,12 @@ class Tile:
     def shape(self) -> tuple[int, int]:
         """Rows and columns that the tile has, with its halo."""
         return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+    @property
+    def share(self) -> float:
+        """Share of the field that the core has."""
+        (top, bottom), (left, right) = self.core_rows, self.core_columns
+        return (bottom - top) * (right - left) / math.prod(self.field)
 
     @property
     def is_central(self) -> bool:

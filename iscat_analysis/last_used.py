@@ -1,0 +1,36 @@
+"""Arrays that were used last, as many as have room: what is used again soon is not made again."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Hashable
+from threading import Lock
+from typing import Generic, TypeVar
+
+V = TypeVar("V")
+
+
+class LastUsed(Generic[V]):
+    """Values by their keys, within so many bytes; the last one is held whatever it takes."""
+
+    def __init__(self, room_bytes: int) -> None:
+        self._room_bytes = room_bytes
+        self._held: OrderedDict[Hashable, tuple[V, int]] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def get(self, key: Hashable) -> V | None:
+        """Give what is held; None if it is gone or never was there."""
+        with self._lock:
+            if key not in self._held:
+                return None
+            self._held.move_to_end(key)
+            return self._held[key][0]
+
+    def hold(self, key: Hashable, value: V, size_bytes: int) -> None:
+        """Hold a value, and let those go that nobody asked for longest."""
+        with self._lock:
+            self._bytes += size_bytes - self._held.pop(key, (value, 0))[1]
+            self._held[key] = value, size_bytes
+            while self._bytes > self._room_bytes and len(self._held) > 1:
+                self._bytes -= self._held.popitem(last=False)[1][1]
