@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 import tempfile
@@ -89,4 +90,5 @@ def find_two_species() -> None:
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, not its function
     share_kernels(ROOT)
+    gc.disable()  # compilers leave few cycles, and to look for them takes a tenth of the time
     follow_particle() if sys.argv[1:] == [ANOTHER] else compile_kernels()
