@@ -37,8 +37,10 @@ install: $(STAMP)
 runtime: | $(BIN)/python
 	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable .
 
+# The pip that Python brings may be one that takes twice the time to choose among files.
 $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --upgrade pip || true
 
 $(STAMP): pyproject.toml | $(BIN)/python
 	$(BIN)/python -m pip install --quiet $(PIP_OPTIONS) --editable ".[test,app,napari,lint,docs]"
