@@ -179,8 +179,9 @@ class Interpreter:
     """
 
     LOOP = """
-import contextlib, io, json, os, sys, traceback
+import contextlib, gc, io, json, os, sys, traceback
 
+gc.set_threshold(50_000)
 names = {}
 lines, sys.stdin = sys.stdin, open(os.devnull)
 
