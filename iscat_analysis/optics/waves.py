@@ -64,6 +64,8 @@ _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is se
 _PEAK_POINTS = 8  # the same, in each step of the radial table
 _NEWTON = 4  # steps from there
 _HEIGHTS_AT_ONCE = 16  # heights of the axial table made together
+_TABLES_KEPT = 16  # Bessel matrices: models that differ in focus or phase need the same ones
+_MOST_KEPT_MB = 1.0  # of such matrices; larger ones are made anew
 
 
 def check_table(what: str, numbers: float) -> None:
@@ -371,11 +373,25 @@ def field_of(
         and like.table.shape[3] == intervals + 1
         and np.array_equal(like.transverse, transverse)
     )
-    table = like.table if same and like else bessel_table(transverse, step, intervals)
+    table = like.table if same and like else _bessel_table(transverse, step, intervals)
     return RadialField(
         source, axial, transverse, table, step, math.radians(optics.polarization_deg),
         optics.polarization == "circular", optics.analyzer,
     )  # fmt: skip
+
+
+def _bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> FloatArray:
+    """Bessel matrices of the radial grid, of which the last few small ones are kept."""
+    if 8e-6 * 6 * transverse.size * (intervals + 1) > _MOST_KEPT_MB:
+        return bessel_table(transverse, step_nm, intervals)
+    return _kept_table(transverse.tobytes(), step_nm, intervals)
+
+
+def _table_of(transverse: bytes, step_nm: float, intervals: int) -> FloatArray:
+    return bessel_table(np.frombuffer(transverse), step_nm, intervals)
+
+
+_kept_table = memoize(_TABLES_KEPT, _table_of)
 
 
 def with_light_of(field: Field, opening: Aperture, factor: complex, oil_nm: float) -> Field:
