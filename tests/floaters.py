@@ -95,10 +95,8 @@ class Volume:
         self._spectra = np.empty((len(heights), 3, side, side // 2 + 1), dtype=complex)
         for n, z in enumerate(heights):
             here = pictures.at_height(float(z))
-            for k, phase in enumerate((1.0, 1j)):
-                above, below = (here.scatterer(*at, phase * sign) for sign in (1.0, -1.0))
-                self._spectra[n, k] = _spectrum((above - below) / 2)
-            self._spectra[n, 2] = _spectrum((above + below) / 2)
+            for k, term in enumerate(here.terms_of_scatterer(*at)):
+                self._spectra[n, k] = _spectrum(term)
         self._ky = 2 * np.pi * np.fft.fftfreq(side)
         self._kx = 2 * np.pi * np.fft.rfftfreq(side)
 

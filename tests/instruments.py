@@ -188,7 +188,7 @@ class Pictures:
     def at_height(self, z_nm: float) -> Pictures:
         """Put the particle at another height, and leave the focus where it was."""
         turn = np.exp(1j * self._rise * (z_nm - self._nominal_nm))
-        tables = [np.einsum("rt,ct,t->rc", rays, pupil, turn) for rays, pupil in self._rays]
+        tables = [rays @ (pupil * turn).T for rays, pupil in self._rays]
         out = copy(self)
         out._spline = CubicSpline(self._distances, np.array(tables), axis=1)
         return out
@@ -197,12 +197,19 @@ class Pictures:
         self, dx_nm: FloatArray, dy_nm: FloatArray, field_over_reference: complex
     ) -> FloatArray:
         """Contrast of a scatterer of absolute strength, see `strength_of_sphere`."""
+        linear, turned, square = self.terms_of_scatterer(dx_nm, dy_nm)
+        s = field_over_reference
+        return s.real * linear + s.imag * turned + abs(s) ** 2 * square
+
+    def terms_of_scatterer(
+        self, dx_nm: FloatArray, dy_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """What real part, imaginary part and squared size of a strength are multiplied by."""
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
         parts = self._spline(r)
-        e = field_over_reference * sum(
-            parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders)
-        )
-        return 2 * np.real(e @ np.conj(self._reference)) + np.sum(np.abs(e) ** 2, axis=-1)
+        e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
+        along = 2 * e @ np.conj(self._reference)
+        return np.real(along), -np.imag(along), np.sum(np.abs(e) ** 2, axis=-1)
 
 
 def strength_of_sphere(

@@ -30,18 +30,26 @@ SETTINGS: dict[str, Any] = {
 }
 
 
-def _movie(instrument: Instrument, exposure_ms: float = 0.05) -> Floaters:
-    volume = Volume((SIDE_PX, SIDE_PX), ceiling_nm=CEILING_NM, instrument=instrument)
+def _volume(instrument: Instrument) -> Volume:
+    return Volume((SIDE_PX, SIDE_PX), ceiling_nm=CEILING_NM, instrument=instrument)
+
+
+def _movie(volume: Volume, exposure_ms: float = 0.05) -> Floaters:
     return volume.record(FRAMES, (Sphere(),), seed=3, exposure_ms=exposure_ms)
 
 
 @pytest.fixture(scope="module")
+def right() -> Volume:
+    return _volume(Instrument(emission="reciprocal"))
+
+
+@pytest.fixture(scope="module")
 def aberrated() -> Floaters:
-    return _movie(Instrument(emission="reciprocal", aberrations_nm={11: SPHERICAL_NM}))
+    return _movie(_volume(Instrument(emission="reciprocal", aberrations_nm={11: SPHERICAL_NM})))
 
 
-def test_right_optics_are_not_doubted_where_heights_are_fitted() -> None:
-    movie = _movie(Instrument(emission="reciprocal"))
+def test_right_optics_are_not_doubted_where_heights_are_fitted(right: Volume) -> None:
+    movie = _movie(right)
     result = ia.fit_movie(movie.counts, settings=SETTINGS)
     told = result.summary["optics"]
     assert told["tested"] == 1
@@ -58,9 +66,9 @@ def test_what_is_wrong_is_named_where_heights_are_fitted(aberrated: Floaters) ->
     assert result.summary["optics"]["left_over"] > 2 * REJECTED_SHARE
 
 
-def test_a_path_that_is_smeared_is_named_and_tells_nothing_else() -> None:
+def test_a_path_that_is_smeared_is_named_and_tells_nothing_else(right: Volume) -> None:
     """It was said that the gain is wrong."""
-    movie = _movie(Instrument(emission="reciprocal"), exposure_ms=0.3)
+    movie = _movie(right, exposure_ms=0.3)
     result = ia.fit_movie(movie.counts, settings={**SETTINGS, "camera.exposure_ms": 0.3})
     (said,) = result.warnings
     assert "within an exposure" in said
