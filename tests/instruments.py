@@ -204,7 +204,7 @@ class Pictures:
     def terms_of_scatterer(
         self, dx_nm: FloatArray, dy_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What real part, imaginary part and squared size of a strength are multiplied by."""
+        """Give what real part, imaginary part and squared size of a strength multiply."""
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
         parts = self._spline(r)
         e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
