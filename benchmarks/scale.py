@@ -3,6 +3,7 @@
     python benchmarks/scale.py [--quick] [--full] [--fields 128x128,…] [--frames 500,…]
                                [--particles 10,…] [--memory-mb N] [--keep FOLDER]
     python benchmarks/scale.py --sensor 2400,4800 [--particles 200] [--memory-mb N] [--keep FOLDER]
+                               [--set optics.focus_curvature_nm=100 …]
 
 Each job is ``iscat fit`` in a process of its own, on plain numbers: a block of frames with
 particles that land in its first half and leave in its second one, and links to it, so that a movie
@@ -16,7 +17,8 @@ extrapolated from that: parts are whole, and the process of the command hashes t
 
 ``--sensor`` analyses two movies of 1200 × 1920 pixels, of as many frames as it is given, and says
 what the longer one has more: speed, memory, and what a recording of 46 GB takes by that.  Each
-block of 400 frames has 200 particles, or as many as ``--particles`` says.
+block of 400 frames has 200 particles, or as many as ``--particles`` says.  ``--set`` changes the
+configuration with which movies are drawn and analysed, as of optics that change over the field.
 
 Without options, the default takes less than ten minutes on two idle cores; ``--full`` goes to
 1200 × 1920 pixels, 100 000 frames and 10 000 particles.  ``--quick`` judges nothing.
@@ -90,10 +92,10 @@ class Cost:
     tiles: int
 
 
-def write_movie(job: Job, folder: Path) -> Path:
+def write_movie(job: Job, folder: Path, settings: Sequence[str] = ()) -> Path:
     """Write a block of frames, and links to it."""
     rng = np.random.default_rng(1)
-    config = load_config(CONFIG, [])
+    config = load_config(CONFIG, settings)
     context = make_context(config, (job.rows, job.columns), searches=100, sliding=True)
     length = min(BLOCK, job.frames)
     y, x = np.mgrid[: job.rows, : job.columns]
@@ -133,22 +135,19 @@ def _particle(
         spans.append((round(place) - HALF_PX, round(place) + HALF_PX + 1))
     pixel = context.pixel_nm
     grid = PixelGrid.region(spans[0], spans[1], pixel)
-    image = context.wide.image(grid, places[1] * pixel, places[0] * pixel, 5.0, mass)
+    x_nm, y_nm = places[1] * pixel, places[0] * pixel
+    image = context.wide_at(x_nm, y_nm).image(grid, x_nm, y_nm, 5.0, mass)
     return landing, leaving, (slice(*spans[0]), slice(*spans[1])), image
 
 
-def measure(job: Job, folder: Path, memory_mb: int) -> Cost:
+def measure(job: Job, folder: Path, memory_mb: int, settings: Sequence[str] = ()) -> Cost:
     """Analyse a movie in a process of its own."""
     with tempfile.TemporaryDirectory(dir=folder) as name:
-        movie = write_movie(job, Path(name))
+        movie = write_movie(job, Path(name), settings)
         command = [sys.executable, "-c", PROGRAM, "fit", str(movie), "--config", str(CONFIG)]
         command += ["--quiet", "--json", "--workers", str(job.workers), "--out", f"{name}/out"]
-        command += [
-            "--set",
-            f"compute.memory_limit_mb={memory_mb}",
-            "--set",
-            "optics.calibrate=never",
-        ]
+        every = (f"compute.memory_limit_mb={memory_mb}", "optics.calibrate=never", *settings)
+        command += [part for setting in every for part in ("--set", setting)]
         answer = Path(name) / "answer.json"
         start = time.perf_counter()
         with answer.open("w", encoding="utf-8") as out:
@@ -240,7 +239,7 @@ def sensor(options: argparse.Namespace, folder: Path) -> int:
     """Analyse two movies of a large sensor, and judge what the longer one has more."""
     particles = options.particles[0] if options.particles else SENSOR_PARTICLES
     short, long = (
-        measure(Job(*SENSOR, frames, particles), folder, options.memory_mb)
+        measure(Job(*SENSOR, frames, particles), folder, options.memory_mb, options.set)
         for frames in options.sensor
     )
     added = long.job.megabytes - short.job.megabytes
@@ -331,6 +330,7 @@ def main() -> int:
     parser.add_argument("--particles", type=_numbers, help="in a block of the largest field")
     parser.add_argument("--sensor", type=_numbers, help="frames of two movies, as 2400,4800")
     parser.add_argument("--memory-mb", type=int, default=1000, help="compute.memory_limit_mb")
+    parser.add_argument("--set", action="append", default=[], help="of the sensor, as KEY=VALUE")
     parser.add_argument("--keep", type=Path, help="folder for the movies while they are analysed")
     options = parser.parse_args()
     if options.keep is not None:

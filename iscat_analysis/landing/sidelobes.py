@@ -11,9 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import near_earlier_peaks
 from iscat_analysis.landing.neighbours import Step
+from iscat_analysis.records import FloatArray
 from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, RINGS, is_hidden, size_on_ring
 from iscat_analysis.search.sliding import STRIDES, MapArray, Peak
 from iscat_analysis.search.templates import FAR_LOBE, LARGEST_IMAGE, NEAR, SIDELOBE
@@ -40,14 +42,19 @@ class SidelobeFilter:
         fresh: list[Peak] = []
         doubtful: list[Peak] = []
         dated = np.array([step.at.frame for step in steps])
+        places = np.array([(step.start.x_px, step.start.y_px) for step in steps]).reshape(-1, 2)
         for peak, waits in zip(peaks, self._waiting(peaks), strict=True):
             if waits:
                 continue
-            seen = np.abs(dated - peak.frame) <= (STRIDES + 1) * self.stride
-            met = [steps[int(i)] for i in np.flatnonzero(seen)]
-            if any(self._is_residue(step, peak) for step in met):
+            met = np.flatnonzero(np.abs(dated - peak.frame) <= (STRIDES + 1) * self.stride)
+            there = places[met]
+            away = np.hypot(there[:, 0] - peak.x_px, there[:, 1] - peak.y_px)
+            order = np.argsort(away, kind="stable")
+            order = order[: np.searchsorted(away[order], LARGEST_IMAGE * self.roi_px, "right")]
+            near = [(steps[int(met[i])], float(away[i])) for i in order]
+            if any(self._is_residue(step, distance, peak) for step, distance in near):
                 continue
-            size = self._left_over(peak, met, snr)
+            size = self._left_over(peak, near, order, there, snr)
             if abs(peak.snr) > size:
                 fresh.append(peak)
             elif not is_hidden(peak.snr, size):
@@ -67,38 +74,39 @@ class SidelobeFilter:
         ).tolist()  # fmt: skip
         return hidden
 
-    def _is_residue(self, step: Step, peak: Peak) -> bool:
-        """Whether a peak may be the residual of a fitted step."""
-        start = step.start
-        distance = math.hypot(start.x_px - peak.x_px, start.y_px - peak.y_px)
+    def _is_residue(self, step: Step, distance: float, peak: Peak) -> bool:
+        """Whether a peak may be the residual of a fitted step, so many pixels away."""
         on_top = distance < self.roi_px / 6
         if on_top and abs(step.at.frame - peak.frame) > self.stride:
             return False
         share = _RESIDUE_SHARE if on_top else 0.0 if step.is_measured else RINGS
-        return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(start.snr)
+        return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(step.start.snr)
 
-    def _left_over(self, peak: Peak, steps: Sequence[Step], snr: MapArray) -> float:
+    def _left_over(
+        self,
+        peak: Peak,
+        near: Sequence[tuple[Step, float]],
+        order: NDArray[np.int64],
+        places: FloatArray,
+        snr: MapArray,
+    ) -> float:
         """Signal-to-noise ratio that a peak must have not to be a residual of the fits.
 
         The nearest steps are tried first; the search ends with one whose residual is higher than
         the peak.
+
+        Shapes: `order` (k,), of those near among the `places` (n, 2), `snr` (n, y, x).
         """
-        away = [math.hypot(peak.x_px - s.start.x_px, peak.y_px - s.start.y_px) for s in steps]
         size = max(
-            (
-                self._inside(s, peak)
-                for s, d in zip(steps, away, strict=True)
-                if d < self.roi_px / 2
-            ),
-            default=0.0,
+            (self._inside(step, peak) for step, away in near if away < self.roi_px / 2), default=0.0
         )
-        places = [(s.start.x_px, s.start.y_px) for s in steps]
         j = round((peak.frame - self.first) / self.stride) - 1
-        for i in np.argsort(away, kind="stable").tolist():
-            if is_hidden(peak.snr, size) or away[i] > LARGEST_IMAGE * self.roi_px:
+        for i in order.tolist():
+            if is_hidden(peak.snr, size):
                 break
-            others = places[:i] + places[i + 1 :]
-            beside = size_on_ring(snr[j], places[i], (peak.x_px, peak.y_px), others)
+            x, y = places[i].tolist()
+            others = np.delete(places, i, axis=0)
+            beside = size_on_ring(snr[j], (x, y), (peak.x_px, peak.y_px), others)
             size = max(size, EXCEEDS * beside)
         return size
 

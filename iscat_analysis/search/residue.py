@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis._kernels.stepping import ring_heights
 
@@ -89,23 +89,24 @@ def size_on_ring(
     snr: NDArray[Any],
     centre: tuple[float, float],
     place: tuple[float, float],
-    others: Iterable[tuple[float, float]] = (),
+    others: ArrayLike = (),
 ) -> float:
     """Give how high the map rises at a candidate's distance from a particle, beside its own peak.
 
     The highest peak there may be another particle that is not known yet, and a fifth of what is
     then left of the ring may be higher, for more: a misfit rises all around.
 
-    Shapes: `snr` (y, x).
+    Shapes: `snr` (y, x), `others` (n, 2), their x and y.
     """
     (x0, y0), (xc, yc) = centre, place
     distance = max(math.hypot(xc - x0, yc - y0), _RING_PX)
     reach = 2 * (distance + _RING_PX)  # farther away, others share no pixels with the ring
-    near = [(x, y) for x, y in others if math.hypot(x - x0, y - y0) < reach]
+    known = np.asarray(others, dtype=np.float64).reshape(-1, 2)
+    near = known[np.hypot(known[:, 0] - x0, known[:, 1] - y0) < reach]
     highest = np.empty(max(8, round(2 * math.pi * distance / _SECTOR_PX)))
     ring_heights(
         snr, (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX, _PATCH_PX,
-        np.array(near, dtype=np.float64).reshape(-1, 2), highest,
+        near, highest,
     )  # fmt: skip
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
