@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.landing.merging import CLIPS, FinishedChunk, is_same_step
+from iscat_analysis.landing.merging import CLIPS, FinishedChunk, SameSteps
 from iscat_analysis.landing.searched import Searched
 from iscat_analysis.records import EventView
 from iscat_analysis.search.empty import EmptySpread
@@ -71,20 +71,19 @@ def _own_rows(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> list[int]
         tile.holds(part.lines["y_px"].to_numpy(float), part.lines["x_px"].to_numpy(float))
         for tile, part in zip(tiles, done, strict=True) if len(part.lines)
     ])  # fmt: skip
-    kept = np.flatnonzero(own)
-    for stranger in np.flatnonzero(~own):
-        if not is_same_step(table, int(stranger), kept):
-            kept = np.append(kept, stranger)
+    same, kept = SameSteps(table), own.copy()
+    for stranger in np.flatnonzero(~own).tolist():
+        kept[stranger] = not kept[same.like(stranger)].any()
     # two of one particle, each in its own core: the clearer one is kept
-    clear = kept[np.argsort(-table["snr"].to_numpy(float)[kept], kind="stable")]
-    rows: list[int] = []
+    chosen = np.flatnonzero(kept)
+    clear = chosen[np.argsort(-table["snr"].to_numpy(float)[chosen], kind="stable")]
     home = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
+    taken = np.zeros(len(table), dtype=np.bool_)
     for one in clear.tolist():
-        others = np.array([k for k in rows if home[k] != home[one]], dtype=np.int64)
-        if not (others.size and is_same_step(table, one, others)):
-            rows.append(one)
+        others = same.like(one)
+        taken[one] = not (taken[others] & (home[others] != home[one])).any()
     frame, y, x = (table[name].to_numpy(float) for name in ("frame", "y_nm", "x_nm"))
-    return sorted(rows, key=lambda i: (frame[i], y[i], x[i]))
+    return sorted(np.flatnonzero(taken).tolist(), key=lambda i: (frame[i], y[i], x[i]))
 
 
 def _field(tiles: Sequence[Tile], parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -123,11 +123,11 @@ class MergedChunks:
         finished = np.zeros(len(table), dtype=np.bool_)
         for done in self._done:
             finished |= (frame >= done.core[0]) & (frame < done.core[1])
-        kept = np.flatnonzero(own)
-        for stranger in np.flatnonzero(~own & finished):
-            if not is_same_step(table, int(stranger), kept):
-                kept = np.append(kept, stranger)
-        order = sorted(kept, key=lambda i: (frame[i], table["y_nm"].iloc[i], table["x_nm"].iloc[i]))
+        same, kept = SameSteps(table), own.copy()
+        for stranger in np.flatnonzero(~own & finished).tolist():
+            kept[stranger] = not kept[same.like(stranger)].any()
+        y, x = (table[name].to_numpy(float) for name in ("y_nm", "x_nm"))
+        order = sorted(np.flatnonzero(kept).tolist(), key=lambda i: (frame[i], y[i], x[i]))
         views, repeats = [], []
         for number, i in enumerate(order):
             done, row = homes[i]
@@ -239,13 +239,25 @@ class MergedChunks:
         return int(defective.sum()), int(self._saturated.sum())
 
 
-def is_same_step(table: pd.DataFrame, one: int, others: NDArray[np.int64]) -> bool:
-    """Whether some other row describes the same step."""
-    frame, error, x, y, mass = (
-        table[name].to_numpy(dtype=float)
-        for name in ("frame", FRAME_COLUMN, "x_px", "y_px", "mass_kda")
-    )
-    near = np.abs(frame[others] - frame[one]) <= np.maximum(2, error[others] + error[one])
-    near &= np.hypot(x[others] - x[one], y[others] - y[one]) < SEAM_PX
-    near &= mass[others] * mass[one] > 0
-    return bool(near.any())
+class SameSteps:
+    """Which rows of a table describe the same step."""
+
+    def __init__(self, table: pd.DataFrame) -> None:
+        self._frame, self._error, self._x, self._y, self._mass = (
+            table[name].to_numpy(dtype=float)
+            for name in ("frame", FRAME_COLUMN, "x_px", "y_px", "mass_kda")
+        )
+        self._order = np.argsort(self._frame, kind="stable")
+        self._dated = self._frame[self._order]
+        self._largest = float(np.max(self._error, initial=0.0))
+
+    def like(self, one: int) -> NDArray[np.int64]:
+        """Give the other rows that describe the step of one."""
+        frame, error = self._frame[one], self._error[one]
+        reach = max(2.0, error + self._largest)
+        first, last = np.searchsorted(self._dated, (frame - reach, frame + reach + 1e-9))
+        others: NDArray[np.int64] = self._order[first:last]
+        near = np.abs(self._frame[others] - frame) <= np.maximum(2, self._error[others] + error)
+        away = np.hypot(self._x[others] - self._x[one], self._y[others] - self._y[one])
+        near &= (away < SEAM_PX) & (self._mass[others] * self._mass[one] > 0) & (others != one)
+        return np.asarray(others[near])

@@ -18,7 +18,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.landing import chunk_work, joining, neighbours, steps
+from iscat_analysis.landing import chunk_work, joining, merging, neighbours, steps
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
@@ -125,6 +125,31 @@ def test_tiles_change_nothing(
     _check(found, whole)
     places = (part.counts.sum(axis=1) for part in (found.empty, whole.empty))
     assert np.divide(*places) == pytest.approx(1.0, abs=0.05)  # none in two tiles
+
+
+def test_rows_of_one_step_are_found_among_those_of_its_frames() -> None:
+    """As by looking at all pairs; 600 rows, half of them beside another in place and time."""
+    rng = np.random.default_rng(5)
+    there = {
+        "frame": rng.integers(0, 200, 300).astype(float), FRAME_COLUMN: rng.integers(0, 6, 300),
+        "x_px": rng.uniform(0, 60, 300), "y_px": rng.uniform(0, 60, 300),
+        "mass_kda": rng.choice([-66.0, 66.0], 300),
+    }  # fmt: skip
+    table = pd.DataFrame({
+        name: np.concatenate([value, value + rng.integers(-3, 4, 300) * (name != "mass_kda") / 2])
+        for name, value in there.items()
+    })  # fmt: skip
+    same = merging.SameSteps(table)
+    found = 0
+    for one in range(600):
+        frame, error, x, y, mass = (table[name].to_numpy(float) for name in there)
+        near = np.abs(frame - frame[one]) <= np.maximum(2, error + error[one])
+        near &= np.hypot(x - x[one], y - y[one]) < merging.SEAM_PX
+        near &= mass * mass[one] > 0
+        near[one] = False
+        assert sorted(same.like(one)) == np.flatnonzero(near).tolist()
+        found += int(near.sum())
+    assert found > 200
 
 
 def test_images_that_are_drawn_again_are_the_same(
