@@ -67,7 +67,6 @@ class TaskBuilder:
         self._roi_px = context.roi_px
         self._stride = int(chunk.edges[1] - chunk.edges[0])
         self._search_reach = self._stride + self._stride // 2 + 1  # of a date, in frames
-        self._read_e2 = chunk.camera.read_variance_e2(chunk.shape)
         self.rise = {1: 0, -1: 0}  # frames over which most landings, and leavings, take place
 
     def build(
@@ -125,8 +124,8 @@ class TaskBuilder:
                 ratio[here] *= self._neighbours.own_factor(step, *cuts, inside)
             with_it = cuts[1] if step.sign > 0 else cuts[0]
             offset = moving.shift(with_it) - moving.at(at.frame)
-        read = self._read_e2[region.slices]
-        variances = [n_before * read, n_after * read]
+        read = np.square(patch.read_noise_e, dtype=np.float64)  # one number for most cameras
+        variances = [np.broadcast_to(n * read, before.shape) for n in (n_before, n_after)]
         if step.sign < 0:
             before, after, ratio = after, before, 1 / ratio
             variances.reverse()
