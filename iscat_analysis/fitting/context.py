@@ -31,6 +31,7 @@ from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templ
 SPREAD_NM = 10_000.0
 """Farther than this from a particle its rings are left out; they are 1e-4 of its peak."""
 
+_WIDE_KEPT = 12  # models that reach far at hand, of 7 MB each
 
 _VARIANCE_OF_BACKGROUND = {
     "fixed": MEAN, "sliding": MEAN, "tracks": MEAN, "median": MEDIAN, "known": KNOWN,
@@ -49,23 +50,30 @@ class AnalysisContext:
     mode: str
     searches: int = 1
     lines: Lines | PartOfLines | None = None
-    local: tuple[LocalModels | ModelsFrom, LocalModels | ModelsFrom] | None = None
+    # of fitted regions, of their surroundings, and of all that is seen far away
+    local: tuple[LocalModels | ModelsFrom, ...] | None = None
 
     def model_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
         """Give the model for fitted regions at a place, in a frame of the movie."""
         return self.model if self.local is None else self.local[0].at(x_nm, y_nm, frame)
 
-    def wide_at(self, x_nm: float, y_nm: float, frame: int | None = None) -> ForwardModel:
-        """Give the model for signals far away of a particle at a place, in a frame of the movie."""
-        return self.wide if self.local is None else self.local[1].at(x_nm, y_nm, frame)
+    def wide_at(
+        self, x_nm: float, y_nm: float, frame: int | None = None, *, reach_px: float = math.inf
+    ) -> ForwardModel:
+        """Give the model for signals far away of a particle at a place, in a frame of the movie.
+
+        One that reaches no farther than the side of a region takes a fifth of the time to make.
+        """
+        if self.local is None:
+            return self.wide
+        return self.local[1 if reach_px <= self.roi_px else 2].at(x_nm, y_nm, frame)
 
     def on_tile(self, tile: Tile) -> AnalysisContext:
         """Give the same for a tile, whose places count from its own corner."""
         local, lines, noise = self.local, self.lines, self.templates.noise
         if isinstance(local, tuple):
             corner_nm = tile.corner[0] * self.pixel_nm, tile.corner[1] * self.pixel_nm
-            near, wide = (ModelsFrom(m, corner_nm) for m in local if isinstance(m, LocalModels))
-            local = near, wide
+            local = tuple(ModelsFrom(m, corner_nm) for m in local if isinstance(m, LocalModels))
         if isinstance(lines, Lines):
             lines = lines.part(tile.here)
         if noise is not None:
@@ -163,7 +171,12 @@ def make_context(
     wide = forward_model(config, reach_nm)
     local = None
     if terms_of(config.optics):
-        local = LocalModels(config, model, field_px), LocalModels(config, wide, field_px)
+        beside = forward_model(config, math.sqrt(2) * (roi_px + 2) * pixel)
+        local = (
+            LocalModels(config, model, field_px),
+            LocalModels(config, beside, field_px),
+            LocalModels(config, wide, field_px, kept=_WIDE_KEPT),
+        )
     return AnalysisContext(
         config=config,
         model=model,

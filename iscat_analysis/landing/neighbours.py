@@ -170,7 +170,7 @@ class Neighbours:
         def image() -> FloatArray:
             pixel = context.pixel_nm
             place = start.x_px * pixel, start.y_px * pixel
-            model = context.wide_at(*place, shown)
+            model = context.wide_at(*place, shown, reach_px=half)
             if sphere is not None:
                 model = sphere.in_place_of(model)
             grid = PixelGrid.region(sides[0], sides[1], pixel)

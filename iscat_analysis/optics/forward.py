@@ -191,10 +191,15 @@ def _pupil(
     beyond = max(0.0, (alpha - critical) / alpha) if critical else 0.0
     return aperture(
         optics,
-        nodes or 16 + math.ceil(0.45 * k * path),
-        nodes or 14 + math.ceil(0.45 * k * path * beyond),
+        nodes or 16 + _in_eights(0.45 * k * path),
+        nodes or 14 + _in_eights(0.45 * k * path * beyond),
         scatterer,
     )
+
+
+def _in_eights(number: float) -> int:
+    """Round up, so that models which differ a little in focus have the same nodes."""
+    return 8 * math.ceil(number / 8)
 
 
 def _lowest_nm(config: Config) -> float:

@@ -19,13 +19,13 @@ from iscat_analysis.optics.field_map import (
 from iscat_analysis.optics.forward import ForwardModel, forward_model
 from iscat_analysis.optics.memoize import memoize
 
-_KEPT = 64  # models at hand, of some MB each
-
 
 class LocalModels:
     """Models of one movie, by place and frame; masses have the scale of the field's centre."""
 
-    def __init__(self, config: Config, model: ForwardModel, field_px: tuple[int, int]) -> None:
+    def __init__(
+        self, config: Config, model: ForwardModel, field_px: tuple[int, int], *, kept: int = 64
+    ) -> None:
         self._optics = optics = config.optics
         self._terms = terms_of(optics)
         self._centre_px = centre_of(optics, field_px)
@@ -38,7 +38,7 @@ class LocalModels:
             there = config.model_copy(update={"optics": local, "calibration": None})
             return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
 
-        self._moved = memoize(_KEPT, moved)
+        self._moved = memoize(kept, moved)
 
     def rise(self, frame: int) -> int:
         """Give by how many steps of its models the focus has risen in a frame."""

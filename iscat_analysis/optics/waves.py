@@ -39,6 +39,7 @@ from iscat_analysis._kernels.radial import (
     radial_profile,
 )
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.last_used import LastUsed
 from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics, weight_on
 from iscat_analysis.optics.coherence import (
     Cone,
@@ -64,8 +65,8 @@ _PEAK_STEP = 1 / 3  # of the lattice: the grid on which the largest signal is se
 _PEAK_POINTS = 8  # the same, in each step of the radial table
 _NEWTON = 4  # steps from there
 _HEIGHTS_AT_ONCE = 16  # heights of the axial table made together
-_TABLES_KEPT = 16  # Bessel matrices: models that differ in focus or phase need the same ones
-_MOST_KEPT_MB = 1.0  # of such matrices; larger ones are made anew
+# Bessel matrices: models that differ in focus or phase need the same ones
+_TABLES: LastUsed[FloatArray] = LastUsed(16_000_000)
 
 
 def check_table(what: str, numbers: float) -> None:
@@ -370,7 +371,7 @@ def field_of(
     same = (
         like is not None
         and like.step_nm == step
-        and like.table.shape[3] == intervals + 1
+        and like.reach_nm >= reach_nm
         and np.array_equal(like.transverse, transverse)
     )
     table = like.table if same and like else _bessel_table(transverse, step, intervals)
@@ -381,17 +382,13 @@ def field_of(
 
 
 def _bessel_table(transverse: FloatArray, step_nm: float, intervals: int) -> FloatArray:
-    """Bessel matrices of the radial grid, of which the last few small ones are kept."""
-    if 8e-6 * 6 * transverse.size * (intervals + 1) > _MOST_KEPT_MB:
-        return bessel_table(transverse, step_nm, intervals)
-    return _kept_table(transverse.tobytes(), step_nm, intervals)
-
-
-def _table_of(transverse: bytes, step_nm: float, intervals: int) -> FloatArray:
-    return bessel_table(np.frombuffer(transverse), step_nm, intervals)
-
-
-_kept_table = memoize(_TABLES_KEPT, _table_of)
+    """Bessel matrices of the radial grid, of which the last are held."""
+    key = transverse.tobytes(), step_nm, intervals
+    table = _TABLES.get(key)
+    if table is None:
+        table = bessel_table(transverse, step_nm, intervals)
+        _TABLES.hold(key, table, table.nbytes)
+    return table
 
 
 def with_light_of(field: Field, opening: Aperture, factor: complex, oil_nm: float) -> Field:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.special import roots_legendre
 
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.context import make_context
+from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.inference.noise import asimov_poisson
 from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.particle_image import ParticleImage
@@ -19,6 +20,8 @@ from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.local import LocalModels
 from iscat_analysis.optics.parameters import FIELD, settings_of
 from iscat_analysis.study.simulate import Movie
+
+ROOT = Path(__file__).resolve().parents[2]
 
 PIXEL_NM = 84.0
 FIELD_PX = (101, 101)
@@ -222,3 +225,33 @@ def test_a_simulated_particle_is_drawn_with_the_optics_of_its_place(light: dict[
     assert np.abs(after / before - 1 - expected).max() < 0.003 * np.abs(expected).max()
     even = forward_model(_config(focus_nm=-300, **light), 6000.0).image(grid, *place)
     assert np.abs(even - expected).max() > 0.05 * np.abs(expected).max()
+
+
+def _landing(*settings: str) -> AnalysisContext:
+    config = load_config(ROOT / "sample_configs" / "landing.toml", settings)
+    return make_context(config, (260, 260), searches=10, sliding=True)
+
+
+def test_models_of_places_share_the_table_of_the_middle() -> None:
+    """It is nearly all that a model takes to make; optics with coma have none."""
+    context = _landing("optics.focus_curvature_nm=100", "optics.focus_tilt_nm=[60, -40]")
+    assert context.local is not None
+    for models in context.local:
+        seen = [models.at(x, 3000.0) for x in np.linspace(500, 21_500, 30)]
+        assert len({each.optics.focus_nm for each in seen}) > 20
+        assert len({id(each.wave.table) for each in seen}) <= 2  # with more focus, more nodes
+
+
+@pytest.mark.parametrize("coma", [0, 20])
+def test_a_model_for_what_is_near_shows_the_same_there(coma: float) -> None:
+    context = _landing("optics.focus_tilt_nm=[60, -40]", f"optics.coma_field_nm={coma}")
+    x, y, side = 150.3 * context.pixel_nm, 90.8 * context.pixel_nm, context.roi_px
+    grid = PixelGrid.region((91 - side, 92 + side), (150 - side, 151 + side), context.pixel_nm)
+    near, wide = (
+        context.wide_at(x, y, reach_px=reach).image(grid, x, y, 5.0, 480.0)
+        for reach in (side, side + 1)
+    )
+    peak = np.abs(wide).max()
+    assert np.abs(near - wide).max() < 1e-5 * peak
+    elsewhere = context.wide_at(10.0, 10.0).image(grid, x, y, 5.0, 480.0)
+    assert np.abs(elsewhere - wide).max() > 0.01 * peak
