@@ -249,7 +249,7 @@ class SameSteps:
         )
         self._order = np.argsort(self._frame, kind="stable")
         self._dated = self._frame[self._order]
-        self._largest = float(np.max(self._error, initial=0.0))
+        self._largest = float(np.nanmax(self._error, initial=0.0))
 
     def like(self, one: int) -> NDArray[np.int64]:
         """Give the other rows that describe the step of one."""
