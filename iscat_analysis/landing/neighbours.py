@@ -17,6 +17,7 @@ out, it is held with the share f of the light that makes the pattern, which is t
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
@@ -377,7 +378,9 @@ class Neighbours:
         )
         return seen
 
-    def of(self, steps: Sequence[Step], frames: int = 0) -> tuple[list[list[int]], list[list[int]]]:
+    def of(
+        self, steps: Sequence[Step], frames: int = 0
+    ) -> tuple[list[array[int]], list[array[int]]]:
         """List for each step the others that its fit must include, and those that it depends on.
 
         Others are near in time within the windows, or within `frames` if these are more.
@@ -398,9 +401,9 @@ class Neighbours:
             close |= self.are_spheres  # what stands there all the time has a field too
             near = close & (np.maximum(dx, dy) < reach)
             near[i] = False
-            seen.append([int(k) for k in np.flatnonzero(near)])
+            seen.append(array("i", np.flatnonzero(near).tolist()))
             near &= (dt < 2 * self._window) & (np.hypot(dx, dy) < self._roi_px / 2)
-            bound.append([int(k) for k in np.flatnonzero(near)])
+            bound.append(array("i", np.flatnonzero(near).tolist()))
         return seen, bound
 
     def shown(self, step: Step, region: Region) -> tuple[tuple[slice, slice], FloatArray] | None:

@@ -9,6 +9,7 @@ what steps do to each other's light, `tasks` sets up the likelihood of one.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -186,7 +187,7 @@ class ChunkFitter:
         lobes = [self._begin(peak) for peak in self._doubtful]
         everything = steps + lobes
         seen, around = (
-            [[k for k in near if k < len(steps)] for near in self.neighbours.of(everything, n)[0]]
+            [near[: bisect_left(near, len(steps))] for near in self.neighbours.of(everything, n)[0]]
             for n in (0, TRACE_FRAMES)
         )
         # steps of the other polarity are fitted too: their rings have the one that is reported
