@@ -38,7 +38,7 @@ from iscat_analysis.search.sliding.tiles import EVERYWHERE
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
 
-_LARGEST_SHARE = 2.0  # times its share of the field, that a tile may have of the events shown
+_LARGEST_SHARE = 1.5  # times its share of the field, that a tile may have of the events shown
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from iscat_analysis.records import Candidate, FitResult, FloatArray
 from iscat_analysis.search.sliding import Chunk, MapArray, StepFrame
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
-_IMAGE_BYTES = 64_000_000  # of the images of steps that a chunk holds
+_IMAGE_BYTES = 40_000_000  # of the images of steps that a chunk holds
 _FAINT_SNR = 30.0  # up to which the image of one region and its surroundings is enough
 WHOLE = (slice(None), slice(None))
 """All of an image."""

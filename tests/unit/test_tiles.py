@@ -174,12 +174,12 @@ def test_images_that_are_drawn_again_are_the_same(
     pd.testing.assert_frame_equal(found.fits, whole.fits)
 
 
-def test_a_tile_shows_no_more_than_twice_its_share() -> None:
+def test_a_tile_shows_half_more_than_its_share_at_most() -> None:
     first, last = (cut_field((100, 400), (1, 4), 10)[k] for k in (0, -1))
     assert first.share == last.share == 0.25
-    assert [chunk_work._shown_of(first, left) for left in (1000, 3, 0, -7)] == [500, 2, 0, 0]
+    assert [chunk_work._shown_of(first, left) for left in (1000, 3, 0, -7)] == [375, 2, 0, 0]
     half = cut_field((100, 400), (1, 2), 10)[0]
-    assert chunk_work._shown_of(half, 9) == chunk_work._shown_of(None, 9) == 9
+    assert [chunk_work._shown_of(tile, 9) for tile in (half, None)] == [7, 9]
 
 
 def test_frames_of_several_files_lie_where_they_are(
