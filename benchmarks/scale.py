@@ -1,7 +1,7 @@
 """Large sensors, long movies, crowded fields: how processor time and memory grow, and what limits.
 
     python benchmarks/scale.py [--quick] [--full] [--fields 128x128,…] [--frames 500,…]
-                               [--particles 10,…] [--memory-mb N] [--keep FOLDER]
+                               [--particles 10,…] [--memory-mb N] [--keep FOLDER] [--set …]
     python benchmarks/scale.py --sensor 2400,4800 [--particles 200] [--memory-mb N] [--keep FOLDER]
                                [--set optics.focus_curvature_nm=100 …]
 
@@ -17,8 +17,10 @@ extrapolated from that: parts are whole, and the process of the command hashes t
 
 ``--sensor`` analyses two movies of 1200 × 1920 pixels, of as many frames as it is given, and says
 what the longer one has more: speed, memory, and what a recording of 46 GB takes by that.  Each
-block of 400 frames has 200 particles, or as many as ``--particles`` says.  ``--set`` changes the
-configuration with which movies are drawn and analysed, as of optics that change over the field.
+block of 400 frames has 200 particles, or as many as ``--particles`` says.
+
+``--set`` changes the configuration with which all movies are drawn and analysed, as of optics that
+change over the field.
 
 Without options, the default takes less than ten minutes on two idle cores; ``--full`` goes to
 1200 × 1920 pixels, 100 000 frames and 10 000 particles.  ``--quick`` judges nothing.
@@ -92,7 +94,7 @@ class Cost:
     tiles: int
 
 
-def write_movie(job: Job, folder: Path, settings: Sequence[str] = ()) -> Path:
+def write_movie(job: Job, folder: Path, settings: Sequence[str]) -> Path:
     """Write a block of frames, and links to it."""
     rng = np.random.default_rng(1)
     config = load_config(CONFIG, settings)
@@ -140,7 +142,7 @@ def _particle(
     return landing, leaving, (slice(*spans[0]), slice(*spans[1])), image
 
 
-def measure(job: Job, folder: Path, memory_mb: int, settings: Sequence[str] = ()) -> Cost:
+def measure(job: Job, folder: Path, memory_mb: int, settings: Sequence[str]) -> Cost:
     """Analyse a movie in a process of its own."""
     with tempfile.TemporaryDirectory(dir=folder) as name:
         movie = write_movie(job, Path(name), settings)
@@ -330,7 +332,7 @@ def main() -> int:
     parser.add_argument("--particles", type=_numbers, help="in a block of the largest field")
     parser.add_argument("--sensor", type=_numbers, help="frames of two movies, as 2400,4800")
     parser.add_argument("--memory-mb", type=int, default=1000, help="compute.memory_limit_mb")
-    parser.add_argument("--set", action="append", default=[], help="of the sensor, as KEY=VALUE")
+    parser.add_argument("--set", action="append", default=[], help="of all movies, as KEY=VALUE")
     parser.add_argument("--keep", type=Path, help="folder for the movies while they are analysed")
     options = parser.parse_args()
     if options.keep is not None:
@@ -354,15 +356,16 @@ def main() -> int:
         bounds = limits(folder)
         small = options.fields[0]
         print("not counted, because it may compile:")
-        measure(Job(*small, 2 * BLOCK, 10), folder, options.memory_mb)
-        start = measure(Job(*small, BLOCK, 1), folder, options.memory_mb)
+        measure(Job(*small, 2 * BLOCK, 10), folder, options.memory_mb, options.set)
+        start = measure(Job(*small, BLOCK, 1), folder, options.memory_mb, options.set)
         found = {
-            along: [measure(job, folder, options.memory_mb) for job in jobs]
+            along: [measure(job, folder, options.memory_mb, options.set) for job in jobs]
             for along, jobs in series(options).items()
         }
         long = found["frames"][-1].job
-        alone = measure(Job(**{**asdict(long), "workers": 1}), folder, options.memory_mb)
-        divided = measure(long, folder, options.memory_mb // 4)
+        single = Job(**{**asdict(long), "workers": 1})
+        alone = measure(single, folder, options.memory_mb, options.set)
+        divided = measure(long, folder, options.memory_mb // 4, options.set)
     every = [start, *(cost for costs in found.values() for cost in costs), divided]
     slopes = {along: slope(costs, along, start.processor_s) for along, costs in found.items()}
     price, errors = prices(every)

@@ -83,7 +83,6 @@ def plan(
     *,
     model: ForwardModel | None = None,
     scale: MassScale | None = None,
-    like: ForwardModel | None = None,
 ) -> Experiment:
     """Set up the experiment of ``[bounds]``."""
     at = config.bounds
@@ -100,7 +99,7 @@ def plan(
         reach = math.hypot(half + abs(at.x_nm), half + abs(at.y_nm)) * 1.0001
         optics = config if scale is None else config.model_copy(update={"calibration": None})
         highest = max(height, config.particle.nominal_height_nm)
-        model = forward_model(optics, reach, z_max_nm=highest, like=like)
+        model = forward_model(optics, reach, z_max_nm=highest)
         model = replace(model, z_range_nm=(height, height))  # one height needs no more
         model = model if scale is None else replace(model, scale=scale)
     mass = model.material.mass_kda

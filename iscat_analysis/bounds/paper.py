@@ -192,7 +192,7 @@ def _curves(
     over_z = panels[0] in ("2b", "4a", "4b")
     photons = photons_of_authors(scheme, attenuation) if convention == "dong2021" else None
     axis = HEIGHTS_NM if over_z else FOCI_NM
-    points, like = [], None
+    points = []
     for value in axis:
         config = paper_config(
             scheme,
@@ -201,9 +201,7 @@ def _curves(
             focus_nm=FOCUS_NM if over_z else value,
             attenuation=attenuation,
         )
-        experiment = plan(config, like=like)
-        points.append(_point(experiment, photons))
-        like = experiment.model
+        points.append(_point(plan(config), photons))
     single = np.array([p.single for p in points])
     joint = np.array([p.joint for p in points])
     quantities: dict[str, list[tuple[str, FloatArray]]] = {

@@ -29,7 +29,7 @@ from iscat_analysis.threads import threads
 FloatArray = NDArray[np.float64]
 
 STRETCH = 16
-"""Neighbouring points that one thread does in a row, handing tables on."""
+"""Neighbouring points that one thread does in a row: the tables of one serve the next."""
 
 MAX_POINTS = 100_000
 """Points of a scan at most."""
@@ -207,12 +207,7 @@ def scan(config: Config, axis: Axis, values: FloatArray, *, progress: Progress =
         model = replace(model, z_range_nm=(min(heights), max(heights)))
 
     def stretch(part: list[Config]) -> list[dict[str, Any]]:
-        found, like = [], None
-        for one in part:
-            experiment = plan(one, model=model, scale=scale, like=like)
-            found.append(_row(experiment, free))
-            like = experiment.model
-        return found
+        return [_row(plan(one, model=model, scale=scale), free) for one in part]
 
     rows: list[dict[str, Any]] = []
     parts = [plans[i : i + STRETCH] for i in range(0, len(plans), STRETCH)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -27,14 +26,12 @@ from iscat_analysis.optics.parameters import Settings, heights_free, settings_of
 from iscat_analysis.records import Mapper
 
 
-def build_microscope(
-    config: Config, reach_nm: float, settings: Settings, *, like: ForwardModel | None = None
-) -> ForwardModel:
+def build_microscope(config: Config, reach_nm: float, settings: Settings) -> ForwardModel:
     """Make the forward model of other optics, with the model's own mass scale."""
     changed = with_settings(config, settings).model_copy(update={"calibration": None})
     seated = not heights_free(config) and not config.particle.height_is_open
     highest = config.particle.nominal_height_nm if seated else None
-    return forward_model(changed, reach_nm, z_max_nm=highest, like=like)
+    return forward_model(changed, reach_nm, z_max_nm=highest)
 
 
 RINGS_NM = 9000.0
@@ -72,13 +69,9 @@ def refuse_uncalibratable(config: Config) -> None:
 
 def microscopes(config: Config, reach_nm: float) -> Callable[[Settings], ForwardModel]:
     """Make models of changing optics, and keep the last few."""
-    latest = threading.local()  # neighbours in a search often share their tables
 
     def model(items: tuple[tuple[str, Any], ...]) -> ForwardModel:
-        like = getattr(latest, "model", None)
-        found = build_microscope(config, reach_nm, dict(items), like=like)
-        latest.model = found
-        return found
+        return build_microscope(config, reach_nm, dict(items))
 
     at_hand = memoize(_MODELS_KEPT, model)
     return lambda settings: at_hand(tuple(settings.items()))

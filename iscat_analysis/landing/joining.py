@@ -71,11 +71,9 @@ def _own_rows(tiles: Sequence[Tile], done: Sequence[FinishedChunk]) -> list[int]
         tile.holds(part.lines["y_px"].to_numpy(float), part.lines["x_px"].to_numpy(float))
         for tile, part in zip(tiles, done, strict=True) if len(part.lines)
     ])  # fmt: skip
-    same, kept = SameSteps(table), own.copy()
-    for stranger in np.flatnonzero(~own).tolist():
-        kept[stranger] = not kept[same.like(stranger)].any()
+    same = SameSteps(table)
+    chosen = np.flatnonzero(same.with_strangers(own, ~own))
     # two of one particle, each in its own core: the clearer one is kept
-    chosen = np.flatnonzero(kept)
     clear = chosen[np.argsort(-table["snr"].to_numpy(float)[chosen], kind="stable")]
     home = np.repeat(np.arange(len(tables)), [len(each) for each in tables])
     taken = np.zeros(len(table), dtype=np.bool_)

@@ -123,9 +123,7 @@ class MergedChunks:
         finished = np.zeros(len(table), dtype=np.bool_)
         for done in self._done:
             finished |= (frame >= done.core[0]) & (frame < done.core[1])
-        same, kept = SameSteps(table), own.copy()
-        for stranger in np.flatnonzero(~own & finished).tolist():
-            kept[stranger] = not kept[same.like(stranger)].any()
+        kept = SameSteps(table).with_strangers(own, ~own & finished)
         y, x = (table[name].to_numpy(float) for name in ("y_nm", "x_nm"))
         order = sorted(np.flatnonzero(kept).tolist(), key=lambda i: (frame[i], y[i], x[i]))
         views, repeats = [], []
@@ -261,3 +259,13 @@ class SameSteps:
         away = np.hypot(self._x[others] - self._x[one], self._y[others] - self._y[one])
         near &= (away < SEAM_PX) & (self._mass[others] * self._mass[one] > 0) & (others != one)
         return np.asarray(others[near])
+
+    def with_strangers(self, own: BoolArray, strangers: BoolArray) -> BoolArray:
+        """Add to some rows those strangers whose step none of them describes.
+
+        Shapes: `own, strangers` (n,), result (n,).
+        """
+        kept = own.copy()
+        for one in np.flatnonzero(strangers).tolist():
+            kept[one] = not kept[self.like(one)].any()
+        return kept

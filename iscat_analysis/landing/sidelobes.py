@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import near_earlier_peaks
 from iscat_analysis.landing.neighbours import Step
@@ -51,10 +50,10 @@ class SidelobeFilter:
             away = np.hypot(there[:, 0] - peak.x_px, there[:, 1] - peak.y_px)
             order = np.argsort(away, kind="stable")
             order = order[: np.searchsorted(away[order], LARGEST_IMAGE * self.roi_px, "right")]
-            near = [(steps[int(met[i])], float(away[i])) for i in order]
-            if any(self._is_residue(step, distance, peak) for step, distance in near):
+            near = [(steps[met[i]], away[i].item(), i) for i in order.tolist()]
+            if any(self._is_residue(step, distance, peak) for step, distance, _ in near):
                 continue
-            size = self._left_over(peak, near, order, there, snr)
+            size = self._left_over(peak, near, there, snr)
             if abs(peak.snr) > size:
                 fresh.append(peak)
             elif not is_hidden(peak.snr, size):
@@ -85,23 +84,23 @@ class SidelobeFilter:
     def _left_over(
         self,
         peak: Peak,
-        near: Sequence[tuple[Step, float]],
-        order: NDArray[np.int64],
+        near: Sequence[tuple[Step, float, int]],
         places: FloatArray,
         snr: MapArray,
     ) -> float:
         """Signal-to-noise ratio that a peak must have not to be a residual of the fits.
 
-        The nearest steps are tried first; the search ends with one whose residual is higher than
-        the peak.
+        The nearest steps, each with its distance and its index among the places of all, are tried
+        first; the search ends with one whose residual is higher than the peak.
 
-        Shapes: `order` (k,), of those near among the `places` (n, 2), `snr` (n, y, x).
+        Shapes: `places` (n, 2), `snr` (n, y, x).
         """
         size = max(
-            (self._inside(step, peak) for step, away in near if away < self.roi_px / 2), default=0.0
+            (self._inside(step, peak) for step, away, _ in near if away < self.roi_px / 2),
+            default=0.0,
         )
         j = round((peak.frame - self.first) / self.stride) - 1
-        for i in order.tolist():
+        for _, _, i in near:
             if is_hidden(peak.snr, size):
                 break
             x, y = places[i].tolist()

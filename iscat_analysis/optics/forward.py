@@ -38,7 +38,7 @@ from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.sized import sized
 from iscat_analysis.optics.spheres import Sphere, sphere_of
-from iscat_analysis.optics.waves import RadialField, check_table, field_of
+from iscat_analysis.optics.waves import check_table, field_of
 from iscat_analysis.units import KILODALTON_KG, NM
 
 __all__ = [
@@ -72,7 +72,6 @@ def forward_model(
     *,
     z_max_nm: float | None = None,
     nodes: int | None = None,
-    like: ForwardModel | None = None,
 ) -> ForwardModel:
     """Build the forward model of a configuration."""
     optics = config.optics
@@ -116,10 +115,7 @@ def forward_model(
     if reference:
         factor *= cmath.exp(-1j * math.radians(optics.reference_phase_deg))
     fixed_oil_nm = -optics.focus_nm if optics.axial == "refocus" else oil_nm
-    before = like.wave if like else None
-    wave = field_of(
-        opening, factor, fixed_oil_nm, reach_nm, before if isinstance(before, RadialField) else None
-    )
+    wave = field_of(opening, factor, fixed_oil_nm, reach_nm)
     points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,

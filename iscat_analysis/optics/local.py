@@ -36,7 +36,7 @@ class LocalModels:
                 return model
             local = changed(optics, {base: n * STEPS[base] for base, n in steps})
             there = config.model_copy(update={"optics": local, "calibration": None})
-            return replace(forward_model(there, model.reach_nm, like=model), scale=model.scale)
+            return replace(forward_model(there, model.reach_nm), scale=model.scale)
 
         self._moved = memoize(kept, moved)
 

@@ -351,11 +351,7 @@ def axial_table(field: Field, z_range_nm: tuple[float, float]) -> AxialTable:
 
 
 def field_of(
-    opening: Aperture,
-    factor: complex,
-    oil_nm: float,
-    reach_nm: float,
-    like: RadialField | None = None,
+    opening: Aperture, factor: complex, oil_nm: float, reach_nm: float
 ) -> RadialField | LatticeField:
     """Tabulate the field of a pupil, as the pupil's symmetry and the light allow."""
     optics = opening.optics
@@ -368,13 +364,7 @@ def field_of(
     transverse = _in_fours(opening.pupil.transverse, "edge")
     step = STEP / (opening.wavenumber * optics.na)
     intervals = math.ceil(reach_nm / step) + 1
-    same = (
-        like is not None
-        and like.step_nm == step
-        and like.reach_nm >= reach_nm
-        and np.array_equal(like.transverse, transverse)
-    )
-    table = like.table if same and like else _bessel_table(transverse, step, intervals)
+    table = _bessel_table(transverse, step, intervals)
     return RadialField(
         source, axial, transverse, table, step, math.radians(optics.polarization_deg),
         optics.polarization == "circular", optics.analyzer,

@@ -322,7 +322,6 @@ class _Setups:
         if focus_nm not in self._models:
             optics = self._config.optics.model_copy(update={"focus_nm": focus_nm})
             config = self._config.model_copy(update={"optics": optics, "calibration": None})
-            like = next(iter(self._models.values()), None)
-            model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm, like=like)
+            model = forward_model(config, self._reach_nm, z_max_nm=self._highest_nm)
             self._models[focus_nm] = replace(model, scale=self._scale)
         return self._models[focus_nm]

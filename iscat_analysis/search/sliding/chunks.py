@@ -41,7 +41,6 @@ from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, FieldSums, Tile
 NOISE_FRAMES = 800
 """Frames on which the noise is judged, and the windows are chosen."""
 
-
 _LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
 MEMORY_SHARE = 0.32  # of compute.memory_limit_mb that the stored counts may take
 _AT_ONCE_BYTES = 2**26  # of frames that are looked at together where not all fit into memory

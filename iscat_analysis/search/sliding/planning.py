@@ -16,6 +16,7 @@ from iscat_analysis.threads import threads
 
 HALO = 2
 """Windows on either side of a chunk's core: a step, its neighbours, and theirs."""
+
 _FIRST_LONGER = 1.24  # than others, of a chunk that is summed before they are begun
 _SPAN_BYTES = 6e9  # of the frames of a chunk of a large field: they stay in the system's cache
 _CONTROLLED = 16  # tiles of a movie, or some more, tell enough of the noise where nothing lands
