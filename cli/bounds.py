@@ -284,9 +284,9 @@ def _target(config: Config, text: str) -> dict[str, Any]:
             "effort": [asdict(entry) for entry in effort(config, goal)],
             "budget": [asdict(line) for line in budget(config, goal.parameter)],
             "note": ""
-            if config.camera.samples_per_pixel > 1
+            if config.camera.samples_per_pixel != 1
             else "camera.samples_per_pixel = 1 samples pixels at their centres and hides what they "
-            "cost: --set camera.samples_per_pixel=4",
+            "cost: leave it out",
         }
     }
 

@@ -22,7 +22,7 @@ GOLD = {"kind": "gold", "permittivity": (-3.7328, 2.7725), "diameter_nm": 30.0}
 
 
 def golden_config(case: dict[str, Any], mode: str = "joint") -> Config:
-    """One golden case as `iscat bounds` would be given it."""
+    """One golden case as `iscat bounds` would be given it; its light is that at pixel centres."""
     dark = case["attenuation"] == 0
     keys = ("wavelength_nm", "na", "n_immersion", "n_glass", "n_sample", "emission", "focus_nm")
     return parse_config(
@@ -33,7 +33,7 @@ def golden_config(case: dict[str, Any], mode: str = "joint") -> Config:
                 "attenuation": 1.0 if dark else case["attenuation"],
                 "axial": case["axial"],
             },
-            "camera": {"pixel_size_nm": case["fov_nm"] / case["pixels"]},
+            "camera": {"pixel_size_nm": case["fov_nm"] / case["pixels"], "samples_per_pixel": 1},
             "particle": {
                 "kind": "gold",
                 "permittivity": tuple(case["permittivity"]),
@@ -52,10 +52,10 @@ def golden_config(case: dict[str, Any], mode: str = "joint") -> Config:
 
 
 def small_config(**sections: dict[str, Any]) -> Config:
-    """D21's microscope with 30 nm gold, changed as asked; 41 × 41 pixels of 50 nm."""
+    """D21's microscope with 30 nm gold, changed as asked; 41 × 41 points 50 nm apart."""
     values: dict[str, dict[str, Any]] = {
         "optics": {**PAPER, "focus_nm": 300.0},
-        "camera": {"pixel_size_nm": 50.0},
+        "camera": {"pixel_size_nm": 50.0, "samples_per_pixel": 1},
         "particle": {**GOLD, "height_nm": 100.0},
         "bounds": {"pixels": 41, "n_before": 0, "n_after": 1},
         "fit": {"mode": "joint"},

@@ -295,7 +295,7 @@ def warnings_of(experiment: Experiment) -> list[str]:
     if experiment.on_camera > (1 + LOST_LIGHT) * experiment.collected:
         lines.append(
             f"pixels of {experiment.grid.pixel_nm:g} nm sampled at their centres count more light "
-            "than was collected: set camera.samples_per_pixel = 4"
+            'than was collected: set camera.samples_per_pixel = "auto"'
         )
     return lines
 

@@ -105,7 +105,10 @@ def paper_config(
                 "convention": convention, "axial": "refocus" if authors else "stage",
                 **(optics or {}),
             },
-            "camera": {"pixel_size_nm": FIELD_NM / (PIXELS - 1 if authors else PIXELS)},
+            "camera": {  # the paper samples the light at the centres of pixels
+                "pixel_size_nm": FIELD_NM / (PIXELS - 1 if authors else PIXELS),
+                "samples_per_pixel": 1,
+            },
             "particle": {**PARTICLE, "height_nm": z_nm},
             "bounds": {
                 "pixels": PIXELS, "n_before": 0, "n_after": 1, "photons_per_pixel": 1.0,

@@ -275,8 +275,13 @@ class CameraConfig(Section):
     )
     exposure_ms: Positive | None = Field(None, description="absent: taken from the metadata")
     frame_rate_hz: Positive | None = Field(None, description="absent: taken from the metadata")
-    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(
-        1, description="per axis, to integrate over pixels; 1 = point sampling at pixel centres"
+    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = Field(
+        "auto",
+        description='along each axis, to integrate over pixels: 1 to 9 | "auto": as many as are '
+        "needed, or those of the calibration's standards; 1: the light at the centre",
+    )
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = Field(
+        1.0, description="share of a pixel's area that detects light, a square at its centre"
     )
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -19,7 +19,12 @@ class StandardsCamera(Section):
     """The detector with which the standards of a calibration were recorded."""
 
     pixel_size_nm: Positive | None = Field(None, description="in the sample plane")
-    samples_per_pixel: Annotated[int, Field(ge=1, le=9)] = Field(1, description="per axis")
+    samples_per_pixel: Literal["auto"] | Annotated[int, Field(ge=1, le=9)] = Field(
+        1, description="along each axis, with which the standards were analysed"
+    )
+    fill_factor: Annotated[float, Field(gt=0, le=1)] = Field(
+        1.0, description="share of a pixel's area that detects light"
+    )
     gain_e_per_adu: Positive | None = Field(
         None, description="photoelectrons per count, where it is one number"
     )

@@ -17,7 +17,7 @@ from iscat_analysis.config.analysis import (
     PosteriorConfig,
     TrackConfig,
 )
-from iscat_analysis.config.instrument import CameraConfig, Optics, Particle
+from iscat_analysis.config.instrument import AUTO, CameraConfig, Optics, Particle
 from iscat_analysis.config.scale import Calibration, Uncertainty
 from iscat_analysis.config.synthetic import BoundsConfig, Simulation
 from iscat_analysis.config.values import ALL, LARGEST_NM, Section, unit_guess
@@ -77,6 +77,14 @@ class Config(Section):
                 'background.method = "tracks" needs an interferometric scheme: dark field needs '
                 "background.frames"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _pixels_of_the_standards(self) -> Config:
+        line, camera = self.calibration, self.camera
+        if line is not None and line.camera is not None and camera.samples_per_pixel == AUTO:
+            update = {"samples_per_pixel": line.camera.samples_per_pixel}
+            self.__dict__["camera"] = camera.model_copy(update=update)
         return self
 
     @model_validator(mode="after")

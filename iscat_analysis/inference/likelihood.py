@@ -115,12 +115,11 @@ class Likelihood:
         if self.model.is_sized:  # each mass has its own picture
             out[inside] = [self._terms(point).value for point in points[inside]]
             return out
-        if inside.all():
-            value_batch(self._table(points[:, 2]), *self._arguments, points, out)
-        else:
-            known = np.empty(int(inside.sum()))
-            value_batch(self._table(points[inside, 2]), *self._arguments, points[inside], known)
-            out[inside] = known
+        known = points if inside.all() else points[inside]
+        values = np.empty(len(known))
+        lens, table = self._table(known)
+        value_batch(table, lens, *self._arguments[1:], known, values)
+        out[inside] = values
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
         if self.prior is not None:
             out += self.prior.log_density(points[:, 2])
@@ -344,11 +343,14 @@ class Likelihood:
             f"{self.model.reach_nm:.0f} nm from the particle to the farthest pixel"
         )
 
-    def _table(self, heights_nm: FloatArray) -> AxialTable:
+    def _table(self, thetas: FloatArray) -> tuple[Lens, AxialTable]:
         """Profiles along z, or at the particle's fixed height where no other is asked for."""
-        fixed = self.model.height_nm
-        at_it = bool(np.all(heights_nm == fixed))
-        return self.model.height_table(fixed) if at_it else self.model.axial_table
+        model, fixed = self.model, self.model.height_nm
+        if not np.all(thetas[:, 2] == fixed):
+            return model.lens, model.axial_table
+        if self.is_pictured(fixed, thetas.min(0), thetas.max(0)):
+            return model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
+        return model.lens, model.height_table(fixed)
 
     @cached_property
     def _support(self) -> tuple[FloatArray, FloatArray, float, float, float, float, float]:

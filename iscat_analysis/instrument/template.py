@@ -328,8 +328,7 @@ def fit_picture(
     side = max(images[0].grid.shape) * pixel
     waves = _Waves.within(1.2 / step_nm, side + 2 * (_FADE_NM + _ROOM_NM))
     own = list(images)
-    offsets, weights = nominal.samples
-    blur = (offsets * pixel, weights)
+    blur = nominal.area.points(pixel)
     coefficients, scale = np.zeros(2 * waves.qx.size - 1), peak_per_amplitude(nominal)
     prior = np.eye(coefficients.size)
     used, moved = 0, math.inf
@@ -345,8 +344,9 @@ def fit_picture(
         covariance = covariance / size**2
         prior = _prior(waves, coefficients, covariance, step_nm)
         template = _template(
-            waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm
-        )
+            waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm,
+            freed=0.0 if blur[0].size == 1 else nominal.area.side,
+        )  # fmt: skip
         model = with_template(nominal, template)
         own = list(mapper(lambda s, m=model: fit_own(s, m, level=level), own))
         moved = float(np.linalg.norm(coefficients - before) / np.sqrt(np.trace(covariance)))
@@ -474,6 +474,7 @@ def _template(
     roi_nm: float,
     side_nm: float,
     step_nm: float,
+    freed: float,
 ) -> Template:
     """Sample the picture on its lattice; beyond what was seen it fades."""
     count = math.ceil((side_nm / 2 + _FADE_NM) / step_nm)
@@ -496,4 +497,5 @@ def _template(
         roi_nm=roi_nm,
         peak_se=float(np.sqrt(rest @ covariance @ rest)),
         sights=len(images),
+        side=freed,
     )

@@ -34,6 +34,7 @@ from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.measured import MeasuredField, Template, sha256_of
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.model import ForwardModel
+from iscat_analysis.optics.pixels import PixelArea
 from iscat_analysis.optics.rods import Rod, rod_of
 from iscat_analysis.optics.scale import MassScale, carry_refusal
 from iscat_analysis.optics.sized import sized
@@ -116,7 +117,6 @@ def forward_model(
         factor *= cmath.exp(-1j * math.radians(optics.reference_phase_deg))
     fixed_oil_nm = -optics.focus_nm if optics.axial == "refocus" else oil_nm
     wave = field_of(opening, factor, fixed_oil_nm, reach_nm)
-    points, weights = np.polynomial.legendre.leggauss(config.camera.samples_per_pixel)
     model = ForwardModel(
         optics=optics,
         material=matter,
@@ -130,7 +130,7 @@ def forward_model(
         strength=strength,
         reach_nm=wave.reach_nm,
         z_range_nm=(min(config.fit.z_range_nm[0], height, _lowest_nm(config)), z_max_nm),
-        samples=(points / 2, weights / 2),
+        area=PixelArea.of(config.camera, optics),
     )
     if sphere is not None:
         model = sized(model, sphere, config.fit.diameter_range_nm)
@@ -146,7 +146,10 @@ def forward_model(
 def with_template(model: ForwardModel, template: Template) -> ForwardModel:
     """Replace the computed image by a measured one."""
     wave = MeasuredField(template, peak_per_amplitude(model), model.reach_nm)
-    return replace(model, wave=wave, scale=MassScale())
+    area = replace(model.area, side=template.side)
+    if not template.side:  # its picture is that of the pixels
+        area = replace(area, samples=1)
+    return replace(model, wave=wave, area=area, scale=MassScale())
 
 
 def peak_per_amplitude(model: ForwardModel) -> float:

@@ -32,14 +32,18 @@ FloatArray = NDArray[np.float64]
 
 _MOST_LATTICES = 4  # cached lattices, one for each number of orders
 _AXIAL_RATE = 1e-3  # a rate [rad/nm] for tables along z, although nothing changes along z
-_STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights")
+_STORED = ("contrast", "sigma", "step_nm", "pixel_nm", "roi_nm", "peak_se", "sights", "side")
 _LARGEST_NUMBER = 1e9  # of its numbers
 _SAME_PIXEL = 1e-3  # relative difference of pixel sizes that is rounding
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The measured contrast of a faint particle."""
+    """The measured contrast of a faint particle, as pixels would see it that are points.
+
+    `side` is that of the pixels' active square over their spacing, of which the picture was freed;
+    0 in files of versions that did not do that, whose picture is used as it is.
+    """
 
     contrast: FloatArray
     sigma: FloatArray
@@ -48,6 +52,7 @@ class Template:
     roi_nm: float
     peak_se: float
     sights: int
+    side: float = 1.0
 
     def to_bytes(self) -> bytes:
         """Give the content of an ``.npz`` file, the same bytes for the same template."""
@@ -88,8 +93,10 @@ def sha256_of(content: bytes) -> str:
 @lru_cache(_MOST_LATTICES)
 def _parsed(name: str, content: bytes) -> Template:
     try:
-        values: dict[str, Any] = dict(npz_of(content, _STORED, LARGEST_TEMPLATE_BYTES))
-        for key in _STORED[2:-1]:
+        stored = npz_of(content, (), LARGEST_TEMPLATE_BYTES)
+        values: dict[str, Any] = {key: stored[key] for key in _STORED if key != "side"}
+        values["side"] = stored.get("side", 0.0)
+        for key in _STORED[2:]:
             values[key] = float(values[key])
         values["sights"] = int(values["sights"])
         picture, error = values["contrast"], values["sigma"]
@@ -98,10 +105,12 @@ def _parsed(name: str, content: bytes) -> Template:
             raise ValueError("no picture")
         if not all(bool((np.abs(number) <= _LARGEST_NUMBER).all()) for number in numbers):
             raise ValueError("no numbers")
+        if not 0 <= values["side"] <= 1:
+            raise ValueError("no share")
         if not min(values["step_nm"], values["pixel_nm"], values["roi_nm"]) > 1 / _LARGEST_NUMBER:
             raise ValueError("no lengths")
         values["contrast"], values["sigma"] = picture.astype(float), error.astype(float)
-    except (ValueError, TypeError, OverflowError):
+    except (KeyError, ValueError, TypeError, OverflowError):
         raise ConfigError(
             f"{name}: is no template of `iscat calibrate optics --measured`"
         ) from None

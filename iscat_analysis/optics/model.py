@@ -28,6 +28,7 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.materials import Material
 from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.memoize import memoize
+from iscat_analysis.optics.pixels import PixelArea
 from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.sensitivity import (
     check_names,
@@ -59,7 +60,7 @@ class ForwardModel:
     strength: complex
     reach_nm: float
     z_range_nm: tuple[float, float]
-    samples: tuple[FloatArray, FloatArray]
+    area: PixelArea
     scale: MassScale = field(default_factory=MassScale)
 
     @property
@@ -103,8 +104,7 @@ class ForwardModel:
 
     def pixels(self, grid: PixelGrid) -> Pixels:
         """Return a grid with the samples inside its pixels, as the kernels take them."""
-        offsets, weights = self.samples
-        return Pixels(grid.x_nm, grid.y_nm, offsets * grid.pixel_nm, weights)
+        return Pixels(grid.x_nm, grid.y_nm, *self.area.points(grid.pixel_nm))
 
     @property
     def fringe_nm(self) -> float:

@@ -23,6 +23,7 @@ import numpy as np
 from iscat_analysis._kernels.image import Pixels, signal_image
 from iscat_analysis._kernels.lattice import DEGREE, TAPS
 from iscat_analysis._kernels.lens import StampLens
+from iscat_analysis.optics.pixels import bandwidth
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
@@ -42,9 +43,7 @@ _POINTS = 24  # of the quadrature over each band
 
 def samples_per_pixel(optics: Optics, pixel_nm: float, band: float = BAND) -> int:
     """Give how many samples per pixel the image needs along each axis."""
-    bandwidth = 2 * math.pi / optics.wavelength_nm * optics.na
-    bandwidth *= 2 if optics.scheme == "darkfield" else 1
-    return max(1, math.ceil(bandwidth * pixel_nm / band))
+    return max(1, math.ceil(bandwidth(optics) * pixel_nm / band))
 
 
 def margin_nm(optics: Optics, pixel_nm: float) -> float:
@@ -63,8 +62,7 @@ def sample_picture(
     step = pixel_nm / fine
     half = math.ceil(half_px * fine) + TAPS
     nodes = np.asarray(step * np.arange(-half, half + 1), dtype=np.float64)
-    offsets, weights = model.samples
-    offsets = np.asarray(offsets * pixel_nm)
+    offsets, weights = model.area.points(pixel_nm)
     profile = model.profile(model.height_nm, 1)
     # as strong as the reference, so that neither P nor Q is lost in the rounding of the other
     z = 1 / math.sqrt(model.wave.peak(model.height_nm, 1.0, model.rho)[1])

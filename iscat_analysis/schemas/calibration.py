@@ -104,7 +104,8 @@ class StandardsCamera(Closed):
     """The camera of the standards."""
 
     pixel_size_nm: NotNegative = maybe("Pixel side [nm]")
-    samples_per_pixel: Count = key("Samples per pixel, per axis")
+    samples_per_pixel: Literal["auto"] | Count = key("Samples per pixel, per axis")
+    fill_factor: Share = key("Share of a pixel's area that detects light")
     gain_e_per_adu: NotNegative = maybe("Photoelectrons per count, where it is one number")
     offset_adu: float = maybe("Counts in the dark, where they are one number")
 

@@ -114,7 +114,7 @@ def _of_the_paper(scheme: str, kind: str) -> Part:
         _PLAIN,
         {
             "optics": {**OPTICS, "scheme": scheme, "attenuation": attenuation, "focus_nm": 300.0},
-            "camera": {"pixel_size_nm": 60.0},
+            "camera": {"pixel_size_nm": 60.0, "samples_per_pixel": 1},
             "fit": {"mode": "joint", "z_range_nm": [0.0, 250.0]},
             "bounds": {"photons_per_pixel": photons, "n_before": 0, "pixels": 45},
         },

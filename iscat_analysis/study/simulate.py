@@ -132,6 +132,7 @@ class Movie:
         self._model = forward_model(
             config, reach, z_max_nm=max([config.particle.nominal_height_nm, *heights])
         )
+        self._inside = self._model.area.points(self._pixel_nm)
         self._local = None
         if terms_of(config.optics):
             if not all(p.still for p in self.movers):
@@ -186,7 +187,7 @@ class Movie:
 
     def _without_movers(self) -> Iterator[_Still]:
         """Yield what every frame has in common with the one before, until that changes."""
-        q = self._model.samples[1].size
+        q = self._inside[1].size
         rows, columns = self._grid.shape
         field = np.zeros((self._components, rows * q, columns * q), dtype=complex)
         present: dict[int, ComplexArray] = {}
@@ -271,7 +272,7 @@ class Movie:
 
     def _in_pixels(self, intensity: FloatArray) -> FloatArray:
         """Average over the samples inside each pixel."""
-        weights = self._model.samples[1]
+        weights = self._inside[1]
         rows, columns = self._grid.shape
         inside = intensity.reshape(rows, weights.size, columns, weights.size)
         return np.asarray(np.einsum("yixj,i,j->yx", inside, weights, weights))
@@ -332,7 +333,7 @@ class Movie:
         self, x_nm: float, y_nm: float, z_nm: float, mass_kda: float, frame: int | None = None
     ) -> ComplexArray:
         """Field of a particle in the sample, on the samples inside each pixel."""
-        offsets = self._model.samples[0] * self._pixel_nm
+        offsets = self._inside[0]
         x = (self._grid.x_nm[:, None] + offsets).ravel() - x_nm
         y = (self._grid.y_nm[:, None] + offsets).ravel() - y_nm
         dx, dy = np.meshgrid(x, y)

@@ -62,6 +62,10 @@ def test_optimize_and_target(capsys: pytest.CaptureFixture[str]) -> None:
     assert status == 0
     for word in ("frames after", "never enough", "shot noise", "finite background", "read noise"):
         assert word in out
+    assert "samples_per_pixel" not in out
+    points = ("--set", "camera.samples_per_pixel=1")
+    status, out, _ = run(capsys, "--mode", "joint", "--target", "mass=5kDa", *points)
+    assert status == 0
     assert "samples_per_pixel" in out
 
 

@@ -241,7 +241,7 @@ def test_saturation_and_coarse_sampling_are_said() -> None:
     coarse = plan(
         protein(camera={"pixel_size_nm": 800.0, "samples_per_pixel": 1}, bounds={"pixels": 5})
     )
-    assert any("samples_per_pixel = 4" in line for line in warnings_of(coarse))
+    assert any('samples_per_pixel = "auto"' in line for line in warnings_of(coarse))
     assert warnings_of(plan(protein())) == []
 
 

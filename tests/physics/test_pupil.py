@@ -87,7 +87,7 @@ def golden(case: dict[str, Any]) -> Config:
     return parse_config(
         {
             "optics": {key: case[key] for key in OPTICS},
-            "camera": {"pixel_size_nm": case["pixel_nm"]},
+            "camera": {"pixel_size_nm": case["pixel_nm"], "samples_per_pixel": 1},
             "particle": {
                 "kind": "gold", "permittivity": tuple(case["permittivity"]),
                 "diameter_nm": 2 * case["radius_nm"], "height_nm": case["z_nm"],

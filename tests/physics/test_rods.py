@@ -126,7 +126,9 @@ def test_a_round_rod_is_a_dipole(polarization: str) -> None:
     [("iscat", "linear", 1.42), ("iscat", "circular", 1.42), ("cobri", "linear", 1.2)],
 )
 def test_the_picture_is_a_sum_over_rays(scheme: str, polarization: str, na: float) -> None:
-    config = of(optics={"scheme": scheme, "polarization": polarization, "na": na})
+    points = {"samples_per_pixel": 1}  # where the rays are summed
+    optics = {"scheme": scheme, "polarization": polarization, "na": na}
+    config = of(optics=optics, camera=points)
     model = model_of(config)
     height, ratio = config.particle.nominal_height_nm, config.particle.aspect_ratio or 1.0
     signal = model.image(GRID, 40.0, -70.0, 60.0, model.material.mass_kda)

@@ -125,7 +125,8 @@ def test_the_picture_is_a_sum_over_rays(
     permittivity = [float((index**2).real), float(np.imag(index**2))]
     particle = {"kind": "custom", "permittivity": permittivity, "density_kg_m3": 2000.0,
                 "diameter_nm": diameter}  # fmt: skip
-    config = of(scheme, optics={"na": na}, particle=particle)
+    points = {"samples_per_pixel": 1}  # where the rays are summed
+    config = of(scheme, optics={"na": na}, particle=particle, camera=points)
     model = model_of(config)
     signal = model.image(GRID, 40.0, -70.0, 130.0, model.material.mass_kda)
     height = config.particle.nominal_height_nm

@@ -227,14 +227,15 @@ def test_a_fit_finds_the_averaged_place_and_loses_mass(d: float, lost: float) ->
     """Frames without noise, fitted without blur.
 
     A blur of variance D e/3 along each axis takes 1.25 % of the mass at 0.15 µm²/s and 6.47 % at
-    0.8: the share of the sharp picture in the blurred one.  Single frames are blurred more or less.
+    0.8: the share of the sharp picture in the blurred one, at points.  Single frames are blurred
+    more or less.
     There is so much light that the bias of order 1/N, which a fit takes off, does not matter.
     """
     frames, side, light = 60, 29, 1e8
     kind = {"d_um2_s": d, "x_px": 24.0, "y_px": 24.0, "confinement_nm": 1500.0}
     config = _config(
         {"movers": [kind], "frames": frames, "shape": [48, 48], "photons_per_pixel": light},
-        camera={"gain_e_per_adu": 1e4},
+        camera={"gain_e_per_adu": 1e4, "samples_per_pixel": 1},
     )
     movie = Movie(config, 3)
     truth = movie.truth

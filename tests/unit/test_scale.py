@@ -51,7 +51,7 @@ def _recorded(**optics: Any) -> dict[str, Any]:
     return {
         "calibration.optics": {"focus_nm": -300.0, **optics},
         "calibration.height_nm": 5.0,
-        "calibration.camera": {"pixel_size_nm": PIXEL_NM},
+        "calibration.camera": {"pixel_size_nm": PIXEL_NM, "samples_per_pixel": "auto"},
     }
 
 

@@ -176,7 +176,7 @@ def test_fields_add_before_they_are_squared() -> None:
     """Two strong particles near each other interfere; their images do not simply add."""
     gold = {"kind": "gold", "mass_kda": None, "diameter_nm": 60.0}
     events = [EVENT, EVENT | {"x_px": 19.0}]
-    options = {"calibrated": False, "particle": gold}
+    options = {"calibrated": False, "particle": gold, "camera": {"samples_per_pixel": 1}}
     both, one, two = (
         list(Movie(_config({"events": chosen}, **options), 1).expected_frames())[5] / 1e4
         for chosen in (events, events[:1], events[1:])

@@ -71,6 +71,7 @@ def standards_of(config: Config) -> Standards:
         camera=StandardsCamera(
             pixel_size_nm=camera.pixel_size_nm,
             samples_per_pixel=camera.samples_per_pixel,
+            fill_factor=camera.fill_factor,
             gain_e_per_adu=gain if isinstance(gain, float) else None,
             offset_adu=offset if isinstance(offset, float) else None,
         ),
