@@ -30,7 +30,7 @@ from iscat_analysis.diagnosis.camera_numbers import (
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import BoolArray, FloatArray, FrameSource, Windows
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Windows
 from iscat_analysis.search.sliding import (
     SHORTEST_MOVIE,
     NoiseCurve,
@@ -41,7 +41,7 @@ from iscat_analysis.search.sliding import (
     measure_noise,
     well_lit,
 )
-from iscat_analysis.search.sliding.chunks import NOISE_FRAMES, Reader
+from iscat_analysis.search.sliding.chunks import NOISE_FRAMES, Reader, reader_of
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import one_thread_algebra
 
@@ -256,6 +256,21 @@ def survey_noise(reader: Reader, config: Config) -> NoiseSurvey:
         )
         noise = replace(noise, excess=ExcessNoise(ratio, message))
     return NoiseSurvey(reader, noise, curve, window, sample)
+
+
+def survey_over(
+    frames: CountSource,
+    config: Config,
+    camera: Camera,
+    span: tuple[int, int],
+    opening: NoiseSurvey | None = None,
+) -> NoiseSurvey:
+    """Judge the noise of a landing movie once, and read all of the movie where a part told it."""
+    if opening is None:
+        return survey_noise(reader_of(frames, config, camera, span), config)
+    if (opening.reader.first, opening.reader.last) == span:
+        return opening
+    return replace(opening, reader=reader_of(frames, config, camera, span))
 
 
 def judge_window(reader: Reader, config: Config) -> tuple[NDArray[Any], NoiseCurve, int]:

@@ -13,14 +13,13 @@ from importlib.metadata import version
 from typing import Any
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.learned import with_camera
-from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, SCAN_STEPS, calibrated
 from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_counts
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
@@ -338,24 +337,20 @@ def calibrate_movie(
 ) -> OpticsCalibration:
     """Measure the optics of an open movie."""
     groups = free_groups(free)
-    movie = movie.channel(config.camera.channels)
     if focus_step_nm is not None:
-        _check_step(focus_step_nm, movie.shape[0])
-    config, notes = resolve_metadata(config, movie.metadata)
-    for note in notes:
-        if notify is not None:
-            notify(note)
+        _check_step(focus_step_nm, movie.channel(config.camera.channels).shape[0])
     refuse_uncalibratable(config)
-    span = config.background.recorded or fitted_frames(movie, config)
-    movie, config, known = with_camera(movie, config, span)
-    camera = known.camera
+    steps = LIGHT_STEPS if focus_step_nm is None else SCAN_STEPS
+    ready = calibrated(movie, config, steps, warn=notify or notify_nobody)
+    movie, config, camera = ready.steady, ready.config, ready.camera
     with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)
         if focus_step_nm is not None:
             images = scan_particle_images(movie, config, camera)
             seen = Collected(config, images, focus_step_nm=focus_step_nm)
         else:
-            seen = Collected(config, *bright_particle_images(movie, config, camera, pool))
+            images = bright_particle_images(movie, config, camera, pool, ready.opening)
+            seen = Collected(config, *images)
         progress("particles", 1, 1)
         origin = {
             "movie": movie.path.name,
@@ -363,7 +358,8 @@ def calibrate_movie(
             "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
             "version": version("iscat-analysis"),
         }  # fmt: skip
-        return learned_from(seen, movie, config, camera, groups, origin, pool)
+        found = learned_from(seen, movie, config, camera, groups, origin, pool)
+    return replace(found, config=ready.with_frames_asked(found.config))
 
 
 def _check_step(step_nm: float, frames: int) -> None:

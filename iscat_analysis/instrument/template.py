@@ -22,12 +22,11 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.learned import with_camera
-from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
@@ -139,29 +138,23 @@ def measure_template(
     notify: Callable[[str], None] | None = None,
 ) -> MeasuredPicture:
     """Measure the picture of a particle in an open movie."""
-    movie = movie.channel(config.camera.channels)
-    config, notes = resolve_metadata(config, movie.metadata)
-    for note in notes:
-        if notify is not None:
-            notify(note)
     refuse_uncalibratable(config)
     if config.fit.mode != "mass":
         raise ConfigError(
             f'fit.mode = "{config.fit.mode}" needs the picture at every height, which --measured '
             'does not give: use fit.mode = "mass"'
         )
+    ready = calibrated(movie, config, warn=notify or notify_nobody)
+    movie, config, camera = ready.steady, ready.config, ready.camera
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel
     physics = config.optics.model_copy(update={"psf": "model", "template": None})
-    span = config.background.recorded or fitted_frames(movie, config)
-    movie, config, known = with_camera(movie, config, span)
-    camera = known.camera
     with threads(config.compute.workers) as pool:
         for number, margin in enumerate(MARGINS_PX):
             progress("particles", number, len(MARGINS_PX))
             larger = config.fit.model_copy(update={"roi_nm": roi_nm + 2 * margin * pixel})
             cut = config.model_copy(update={"fit": larger, "optics": physics, "calibration": None})
-            alone = _alone(*bright_particle_images(movie, cut, camera, pool))
+            alone = _alone(*bright_particle_images(movie, cut, camera, pool, ready.opening))
             if len(alone) >= _PLENTY:
                 break
         progress("particles", len(MARGINS_PX), len(MARGINS_PX))
@@ -185,8 +178,9 @@ def measure_template(
             "level": background_mode(config) == "sliding",
         }
         return _judged(
-            place_particle_images(alone, nominal), nominal, config, settings, source, pool.map
-        )
+            place_particle_images(alone, nominal), nominal, ready.with_frames_asked(config),
+            settings, source, pool.map,
+        )  # fmt: skip
 
 
 def _judged(

@@ -24,7 +24,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.camera.lines import Lines, SteadyFrames
 from iscat_analysis.config import LARGEST_SD_NM, Config, with_absolute_paths
-from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
+from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_over
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import FloodError
 from iscat_analysis.executors import Executor, LocalExecutor
@@ -43,7 +43,6 @@ from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.landing.step_maps import maps_are_local
 from iscat_analysis.records import CountSource, Progress, Status, silent
 from iscat_analysis.search.sliding import FieldSums, boundaries, stride_of
-from iscat_analysis.search.sliding.chunks import reader_of
 from iscat_analysis.search.sliding.planning import Part, plan_parts
 from iscat_analysis.threads import one_thread_algebra, start_in_thread, threads
 
@@ -150,12 +149,8 @@ def analyse_landings(
     stretches = stretches or ((first, last),)
     total = sum(stop - start for start, stop in stretches)
     frames = movie if lines is None else SteadyFrames(movie, lines, camera)
-    if opening is None:
-        reader = reader_of(frames, config, camera, (first, last))
-        opening = survey_noise(reader, config)
+    opening = survey_over(frames, config, camera, (first, last), opening)
     reader, noise, window = opening.reader, opening.noise, opening.window
-    if (reader.first, reader.last) != (first, last):  # it was surveyed in one stretch
-        reader = reader_of(frames, config, camera, (first, last))
     for text in noise.messages_of(movie.name):
         warn(text)
     stride = stride_of(window)

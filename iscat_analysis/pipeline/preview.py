@@ -1,7 +1,8 @@
 """The search of `analyse` in the frames that one is looking at, before a movie is analysed.
 
-The frames, windows, matched filter and threshold are those with which `analyse` begins; nothing is
-fitted.  The optics are the configured ones: learning them takes the whole movie.
+The frames, windows, matched filter and threshold are those with which `analyse` begins, because
+both prepare the movie by the same steps (`calibrated`); nothing is fitted.  The optics are the
+configured ones: learning them takes fits of particles.
 """
 
 from __future__ import annotations
@@ -9,15 +10,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 
-from iscat_analysis.camera.counts import Camera, camera_from_config, refuse_ratio
-from iscat_analysis.camera.learned import with_camera
-from iscat_analysis.camera.lines import Lines
-from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.light import judge_light
+from iscat_analysis.diagnosis.calibrated import calibrated
+from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
-from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.background_mode import BackgroundMode
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline.preview_searches import (
@@ -29,7 +26,7 @@ from iscat_analysis.pipeline.preview_searches import (
     positive_threshold,
 )
 
-_SEARCHES: Mapping[BackgroundMode, Callable[[Stack, Config, Camera, Lines | None], Search]] = {
+_SEARCHES: Mapping[BackgroundMode, Callable[[Prepared], Search]] = {
     "fixed": BeforeAfterSearch,
     "sliding": LandingSearch,
     "tracks": MovingSearch,
@@ -53,13 +50,11 @@ class Preview:
     Attributes
     ----------
     config : Config
-        With what the movie's metadata say.
+        With what the movie's metadata and its frames say.
     notes : tuple of str
-        What the metadata left to say, one line each.
-    camera : LearnedCamera
-        Its numbers, and where they come from.
-    steady : Stack
-        The frames with what is unsteady in their light divided out.
+        What an analysis would warn of before its search, one line each.
+    prepared : Prepared
+        The movie as an analysis prepares it: camera, light, the stretches of a movie that breaks.
 
     Raises
     ------
@@ -82,22 +77,11 @@ class Preview:
                 f"`movie` is {type(movie).__name__} and `config` {type(config).__name__}: give "
                 "what open_stack and configure return"
             )
-        movie = movie.channel(config.camera.channels)
-        config, notes = resolve_metadata(config, movie.metadata)
-        shape = (movie.shape[1], movie.shape[2])
-        stated = camera_from_config(config.camera, shape, movie.dtype)
-        refuse_ratio(movie.read(0, 1)[0], f"{movie.name}: frame 0", stated)
-        span = config.background.recorded or fitted_frames(movie, config)
-        movie, config, known = with_camera(movie, config, span)
-        camera = known.camera
-        self.config = config
-        self.camera = known
-        self.notes = (*movie.notes, *notes, *known.messages)
-        judged = judge_light(movie, config, camera)
-        self.steady = judged.steady
-        self._search = _SEARCHES[background_mode(config)](
-            judged.movie, config, camera, judged.lines
-        )
+        notes: list[str] = []
+        self.prepared = calibrated(movie, config, warn=notes.append)
+        self.config = self.prepared.over_all_stretches().config
+        self.notes = tuple(notes)
+        self._search = _SEARCHES[self.prepared.background_mode](self.prepared)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

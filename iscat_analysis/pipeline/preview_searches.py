@@ -13,10 +13,8 @@ import pandas as pd
 
 from iscat_analysis._kernels.sliding import contrast_map
 from iscat_analysis.camera.background import measure_windows, start_power
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
-from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import judge_background, survey_noise
+from iscat_analysis.diagnosis.noise import judge_background, survey_over
+from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context, reported_steps
 from iscat_analysis.fitting.field import search_field
@@ -24,7 +22,6 @@ from iscat_analysis.fitting.pattern import SPAN, corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
 from iscat_analysis.fitting.regions import contrast_image
 from iscat_analysis.landing.sidelobes import SidelobeFilter
-from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, silent
 from iscat_analysis.search.sliding import (
     STRIDES,
@@ -36,7 +33,6 @@ from iscat_analysis.search.sliding import (
     sliding_maps,
     stride_of,
 )
-from iscat_analysis.search.sliding.chunks import reader_of
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
@@ -126,28 +122,31 @@ class Search(Protocol):
 class LandingSearch:
     """Searches for particles that land or leave between two windows."""
 
-    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self.frames = first, last = fitted_frames(movie, config)
-        self.longest = (last - first) // 2
-        frames = movie if lines is None else SteadyFrames(movie, lines, camera)
-        self._config = config
-        self._reader = reader_of(frames, config, camera, (first, last))
-        opening = survey_noise(self._reader, config)
-        noise, self.window = opening.noise, opening.window
+    def __init__(self, ready: Prepared) -> None:
+        whole, self._stretches = ready.over_all_stretches(), ready.stretches.kept
+        self._config = config = whole.config
+        self.frames = whole.span
+        self.longest = max(stop - start for start, stop in self._stretches) // 2
+        opening = survey_over(ready.steady, config, ready.camera, self.frames, ready.opening)
+        self._reader, noise, self.window = opening.reader, opening.noise, opening.window
 
         @lru_cache(_WINDOWS_KEPT)
         def context(window: int) -> AnalysisContext:
+            searches = sum(boundaries(stop - start, window) for start, stop in self._stretches)
             return make_context(
-                config, self._reader.shape, searches=boundaries(last - first, window),
-                noise=noise.spectrum, lines=lines, sliding=True,
+                config, self._reader.shape, searches=searches, noise=noise.spectrum,
+                lines=ready.lines, sliding=True,
             )  # fmt: skip
 
         self.context = context
 
     def look(self, frame: int, window: int) -> Look:
         """Compare the windows before and after the boundary at which a frame begins."""
-        first, last = self.frames
         stride = stride_of(window)
+        first, last = min(  # the stretch with or next to the frame in which windows have room
+            (span for span in self._stretches if span[1] - span[0] >= 2 * stride),
+            key=lambda span: max(span[0] - frame, frame + 1 - span[1], 0),
+        )
         frame = min(max(frame, first + stride), last - stride)
         half = STRIDES * stride
         reach = (SPAN if self._config.background.follows_pattern else 1) * STRIDES
@@ -200,15 +199,16 @@ class LandingSearch:
 class BeforeAfterSearch:
     """Searches for particles that were not in the background."""
 
-    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self._movie = steady(movie, lines, camera)
+    def __init__(self, ready: Prepared) -> None:
+        self._movie, config, camera = ready.steady, ready.config, ready.camera
         self._camera, self._config = camera, config
-        self._check = checked(movie, camera)
-        before, after = frame_ranges(movie, config)
-        self.frames, self.longest = after, after[1] - after[0]
-        tracked = config.fit.mode == "track"
-        self.window = 1 if tracked else self.longest
-        shape = (movie.shape[1], movie.shape[2])
+        self._check = checked(self._movie, camera)
+        before, after = frame_ranges(self._movie, config)
+        self._after, self.longest = after, after[1] - after[0]
+        numbers = None if ready.kept is None else ready.kept.numbers
+        self._numbers = np.arange(ready.whole.shape[0]) if numbers is None else numbers
+        self.frames = self._in_file(after)
+        self.window = 1 if ready.tracked else self.longest
         self._windows = measured_windows(
             self._movie, config, camera, before, (after[0], after[0] + 1)
         )
@@ -216,13 +216,17 @@ class BeforeAfterSearch:
             self._movie,
             camera,
             replace(self._windows, n_after=self.longest, frames_after=after),
-            still=not tracked,
+            still=not ready.tracked,
             additive=config.optics.scheme == "darkfield",
         )
-        searches = self.longest if tracked else 1
         self._context = make_context(
-            config, shape, searches=searches, noise=noise.spectrum, lines=lines
-        )
+            config, ready.shape, searches=self.longest if ready.tracked else 1,
+            noise=noise.spectrum, lines=ready.lines,
+        )  # fmt: skip
+
+    def _in_file(self, span: tuple[int, int]) -> tuple[int, int]:
+        """Give the numbers in the file of a range of the frames that are left."""
+        return int(self._numbers[span[0]]), int(self._numbers[span[1] - 1]) + 1
 
     def context(self, window: int) -> AnalysisContext:  # noqa: ARG002
         """Give models and threshold, which are those of every window."""
@@ -231,7 +235,8 @@ class BeforeAfterSearch:
     def look(self, frame: int, window: int) -> Look:
         """Compare the frames from one on with the background."""
         context, known = self._context, self._windows
-        frame = min(max(frame, self.frames[0]), self.frames[1] - window)
+        frame = int(np.searchsorted(self._numbers, frame))
+        frame = min(max(frame, self._after[0]), self._after[1] - window)
         part = measure_windows(
             self._movie, self._camera, None, (frame, frame + window),
             level_e=1.0, power_normalization=False, check=self._check,
@@ -260,30 +265,28 @@ class BeforeAfterSearch:
             return _candidate_table(r for r in rows if context.additive or wanted * r[3] >= 0)
 
         return Look(
-            frame, known.frames_before if known.n_before else None, windows.frames_after,
-            np.where(windows.masked, np.nan, image), context.templates.threshold, search,
+            int(self._numbers[frame]),
+            self._in_file(known.frames_before) if known.n_before else None,
+            self._in_file(windows.frames_after), np.where(windows.masked, np.nan, image),
+            context.templates.threshold, search,
         )  # fmt: skip
 
 
 class MovingSearch:
     """Searches single frames for particles that are not in the median of the frames around."""
 
-    def __init__(self, movie: Stack, config: Config, camera: Camera, lines: Lines | None) -> None:
-        self._movie = steady(movie, lines, camera)
-        self._camera, self._config = camera, config
-        self._check = checked(movie, camera)
+    def __init__(self, ready: Prepared) -> None:
+        movie, config, camera = ready.steady, ready.config, ready.camera
+        self._config, check = config, checked(movie, camera)
         self.frames = first, last = fitted_frames(movie, config)
         self.longest = last - first
         self.window = min(AROUND, self.longest)
-        shape = (movie.shape[1], movie.shape[2])
-        self._context = tracking_context(config, shape, max(last - first, 1))
+        self._context = tracking_context(config, ready.shape, max(last - first, 1), ready.lines)
 
         @lru_cache(1)
         def background(span: tuple[int, int]) -> tuple[MovingField, BackgroundEstimate]:
             with threads(config.compute.workers) as pool:
-                field = load_field(
-                    self._context, self._movie, camera, span, self._check, pool, silent
-                )
+                field = load_field(self._context, movie, camera, span, check, pool, silent)
                 return field, initial_background(config, field)
 
         self._background = background

@@ -18,16 +18,12 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import refine_power
-from iscat_analysis.camera.burnt_in import find_text, without_text
-from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.field_sample import LARGEST_PX, CutFrames
-from iscat_analysis.camera.lines import Lines, SteadyFrames, steady
-from iscat_analysis.camera.response import linear
+from iscat_analysis.camera.lines import Lines
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.light import judge_light
-from iscat_analysis.diagnosis.repeated_frames import without_repeats
+from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass
 from iscat_analysis.fitting.field import add_signal
@@ -73,26 +69,18 @@ def redraw(
     summary: Mapping[str, Any],
 ) -> Redraw:
     """Make the function that draws the rows of a result."""
-    movie = movie.channel(config.camera.channels)
-    text = find_text(movie, config.background.recorded or fitted_frames(movie, config))
-    movie = linear(movie, config.camera)
-    camera = camera_from_config(config.camera, (movie.shape[1], movie.shape[2]), movie.dtype)
-    movie = movie if text is None else without_text(movie, text, camera)
-    way, additive = background_mode(config), config.optics.scheme == "darkfield"
-    if way == "fixed" and config.fit.mode != "track" and not additive:
-        kept = without_repeats(movie, config, camera)
-        movie, config = kept.movie, kept.config
-    judged = judge_light(movie, config, camera)
-    movie, lines = judged.movie, judged.lines
-    if way == "sliding":
-        window = int(summary["landing"]["window_frames"])
-        stretches = summary.get("left_out", {}).get("analysed")
-        return _landings(movie, config, camera, lines, table, window, stretches or ())
-    seen = steady(movie, lines, camera)
-    if way == "tracks":
-        blocks = int(summary["blocks"]["number"])
-        return _moving(seen, config, camera, lines, table, tracks, blocks)
-    return _before_after(seen, config, camera, lines, table)
+    ready = calibrated(movie, config).over_all_stretches()
+    steady, config, camera, lines = ready.steady, ready.config, ready.camera, ready.lines
+    match ready.background_mode:
+        case "sliding":
+            window = int(summary["landing"]["window_frames"])
+            stretches = summary.get("left_out", {}).get("analysed") or ()
+            return _landings(steady, config, camera, lines, table, window, stretches)
+        case "tracks":
+            blocks = int(summary["blocks"]["number"])
+            return _moving(steady, config, camera, lines, table, tracks, blocks)
+        case "fixed":
+            return _before_after(steady, config, camera, lines, table)
 
 
 def _landings(
@@ -106,7 +94,6 @@ def _landings(
 ) -> Redraw:
     """Draw rows of a landing movie: the windows before and after each step."""
     first, last = fitted_frames(movie, config)
-    frames = movie if lines is None else SteadyFrames(movie, lines, camera)
     shape = (movie.shape[1], movie.shape[2])
     field = make_context(config, shape, lines=lines, sliding=True)
     stride = stride_of(window)
@@ -114,9 +101,9 @@ def _landings(
     @lru_cache(1)
     def seen(tile: Tile) -> tuple[Reader, AnalysisContext]:
         """Read the pixels of a tile alone."""
-        part: CountSource = frames
+        part: CountSource = movie
         if tile.shape != shape:
-            part = CutFrames(frames, tile.shape, lambda images: images[..., *tile.here])
+            part = CutFrames(movie, tile.shape, lambda images: images[..., *tile.here])
         reader = reader_of(part, config, camera.part(tile.here), (first, last))
         return reader, field.on_tile(tile)
 

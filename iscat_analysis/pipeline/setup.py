@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.learned import ASSUMPTION, METADATA, LearnedCamera
+from iscat_analysis.camera.learned import ASSUMPTION, METADATA
 from iscat_analysis.camera.learned import MEASURED as BY_NOISE
 from iscat_analysis.config import AUTO, Config, configure, toml_value
+from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
@@ -143,7 +144,7 @@ def write_setup(
         values += [Value(key, _config_value(_DEFAULTS, key), DEFAULT) for key in _STANDING]
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
-        values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.camera)]
+        values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.prepared)]
         found = Setup(
             movie=stack.name,
             shape=stack.shape,
@@ -199,7 +200,8 @@ def _ask_the_rest(
 
 def _mode_of(preview: Preview, stack: Stack, config: Config) -> tuple[Value, Preview]:
     """Choose mode track where the frames clearly show moving particles, else keep the mode."""
-    changes = look_at_changes(preview.steady, preview.config, preview.camera.camera, preview.frames)
+    ready = preview.prepared
+    changes = look_at_changes(ready.steady, ready.config, ready.camera, ready.span)
     if not as_moving(changes, stack.name):
         return Value("fit.mode", config.fit.mode, DEFAULT), preview
     moving = configure(config, settings={"fit.mode": "track"})
@@ -216,11 +218,12 @@ def _each_movie(metadata: StackMetadata) -> list[Value]:
     ]
 
 
-def _camera_values(camera: LearnedCamera) -> list[Value]:
+def _camera_values(ready: Prepared) -> list[Value]:
     """List the numbers of the camera, which are measured anew in each movie."""
+    numbers = {} if ready.known is None else ready.known.numbers
     values = []
     for key in _CAMERA:
-        number = camera.numbers[key.partition(".")[2]]
+        number = numbers[key.partition(".")[2]]
         origin = _ORIGINS.get(number.source, f"{MEASURED} ({number.source})")
         values.append(Value(key, number.value, origin, number.se or None, written=False))
     return values
@@ -234,7 +237,9 @@ def _search_preview(preview: Preview) -> dict[str, Any]:
     at = np.linspace(first, last, places + 1)
     looks = [preview.look(int((a + b) / 2)) for a, b in pairwise(at)]
     found = [look.found() for look in looks]
-    lit = preview.steady.read(first, min(first + _LIGHT_FRAMES, last))
+    ready = preview.prepared
+    start, stop = ready.span
+    lit = ready.steady.read(start, min(start + _LIGHT_FRAMES, stop))
     strongest = max((float(table["snr"].abs().max()) for table in found if len(table)), default=0.0)
     return {
         "frames": [look.frame for look in looks],
@@ -243,7 +248,7 @@ def _search_preview(preview: Preview) -> dict[str, Any]:
         "threshold_snr": looks[0].threshold,
         "strongest_snr": strongest if strongest else None,
         "noise_contrast": float(np.median([_spread(look.image) for look in looks])),
-        "light_e": float(np.mean(preview.camera.camera.to_electrons(lit))),
+        "light_e": float(np.mean(ready.camera.to_electrons(lit))),
     }
 
 

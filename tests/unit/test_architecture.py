@@ -146,3 +146,17 @@ def test_golden_copies_are_the_originals(shared_dir: Path, golden_dir: Path) -> 
         pytest.skip(f"no golden data beside the checkout: {originals} is absent")
     for copy in golden_dir.glob("*.json"):
         assert copy.read_bytes() == (originals / copy.name).read_bytes(), copy.name
+
+
+def test_a_movie_is_prepared_at_one_door() -> None:
+    steps = {"resolve_metadata", "with_camera", "find_stretches", "judge_light", "survey_noise"}
+    door = {
+        ROOT / "iscat_analysis" / "diagnosis" / f"{name}.py" for name in ("calibrated", "noise")
+    }
+    calls = [
+        (path, node)
+        for path, node in _nodes(ast.Call)
+        if isinstance(node, ast.Call) and _dotted(node.func) in steps
+    ]
+    assert {_dotted(node.func) for _, node in calls} == steps
+    assert [_where(path, node) for path, node in calls if path not in door] == []

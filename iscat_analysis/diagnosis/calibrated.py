@@ -1,0 +1,236 @@
+"""The one door to a movie: steps after which its camera and its light are known.
+
+Analysis, preview, `iscat init`, redrawn events and calibrations of the optics all open a movie by
+these steps, so that they see the same frames, noise and threshold.  Each takes as many steps as it
+needs, from the first on; those of an analysis go on in `iscat_analysis.pipeline.prepare`.  A step
+takes a state and gives the next one, with its findings, which the user should know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from iscat_analysis.camera.burnt_in import text_message, without_text
+from iscat_analysis.camera.counts import refuse_overflow, refuse_ratio
+from iscat_analysis.camera.field_sample import whole_frames
+from iscat_analysis.camera.learned import with_camera
+from iscat_analysis.camera.metadata import resolve_metadata
+from iscat_analysis.camera.processed import find_processing
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.camera_numbers import law_messages
+from iscat_analysis.diagnosis.causes import axes_warning
+from iscat_analysis.diagnosis.light import JudgedLight, judge_light
+from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
+from iscat_analysis.diagnosis.prepared import Finding, Prepared, within
+from iscat_analysis.diagnosis.recognise import look_at_changes
+from iscat_analysis.diagnosis.repeated_frames import without_repeats
+from iscat_analysis.diagnosis.stage import motion_message, with_drift_correction
+from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
+from iscat_analysis.diagnosis.turns import refuse_channels
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.fitting.background_mode import describe_background_mode
+from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.run import Notify, notify_nobody
+from iscat_analysis.movie import Stack
+from iscat_analysis.pieces.setups import darkfield_photons
+from iscat_analysis.search.sliding.chunks import reader_of
+from iscat_analysis.search.sliding.planning import sum_first_chunk
+from iscat_analysis.threads import one_thread_algebra, start_in_thread
+
+Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding]]]
+"""What is known → what is known after the step, and what it found."""
+
+_FIRST_FRAMES = 64  # frames that are looked at before anything else, fewer of a large field
+
+
+def metadata(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Choose the channel, and take what the file says of the recording."""
+    config = state.config
+    if config.optics.scheme == "darkfield":
+        darkfield_photons(config.particle)
+    movie = state.movie.channel(config.camera.channels)
+    config, notes = resolve_metadata(config, movie.metadata)
+    findings = [Finding(note) for note in (*movie.notes, *notes)]
+    findings.append(Finding(describe_background_mode(config), is_warning=False))
+    if config.optics.psf == "measured":
+        findings.append(
+            Finding(
+                'optics.psf = "measured": bounds are those of the template, and there is no '
+                "quantum bound: a measured picture does not give the field"
+            )
+        )
+    span = fitted_frames(movie, config, config.background.recorded)
+    state = replace(
+        state, stored=movie, whole=movie, movie=movie, steady=movie, config=config, asked=config,
+        stretches=Stretches((span,)),
+    )  # fmt: skip
+    return state, findings
+
+
+def breaks(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Find where a landing movie breaks; what is learned of it is learned within one stretch."""
+    config, movie = state.config, state.movie
+    if state.background_mode != "sliding" or config.optics.scheme == "darkfield":
+        if config.fit.excluded_frames:
+            raise ConfigError(
+                "fit.excluded_frames: frames are left out of landing movies only, which have an "
+                'interferometric scheme and background.method = "sliding"; cut others with '
+                "fit.frames"
+            )
+        return state, []
+    found = find_stretches(movie, state.span, config.fit.excluded_frames)
+    if not found.breaks:
+        return replace(state, stretches=found), []
+    state = replace(state, stretches=found, config=within(config, found.main))
+    return state, [Finding(found.message(movie.name))]
+
+
+def camera(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Refuse what is no camera's movie, learn the camera's numbers, and leave out burnt-in text."""
+    movie, config, stated = state.movie, state.config, state.camera
+    name, learned_from = movie.name, state.learned_from
+    refuse_ratio(movie.read(0, 1)[0], f"{name}: frame 0", stated)
+    refuse_channels(movie.read(*_first_frames(state)), stated, name)
+    movie, config, known = with_camera(movie, config, learned_from)
+    findings = [Finding(f"{name}: {text}") for text in (*known.messages, *law_messages(known))]
+    stored = state.stored
+    if known.text is not None:
+        stored = without_text(stored, known.text, known.camera)
+        findings.append(Finding(text_message(known.text, name)))
+    if known.padding_message:
+        findings.append(Finding(f"{name}: {known.padding_message}", is_warning=False))
+    if state.config.camera.assumed is not state.config.camera:
+        findings.append(Finding(f"{name}: {known.description}", is_warning=False))
+    state = replace(
+        state, stored=stored, whole=movie, movie=movie, steady=movie, config=config, known=known,
+        summary={"camera": known.summary},
+    )  # fmt: skip
+    return state, findings
+
+
+def repeats(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Leave out frames that were stuck in the camera, where a background was recorded."""
+    config = state.config
+    if state.background_mode != "fixed" or state.tracked or config.optics.scheme == "darkfield":
+        return state, []
+    kept = without_repeats(state.movie, config, state.camera)
+    state = replace(state, movie=kept.movie, steady=kept.movie, config=kept.config, kept=kept)
+    return state, [Finding(kept.message)] if kept.message else []
+
+
+def counts(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Refuse counts that no camera gives, and find what was done to them before."""
+    movie, name = state.movie, state.movie.name
+    processing = find_processing(movie, state.camera, state.span, moving=state.tracked)
+    findings = [] if processing is None else [Finding(f"{name}: {processing.message}")]
+    start, stop = _first_frames(state)
+    seen = movie.read(start, stop)
+    if state.background_mode != "sliding":  # windows that slide pass over frames that repeat
+        _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
+    refuse_overflow(state.stored.read(start, stop), name)
+    if swapped := axes_warning(name, seen):
+        findings.append(Finding(swapped))
+    if processing is None:
+        return state, findings
+    summary = {**state.summary, "processing": processing.summary}
+    return replace(state, processing=processing, summary=summary), findings
+
+
+def light(state: Prepared) -> tuple[Prepared, list[Finding]]:
+    """Divide out unsteady light; of a landing movie judge motion, noise and window, too."""
+    movie, config, name = state.movie, state.config, state.movie.name
+    opening, changes, findings = None, None, []
+    follow = state.ahead and (state.tracked or state.background_mode == "sliding")
+    with one_thread_algebra():  # in all threads until the light is judged
+        if state.background_mode == "sliding":
+            judged, opening, motion = _landing_light(state, config)
+            if config.background.drift_correction == "auto":
+                config = with_drift_correction(config, moves=bool(motion))
+            if motion:
+                said = f"{name}: {motion}; its motion is followed and divided out"
+                findings.append(Finding(said, is_warning=False))
+                judged, opening, _ = _landing_light(state, config)
+        else:
+            if follow:  # in the light as it is; again if anything of it is unsteady
+                changes = start_in_thread(look_at_changes, movie, config, state.camera, state.span)
+            judged = judge_light(movie, config, state.camera)
+    findings += [Finding(f"{name}: {text}") for text in judged.messages]
+    if follow and (changes is None or judged.steady is not movie):
+        steady = judged.steady
+        changes = start_in_thread(look_at_changes, steady, config, state.camera, state.span)
+    lines = {} if judged.lines is None else {"lines": judged.lines.summary}
+    state = replace(
+        state, movie=judged.movie, steady=judged.steady, lines=judged.lines, config=config,
+        opening=opening, changes=changes, summary={**state.summary, **lines},
+    )  # fmt: skip
+    return state, findings
+
+
+SCAN_STEPS: tuple[Step, ...] = (metadata, camera)
+"""Of a scan of the focus, whose light changes from frame to frame because it is scanned."""
+
+LIGHT_STEPS: tuple[Step, ...] = (metadata, breaks, camera, repeats, counts, light)
+"""From an open movie to steady light."""
+
+
+def calibrated(
+    movie: Stack,
+    config: Config,
+    steps: Sequence[Step] = LIGHT_STEPS,
+    *,
+    warn: Notify = notify_nobody,
+    notify: Notify = notify_nobody,
+    ahead: bool = False,
+) -> Prepared:
+    """Take a movie through steps; `ahead` where an analysis follows."""
+    state = Prepared(movie, movie, movie, movie, config, config, ahead, notify)
+    for step in steps:
+        state, findings = step(state)
+        for finding in findings:
+            (warn if finding.is_warning else notify)(finding.text)
+    return state
+
+
+def _first_frames(state: Prepared) -> tuple[int, int]:
+    """Give the few frames that are looked at before anything else."""
+    start, stop = state.learned_from
+    return start, max(start, min(stop, start + whole_frames(state.shape, _FIRST_FRAMES)))
+
+
+def _landing_light(state: Prepared, config: Config) -> tuple[JudgedLight, NoiseSurvey, str]:
+    """Judge the light of a landing movie, and its noise and motion once the light is steady.
+
+    The message about motion is empty where drift correction was configured or nothing moves.  The
+    first chunk, which an analysis needs next, is summed while the light is still being judged.
+    """
+    movie, span = state.movie, state.span
+
+    def survey_light(seen: Stack) -> tuple[NoiseSurvey, str]:
+        opening = survey_noise(reader_of(seen, config, state.camera, span), config)
+        left_open = config.background.drift_correction == "auto"
+        motion = motion_message(opening) if left_open else ""
+        opening.reader.forget_sample()
+        if state.ahead and not motion:
+            sum_first_chunk(opening.reader, config, opening.window)
+        return opening, motion
+
+    # in the light as it is; again if anything is unsteady
+    survey = start_in_thread(survey_light, movie)
+    judged = judge_light(movie, config, state.camera)
+    if judged.steady is not movie:
+        survey = start_in_thread(survey_light, judged.steady)
+    return judged, *survey.result()
+
+
+def _refuse_still(frames: NDArray[Any], name: str) -> None:
+    """Refuse identical frames: without noise no error can be estimated.
+
+    Shapes: `frames` (t, y, x).
+    """
+    if len(frames) > 1 and all(np.array_equal(frame, frames[0]) for frame in frames[1:]):
+        raise DataError(f"{name} are all the same; export the movie again")
