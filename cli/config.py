@@ -7,29 +7,35 @@ import textwrap
 import typer
 
 from iscat_cli.console import Messages, failures, print_result
-from iscat_cli.options import DebugOption, Mode, ModeOption
+from iscat_cli.options import DebugOption, InstrumentOption, Mode, ModeOption
 
 WIDTH, COMMENT = 80, 36  # columns of a narrow terminal, and where most comments begin
 
 EXAMPLE = """Example: a file to edit, and what it says checked without running anything.
 
-    iscat config --mode joint > setup.toml
+    iscat config --mode joint --instrument mass-photometer-445 > setup.toml
     iscat bounds --config setup.toml --set camera.pixel_size_nm=84.4
 """
 
 
-def config(context: typer.Context, *, mode: ModeOption = None, debug: DebugOption = False) -> None:
+def config(
+    context: typer.Context,
+    *,
+    mode: ModeOption = None,
+    instrument: InstrumentOption = None,
+    debug: DebugOption = False,
+) -> None:
     """Print a complete configuration, each key with what it means.
 
     A key without a value is unset; take the # away and fill it in.
     """
     with failures(Messages(context.command_path, debug=debug)):
-        from iscat_analysis.config import config_to_toml, load_config
+        from iscat_analysis.config import config_to_toml, configure
 
         changes = [f"fit.mode={mode.value}"] if mode else []
         if mode is Mode.SIZE:  # which fits spheres alone
             changes.append("particle.model=mie")
-        text = config_to_toml(load_config(None, changes))
+        text = config_to_toml(configure(instrument=instrument, settings=changes))
         text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_of_each()}\n[bounds]", 1)
         print_result("\n".join(_folded(line) for line in text.splitlines()))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result, table
-from iscat_cli.options import JsonOption, OverwriteOption, command
+from iscat_cli.options import InstrumentOption, JsonOption, OverwriteOption, command
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,14 +66,16 @@ def init(
             "--sample", metavar="KIND", help="protein, gold, silica or polystyrene particles."
         ),
     ] = None,
+    instrument: InstrumentOption = None,
     overwrite: OverwriteOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Look at a movie, ask what only you can know, and write iscat.toml for it.
 
     Says what the file's metadata and the frames tell, asks for the rest (pixel size, wavelength,
-    NA, kind of sample), writes every value with where it comes from, and shows what the search
-    sees in some frames.  Without a terminal nothing is asked, as with --yes.
+    NA, kind of sample), writes every value with where it comes from and whether it will be learned,
+    and shows what the search sees in some frames.  Without a terminal nothing is asked, as with
+    --yes.
     """
     with failures(messages):
         from iscat_analysis.pipeline.setup import preview_lines, write_setup
@@ -88,6 +90,7 @@ def init(
             movie,
             answers={key: value for key, value in given.items() if value is not None},
             ask=None if yes or not sys.stdin.isatty() else _asker(),
+            instrument=instrument,
             warn=messages.notify,
             out=out,
             overwrite=overwrite,

@@ -38,6 +38,25 @@ def complete_setting(incomplete: str) -> list[str]:
     return [name for name in found if name.startswith(incomplete)]
 
 
+class Instrument(StrEnum):
+    """Named set-ups; the same names as `iscat_analysis.instruments`."""
+
+    MASS_PHOTOMETER_445 = "mass-photometer-445"
+    MASS_PHOTOMETER_525 = "mass-photometer-525"
+    ISCAT = "iscat"
+    COBRI = "cobri"
+
+
+InstrumentOption = Annotated[
+    Instrument | None,
+    typer.Option(
+        "--instrument",
+        metavar="NAME",
+        help="Optics, pixels and light of a published set-up in place of the defaults: "
+        f"{', '.join(Instrument)}.",
+    ),
+]
+
 ModeOption = Annotated[
     Mode | None,
     typer.Option(

@@ -30,6 +30,7 @@ Answers, from any table of events::
 Whole jobs, from a movie to a report::
 
     setup = ia.configure("setup.toml", settings={"optics.na": 1.42})
+    ia.instruments              # named set-ups to begin with: ia.configure(instrument="iscat")
     result = ia.fit_movie("movie.tif", config=setup, background=(0, 200))
     result                      # summary and table; in a notebook, drawn as HTML
     result.table                # pandas.DataFrame, one row per event
@@ -76,6 +77,7 @@ if TYPE_CHECKING:
     from iscat_analysis.config import Particle as Particle
     from iscat_analysis.config import config_to_toml as config_to_toml
     from iscat_analysis.config import configure as configure
+    from iscat_analysis.config import instruments as instruments
     from iscat_analysis.config import load_config as load_config
     from iscat_analysis.day import Batch as Batch
     from iscat_analysis.day import batch as batch
@@ -185,6 +187,7 @@ _HOME = {
     "Bounds": "notebook",
     "Config": "config",
     "load_config": "config",
+    "instruments": "config",
     "config_to_toml": "config",
     "open_stack": "movie",
     "Stack": "movie",
@@ -254,6 +257,7 @@ __all__ = [
     "fit_stack",
     "forecast_optics",
     "hydrodynamic_diameter",
+    "instruments",
     "load_config",
     "log_likelihood",
     "open_result",

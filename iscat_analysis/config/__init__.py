@@ -1,10 +1,10 @@
 """The configuration: its keys, how files are read, and how single keys are changed.
 
 `instrument`, `analysis` and `synthetic` have the sections and their keys, `values` the allowed
-values, and `schema` the whole configuration.  Only `configure` makes a `Config`: files, mappings,
-keyword arguments and ``--set`` all go through it, so that the same keys give the same configuration
-and a later value always replaces an earlier one.  `files` reads and writes TOML, and `renamed`
-accepts old names for one release.
+values, and `schema` the whole configuration; `named` has set-ups from publications.  Only
+`configure` makes a `Config`: files, mappings, keyword arguments and ``--set`` all go through it, so
+that the same keys give the same configuration and a later value always replaces an earlier one.
+`files` reads and writes TOML, and `renamed` accepts old names for one release.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from iscat_analysis.config.instrument import (
     Optics,
     Particle,
 )
+from iscat_analysis.config.named import Instrument, Instruments, instruments
 from iscat_analysis.config.overrides import configure, load_config, parse_config
 from iscat_analysis.config.scale import Calibration, StandardsCamera, Uncertainty
 from iscat_analysis.config.schema import Config, refuse_rod, refuse_sphere
@@ -76,6 +77,8 @@ __all__ = [
     "Config",
     "Detection",
     "Fit",
+    "Instrument",
+    "Instruments",
     "Method",
     "Mode",
     "Optics",
@@ -95,6 +98,7 @@ __all__ = [
     "config_to_toml",
     "configure",
     "field_keys",
+    "instruments",
     "load_config",
     "parse_config",
     "plausible_pixel",

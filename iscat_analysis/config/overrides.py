@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from iscat_analysis.config.complaints import complaints
 from iscat_analysis.config.files import read_optics_file, read_toml
+from iscat_analysis.config.named import instruments
 from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
 from iscat_analysis.config.values import ALL
@@ -40,6 +41,7 @@ def configure(
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     arguments: Mapping[str, Any] | None = None,
     called: Mapping[str, str] | None = None,
+    instrument: str | None = None,
 ) -> Config:
     """Make a configuration from a file, a mapping, another configuration, or the defaults.
 
@@ -58,6 +60,9 @@ def configure(
     called : mapping of str to str, optional
         Names in messages of keys that the caller has under another name, as in
         ``{"fit.mode": "mode"}``.
+    instrument : str, optional
+        Name of one of `iscat_analysis.instruments`, which replaces the defaults; a file or mapping
+        replaces values of it.
 
     Returns
     -------
@@ -71,7 +76,7 @@ def configure(
         impossible.
     """
     if isinstance(source, Config):
-        if not settings and not arguments:
+        if not settings and not arguments and instrument is None:
             return source
         values = source.model_dump(exclude_none=True)
         where = "arguments" if called else "settings"
@@ -87,12 +92,28 @@ def configure(
             f"{type(source).__name__}: give the path of a TOML file, or sections of keys as in "
             '{"optics": {"na": 1.42}}'
         )
+    if instrument is not None:
+        values = _with_instrument(instrument, values, complete=isinstance(source, Config))
     changes = _changes(settings) + _changes(arguments)
     for section, key, value in changes:
         _change(values, section, key, value)
     if any(change[:2] in _METHOD_FOLLOWS for change in changes):
         _choose_method_again(values, changes)
     return _validated(values, changes, where, called or {})
+
+
+def _with_instrument(name: str, values: dict[str, Any], *, complete: bool) -> dict[str, Any]:
+    """Put values over those of a named set-up."""
+    begun = _nested(instruments[name].settings)
+    if complete:
+        raise ConfigError(
+            f"`instrument` = {name!r}: a Config has a value for every key already; give "
+            f'`settings=ia.instruments["{name}"].settings` to change it'
+        )
+    for section, table in values.items():
+        known = begun.get(section)
+        begun[section] = {**known, **table} if known and isinstance(table, dict) else table
+    return begun
 
 
 def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:

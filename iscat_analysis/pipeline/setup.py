@@ -1,15 +1,16 @@
 """From a bare movie to a configuration: what the file says, what is measured, what is asked.
 
 `write_setup` writes ``iscat.toml`` beside the movie, where `iscat-fit` finds it.  Every value in it
-has its origin beside it: the file's metadata, this movie's own noise, an answer of the user, or a
-default.  Then the search looks at some frames, so that one sees whether the values make sense.
+has its origin beside it: read from the file, measured from the movie, your answer, a named
+instrument, assumed, or to be given; and whether it will be learned from the movie's particles.
+Then the search looks at some frames, so that one sees whether the values make sense.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ import numpy as np
 
 from iscat_analysis.camera.learned import ASSUMPTION, METADATA
 from iscat_analysis.camera.learned import MEASURED as BY_NOISE
-from iscat_analysis.config import AUTO, Config, configure, toml_value
+from iscat_analysis.config import AUTO, Config, configure, instruments, toml_value
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
+from iscat_analysis.instrument.learning import why_not
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.addresses import setup_beside
 from iscat_analysis.pipeline.preview import Preview
@@ -30,8 +32,9 @@ from iscat_analysis.records import StackMetadata
 from iscat_analysis.text import in_toml
 from iscat_analysis.units import count
 
-ANSWER, DEFAULT, MEASURED = "your answer", "default", "measured here"
-"""Where a value comes from, if not from the file's metadata."""
+ANSWER, DEFAULT, MEASURED = "your answer", "assumed", "measured from the movie"
+READ, TO_GIVE = "read from the file", "to be given, by `iscat calibrate mass`"
+"""Where a value comes from."""
 
 SAMPLES = ("protein", "gold", "silica", "polystyrene")
 """Kinds of samples: what the particles are made of."""
@@ -58,9 +61,16 @@ _QUESTIONS = (
     Question("optics.na", "numerical aperture of the objective", _DEFAULTS.optics.na),
     Question("particle.kind", "kind of sample", _DEFAULTS.particle.kind, SAMPLES),
 )
-_STANDING = ("optics.n_immersion", "optics.n_sample")  # shown, since they may have to be changed
+_STANDING = ("optics.focus_nm", "optics.n_immersion", "optics.n_sample")  # may have to be changed
+_LEARNED = {  # from the particles of a movie
+    "optics.focus_nm": "will be learned",
+    "optics.na": "will be learned",
+    "optics.n_immersion": "an error of it will be learned as an aberration",
+}
+_SECTIONS = ("optics", "camera", "particle")  # of an instrument that a movie has to have
+_CALIBRATION = "calibration.gradient_per_kda"
 _EACH_MOVIE = ("camera.exposure_ms", "camera.frame_rate_hz")  # left to the metadata of each
-_ORIGINS = {ASSUMPTION: DEFAULT, METADATA: "the file's metadata", BY_NOISE: MEASURED}
+_ORIGINS = {ASSUMPTION: DEFAULT, METADATA: READ, BY_NOISE: MEASURED}
 _CAMERA = ("camera.gain_e_per_adu", "camera.offset_adu", "camera.read_noise_e")
 
 
@@ -117,6 +127,7 @@ def write_setup(
     *,
     answers: Mapping[str, float | str] | None = None,
     ask: Callable[[Question], str] | None = None,
+    instrument: str | None = None,
     warn: Callable[[str], None] = lambda _: None,
     out: Path | None = None,
     overwrite: bool = False,
@@ -124,8 +135,8 @@ def write_setup(
     """Write a configuration for a movie, and look at some of its frames with it.
 
     `answers` are keys of the configuration and what the user has said already; `ask` puts the
-    questions that are left, and without it defaults are taken; `warn` says what is known, line by
-    line.
+    questions that are left, and without it defaults are taken, or before these what a named
+    `instrument` has; `warn` says what is known, line by line.
     """
     target = setup_beside(movie) if out is None else out
     if target.exists() and not overwrite:
@@ -133,7 +144,7 @@ def write_setup(
     with open_stack(movie) as stack:
         frames, rows, columns = stack.shape
         warn(f"{stack.name}: {frames} frames of {rows} × {columns} pixels, {stack.dtype}")
-        known = _known_values(stack.metadata, answers or {})
+        known = _known_values(stack.metadata, answers or {}, instrument)
         warn(_metadata_line(stack))
         values, config = _ask_the_rest(known, ask, warn)
         if config.camera.pixel_size_nm is None:
@@ -141,10 +152,17 @@ def write_setup(
                 f"{stack.name}: its metadata do not say how large a pixel is, which nobody can "
                 "guess: give `pixel_size_nm`, in the sample plane"
             )
-        values += [Value(key, _config_value(_DEFAULTS, key), DEFAULT) for key in _STANDING]
+        here = {each.key for each in values}
+        values += [
+            Value(key, _config_value(_DEFAULTS, key), DEFAULT)
+            for key in _STANDING
+            if key not in here
+        ]
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
+        values = [_with_learning(each, preview.config) for each in values]
         values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.prepared)]
+        values.append(Value(_CALIBRATION, "", TO_GIVE, written=False))
         found = Setup(
             movie=stack.name,
             shape=stack.shape,
@@ -160,8 +178,10 @@ def write_setup(
     return found
 
 
-def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -> list[Value]:
-    """Collect values from answers and metadata; answers win."""
+def _known_values(
+    metadata: StackMetadata, answers: Mapping[str, float | str], instrument: str | None
+) -> list[Value]:
+    """Collect values from answers, metadata and an instrument; answers win, then metadata."""
     known = []
     for question in _QUESTIONS:
         value = getattr(metadata, question.key.partition(".")[2], None)
@@ -169,7 +189,23 @@ def _known_values(metadata: StackMetadata, answers: Mapping[str, float | str]) -
             known.append(Value(question.key, answers[question.key], ANSWER))
         elif value is not None:
             known.append(Value(question.key, value, _origin_in_file(metadata)))
+    if instrument is not None:
+        here = {each.key for each in known}
+        known += [
+            Value(key, value, f"instrument {instrument}")
+            for key, value in instruments[instrument].settings.items()
+            if key not in here and key.partition(".")[0] in _SECTIONS
+        ]
     return known
+
+
+def _with_learning(value: Value, config: Config) -> Value:
+    """Say of a value that is not known for certain whether it will be learned from the movie."""
+    if value.key not in _LEARNED or value.origin == ANSWER:
+        return value
+    reason = why_not(config)
+    said = f"not learned {reason}" if reason else _LEARNED[value.key]
+    return replace(value, origin=f"{value.origin}, {said}")
 
 
 def _ask_the_rest(
@@ -272,15 +308,18 @@ def _toml_text(setup: Setup) -> str:
     ]
     for section in Config.model_fields:
         own = [each for each in setup.values if each.key.startswith(f"{section}.")]
-        lines += ["", f"[{section}]"] if own else []
+        unset = not any(each.written or each.key in _CAMERA for each in own)
+        lines += ["", f"{'# ' if unset else ''}[{section}]"] if own else []
         for each in own:
             name = each.key.partition(".")[2]
             if each.key in _CAMERA:
                 line = f"{name} = {toml_value(AUTO)}"
                 origin = f"{each.shown} in this movie: {each.origin}"
             else:
-                line = f"{'' if each.written else '# '}{name} = {toml_value(each.value)}"
-                origin = each.origin if each.written else f"{each.origin}; taken from each movie"
+                value = "" if each.value == "" else toml_value(each.value)
+                line = f"{'' if each.written else '# '}{name} = {value}"
+                of_each = each.key in _EACH_MOVIE
+                origin = f"{each.origin}; taken from each movie" if of_each else each.origin
             lines.append(f"{line:<32} # {origin}")
     return "\n".join(lines) + "\n"
 
@@ -309,7 +348,7 @@ def _metadata_line(stack: Stack) -> str:
 
 
 def _origin_in_file(metadata: StackMetadata) -> str:
-    return f"the file's metadata ({metadata.source})"
+    return f"{READ} ({metadata.source})"
 
 
 def _config_value(config: Config, key: str) -> Any:

@@ -16,7 +16,8 @@ class SetupValue(Document):
     se: Number = key("Its standard error, where it was measured")
     origin: str = Field(
         alias="from",
-        description="Where it comes from: the file's metadata, measured here, your answer, default",
+        description="Where it comes from: read from the file, measured from the movie, your "
+        "answer, instrument NAME, assumed, to be given; and whether it will be learned",
     )
 
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -28,7 +28,7 @@ from scipy import fft
 from scipy.ndimage import gaussian_filter
 
 from iscat_analysis.camera.counts import camera_from_config, read_map
-from iscat_analysis.config import Config
+from iscat_analysis.config import AUTO, Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.optics.collected import photons_per_intensity
@@ -431,8 +431,13 @@ class Movie:
         level = float(self._sample_e.max())
         top = level * (1 + peak) if self._model.rho else level + self._signal_scale * peak
         top *= float(self.power.max())
-        top = (top + 6 * math.sqrt(top)) / np.min(camera.gain_e_per_adu) + np.max(camera.offset_adu)
-        if top > np.iinfo(np.uint16).max and camera.well_depth_e is None:
+        top += 6 * math.sqrt(top)
+        most, offset = np.iinfo(np.uint16).max, float(np.max(camera.offset_adu))
+        if self._config.camera.gain_e_per_adu == AUTO and offset < most:
+            needed = math.ceil(top / (most - offset))  # 1 where counts can be photoelectrons
+            self._camera = camera = replace(camera, gain_e_per_adu=float(max(needed, 1)))
+        top = top / np.min(camera.gain_e_per_adu) + offset
+        if top > most and camera.well_depth_e is None:
             raise ConfigError(
                 f"the brightest pixel would hold {top:.0f} counts, more than 16 bits: raise "
                 "camera.gain_e_per_adu or lower simulation.photons_per_pixel"

@@ -41,6 +41,9 @@ OME = (
 )
 
 
+OME_FILE, ANSWER, LEARNED = "read from the file (ome)", "your answer", "will be learned"
+
+
 @pytest.fixture(scope="module")
 def counts(tmp_path_factory: pytest.TempPathFactory, sample_configs) -> NDArray:
     """Simulate a landing, with 4 electrons per count."""
@@ -83,13 +86,27 @@ def _found(capsys, *arguments: str) -> dict:
 @pytest.mark.parametrize(
     ("kind", "options", "origins"),
     [
-        ("ome", [], ["(ome)", "(ome)", "(ome)", "default"]),
-        ("ome", ["--na", "1.3"], ["(ome)", "(ome)", "your answer", "default"]),
-        ("imagej", ["--wavelength-nm", "520"], ["(imagej)", "your answer", "default", "default"]),
+        ("ome", [], [OME_FILE, OME_FILE, f"{OME_FILE}, {LEARNED}", "assumed"]),
+        ("ome", ["--na", "1.3"], [OME_FILE, OME_FILE, ANSWER, "assumed"]),
+        (
+            "imagej",
+            ["--wavelength-nm", "520"],
+            ["read from the file (imagej)", ANSWER, f"assumed, {LEARNED}", "assumed"],
+        ),
         (
             "plain",
             ["--pixel-size-nm", "84", "--na=1.4", "--sample=gold"],
-            ["your answer", "default", "your answer", "your answer"],
+            [ANSWER, "assumed", ANSWER, ANSWER],
+        ),
+        (
+            "ome",
+            ["--na", "1.4", "--instrument", "iscat"],
+            [OME_FILE, OME_FILE, ANSWER, "assumed"],
+        ),
+        (
+            "plain",
+            ["--pixel-size-nm=84", "--sample=gold", "--instrument", "iscat"],
+            [ANSWER, "instrument iscat", f"instrument iscat, {LEARNED}", ANSWER],
         ),
     ],
 )
@@ -100,7 +117,15 @@ def test_every_value_has_its_origin(
     found = _found(capsys, str(movie), *options)
     asked = ("camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind")
     for key, origin in zip(asked, origins, strict=True):
-        assert found["values"][key]["from"].endswith(origin), key
+        assert found["values"][key]["from"] == origin, key
+    focus = found["values"]["optics.focus_nm"]
+    named = "--instrument" in options
+    assert focus["from"] == f"{'instrument iscat' if named else 'assumed'}, {LEARNED}"
+    assert focus["value"] == (-150.0 if named else -300.0)
+    assert "learned as an aberration" in found["values"]["optics.n_immersion"]["from"]
+    calibration = found["values"]["calibration.gradient_per_kda"]
+    assert calibration["value"] == ""
+    assert calibration["from"].startswith("to be given, by `iscat calibrate mass`")
     out = movie.with_name("iscat.toml")
     assert found["out"] == str(out)
     text, config = out.read_text(encoding="utf-8"), load_config(out)
@@ -110,14 +135,16 @@ def test_every_value_has_its_origin(
     assert config.particle.kind == ("gold" if kind == "plain" else "protein")
     lines = [line for line in text.splitlines() if " = " in line]
     assert all(" # " in line for line in lines)
+    assert "[simulation]" not in text  # which no movie has
+    assert load_config(out).calibration is None
     assert len(lines) == len(found["values"])
 
 
 def test_the_movie_tells_gain_light_and_what_is_there(ome: Path, capsys) -> None:
     found = _found(capsys, str(ome))
     gain = found["values"]["camera.gain_e_per_adu"]
-    assert gain["from"] == "measured here"
-    assert found["values"]["fit.mode"] == {"value": "mass", "se": None, "from": "default"}
+    assert gain["from"] == "measured from the movie"
+    assert found["values"]["fit.mode"] == {"value": "mass", "se": None, "from": "assumed"}
     assert abs(gain["value"] - GAIN) < 4 * gain["se"] < 0.1
     seen = found["preview"]
     assert seen["light_e"] == pytest.approx(1e5, rel=0.05)
@@ -144,7 +171,7 @@ def test_what_the_file_says_is_said(ome: Path, plain: Path, capsys) -> None:
         "200 frames per second" in shown.err
     )
     assert "not known: kind of sample" in shown.err
-    assert shown.out.count("the file's metadata (ome)") == 4
+    assert shown.out.count("read from the file (ome)") == 4
     assert main(["init", str(plain), "--yes", "--pixel-size-nm=84", "--overwrite"]) == 0
     assert "the file has no metadata that help" in capsys.readouterr().err
 
@@ -180,7 +207,7 @@ def test_particles_that_move_are_told_from_those_that_land(
                  "--quiet", *options]) == 0  # fmt: skip
     found = _found(capsys, str(movie))
     mode = found["values"]["fit.mode"]
-    assert (mode["value"], mode["from"]) == ("track", "measured here")
+    assert (mode["value"], mode["from"]) == ("track", "measured from the movie")
     assert all(found["preview"]["candidates"])
     assert load_config(found["out"]).background.method == "tracks"
 
@@ -241,3 +268,10 @@ def test_fit_finds_the_file_beside_the_movie(plain: Path, tmp_path: Path, capsys
     assert main_fit([str(plain), "--config", str(other), *changes, "--overwrite"]) == 0
     assert "lies beside the movie" not in capsys.readouterr().err
     assert load_config(plain.with_suffix(".iscat") / "config.toml").optics.na == 1.3
+
+
+def test_a_named_set_up_gives_what_is_not_known(ome: Path, capsys) -> None:
+    found = _found(capsys, str(ome), "--instrument", "cobri")
+    assert found["values"]["optics.scheme"]["from"] == "instrument cobri"
+    assert found["values"]["optics.wavelength_nm"] == {"value": 520.0, "se": None, "from": OME_FILE}
+    assert load_config(found["out"]).optics.attenuation == 0.0601

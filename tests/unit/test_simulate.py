@@ -328,5 +328,5 @@ def test_nothing_is_overwritten_or_left_half_done(tmp_path: Path) -> None:
 
 def test_counts_beyond_16_bits_are_refused() -> None:
     with pytest.raises(ConfigError, match="16 bits"):
-        Movie(_config({"photons_per_pixel": 7e4}), 1)
+        Movie(_config({"photons_per_pixel": 7e4}, camera={"gain_e_per_adu": 1.0}), 1)
     Movie(_config({"photons_per_pixel": 7e4}, camera={"gain_e_per_adu": 2.0}), 1)
