@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.burnt_in import text_message, without_text
-from iscat_analysis.camera.counts import refuse_overflow, refuse_ratio
+from iscat_analysis.camera.counts import camera_from_config, refuse_overflow, refuse_ratio
 from iscat_analysis.camera.field_sample import whole_frames
-from iscat_analysis.camera.learned import with_camera
+from iscat_analysis.camera.learned import LearnedCamera, with_camera
 from iscat_analysis.camera.metadata import resolve_metadata
 from iscat_analysis.camera.processed import find_processing
 from iscat_analysis.config import Config
@@ -188,7 +188,9 @@ def calibrated(
     ahead: bool = False,
 ) -> Prepared:
     """Take a movie through steps; `ahead` where an analysis follows."""
-    state = Prepared(movie, movie, movie, movie, config, config, ahead, notify)
+    stated = camera_from_config(config.camera, movie.shape[1:], movie.dtype)
+    known = LearnedCamera(config.camera, stated, {}, ())
+    state = Prepared(movie, movie, movie, movie, config, config, known, ahead, notify)
     for step in steps:
         state, findings = step(state)
         for finding in findings:

@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from iscat_analysis.camera.counts import Camera, camera_from_config
+from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.learned import LearnedCamera
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.processed import Processing
@@ -51,6 +51,8 @@ class Prepared:
         breaks until `over_all_stretches`.
     asked : Config
         The same before frames were left out.
+    known : LearnedCamera
+        The camera's numbers, and where they come from.
     ahead : bool
         An analysis follows, whose next sums are begun while the light is judged.
     notify : callable
@@ -63,9 +65,9 @@ class Prepared:
     steady: Stack
     config: Config
     asked: Config
+    known: LearnedCamera
     ahead: bool = False
     notify: Notify = notify_nobody
-    known: LearnedCamera | None = None
     stretches: Stretches = field(default_factory=lambda: Stretches(()))
     kept: KeptFrames | None = None
     processing: Processing | None = None
@@ -88,14 +90,12 @@ class Prepared:
     @property
     def camera(self) -> Camera:
         """The camera, as it is configured until its numbers are learned."""
-        if self.known is not None:
-            return self.known.camera
-        return camera_from_config(self.config.camera, self.shape, self.movie.dtype)
+        return self.known.camera
 
     @property
     def response(self) -> Response | None:
         """Response curve of the camera, where the counts show one."""
-        return None if self.known is None else self.known.response
+        return self.known.response
 
     @property
     def span(self) -> tuple[int, int]:

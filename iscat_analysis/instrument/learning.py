@@ -349,8 +349,8 @@ def calibrate_movie(
             images = scan_particle_images(movie, config, camera)
             seen = Collected(config, images, focus_step_nm=focus_step_nm)
         else:
-            images = bright_particle_images(movie, config, camera, pool, ready.opening)
-            seen = Collected(config, *images)
+            images, others = bright_particle_images(movie, config, camera, pool, ready.opening)
+            seen = Collected(config, images, others)
         progress("particles", 1, 1)
         origin = {
             "movie": movie.path.name,

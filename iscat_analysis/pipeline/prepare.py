@@ -30,7 +30,7 @@ def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     run.clock.lap("optics")
     if ready.background_mode != "sliding":
         _refuse_what_only_slides(run, movie.name)
-    text = None if ready.known is None else ready.known.text
+    text = ready.known.text
     left_out = {"texts": [] if text is None else text_summary(text)}
     summary = {**ready.summary, "left_out": ready.stretches.summary | left_out}
     return replace(ready, summary=summary).over_all_stretches()

@@ -53,8 +53,12 @@ class Preview:
         With what the movie's metadata and its frames say.
     notes : tuple of str
         What an analysis would warn of before its search, one line each.
+    camera : LearnedCamera
+        Its numbers, and where they come from.
+    steady : Stack
+        The frames with what is unsteady in their light divided out.
     prepared : Prepared
-        The movie as an analysis prepares it: camera, light, the stretches of a movie that breaks.
+        All that an analysis knows of the movie before it learns the optics.
 
     Raises
     ------
@@ -81,6 +85,7 @@ class Preview:
         self.prepared = calibrated(movie, config, warn=notes.append)
         self.config = self.prepared.over_all_stretches().config
         self.notes = tuple(notes)
+        self.camera, self.steady = self.prepared.known, self.prepared.steady
         self._search = _SEARCHES[self.prepared.background_mode](self.prepared)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 

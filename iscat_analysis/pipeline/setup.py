@@ -17,10 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.learned import ASSUMPTION, METADATA
+from iscat_analysis.camera.learned import ASSUMPTION, METADATA, LearnedCamera
 from iscat_analysis.camera.learned import MEASURED as BY_NOISE
 from iscat_analysis.config import AUTO, Config, configure, instruments, toml_value
-from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
@@ -161,7 +160,7 @@ def write_setup(
         preview = Preview(stack, config)
         mode, preview = _mode_of(preview, stack, config)
         values = [_with_learning(each, preview.config) for each in values]
-        values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.prepared)]
+        values += [mode, *_each_movie(stack.metadata), *_camera_values(preview.camera)]
         values.append(Value(_CALIBRATION, "", TO_GIVE, written=False))
         found = Setup(
             movie=stack.name,
@@ -254,12 +253,11 @@ def _each_movie(metadata: StackMetadata) -> list[Value]:
     ]
 
 
-def _camera_values(ready: Prepared) -> list[Value]:
+def _camera_values(camera: LearnedCamera) -> list[Value]:
     """List the numbers of the camera, which are measured anew in each movie."""
-    numbers = {} if ready.known is None else ready.known.numbers
     values = []
     for key in _CAMERA:
-        number = numbers[key.partition(".")[2]]
+        number = camera.numbers[key.partition(".")[2]]
         origin = _ORIGINS.get(number.source, f"{MEASURED} ({number.source})")
         values.append(Value(key, number.value, origin, number.se or None, written=False))
     return values
