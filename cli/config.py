@@ -30,20 +30,24 @@ def config(
     A key without a value is unset; take the # away and fill it in.
     """
     with failures(Messages(context.command_path, debug=debug)):
-        from iscat_analysis.config import config_to_toml, configure
+        from iscat_analysis.config import config_to_toml, configure, instruments
 
         changes = [f"fit.mode={mode.value}"] if mode else []
         if mode is Mode.SIZE:  # which fits spheres alone
             changes.append("particle.model=mie")
         text = config_to_toml(configure(instrument=instrument, settings=changes))
-        text = _INTRODUCTION + text.replace("\n[bounds]", f"\n{_one_of_each()}\n[bounds]", 1)
-        print_result("\n".join(_folded(line) for line in text.splitlines()))
+        text = text.replace("\n[bounds]", f"\n{_one_of_each()}\n[bounds]", 1)
+        begun = _INTRODUCTION
+        if instrument:
+            one = instruments[instrument]
+            said = textwrap.wrap(f"{instrument.value}: {one.title} ({one.reference})", WIDTH - 2)
+            begun += "".join(f"# {line}\n" for line in said)
+        print_result("\n".join(_folded(line) for line in f"{begun}\n{text}".splitlines()))
 
 
 _INTRODUCTION = """\
 # Lengths are nm, masses kDa, counts photoelectrons; ranges are [start, stop).
 # A line that begins with # is unset.  Paths are relative to this file.
-
 """
 
 

@@ -9,6 +9,7 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.study.simulate import Movie
+from iscat_cli import main
 from iscat_cli.options import Instrument
 
 HUNDRED = {"particle.mass_kda": 480.0, "bounds.n_before": 100, "bounds.n_after": 100}
@@ -51,6 +52,16 @@ def test_set_ups_are_listed_with_their_publications() -> None:
     for name, one in ia.instruments.items():
         assert any(line.startswith(f"{name}: ") for line in lines)
         assert any(one.reference in line for line in lines)
+
+
+def test_a_printed_set_up_is_read_back(tmp_path: Path, capsys) -> None:
+    path = tmp_path / "setup.toml"
+    for name in NAMES:
+        assert main(["config", "--instrument", name]) == 0
+        path.write_text(capsys.readouterr().out, encoding="utf-8")
+        assert ia.configure(path) == ia.configure(instrument=name)
+        text = path.read_text(encoding="utf-8").replace("\n# ", " ")
+        assert ia.instruments[name].reference in text
 
 
 def test_a_set_up_lies_below_what_is_given(tmp_path: Path) -> None:
