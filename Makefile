@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
-KERNELS := .kernels/.compiled
+KERNELS := $(VENV)/.kernels
 LOWEST := $(VENV)/lowest
 
 # Tests and pages start hundreds of processes, none of which should compile the package anew.
@@ -26,7 +26,7 @@ help:
 	@echo "make test-all     the same with coverage, and the large tests: statistics, random kills"
 	@echo "make test-lowest  unit and physics tests with the lowest versions that pyproject.toml admits"
 	@echo "make lint         style, types, architecture, docstrings"
-	@echo "make kernels      compile the kernels that tests and manual share, in .kernels"
+	@echo "make kernels      compile the kernels that tests and manual share, in the user's cache"
 	@echo "make bench        speed and efficiency, against peers"
 	@echo "make docs         the manual, in docs/_build/html; runs all of its code blocks"
 	@echo "make docs-and-test  the manual beside the tests, without lint, as .ci/run does"
@@ -64,7 +64,7 @@ kernels: $(KERNELS)
 # Compiled once, while the style is judged, and not by every worker and every page.
 $(KERNELS): $(STAMP) docs/kernel_cache.py $(wildcard iscat_analysis/_kernels/*.py)
 	$(BIN)/python docs/kernel_cache.py
-	@mkdir -p $(@D) && touch $@
+	@touch $@
 
 lint-and-kernels: $(STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint kernels
@@ -101,5 +101,5 @@ docs-and-test: $(KERNELS)
 	@$(MAKE) --no-print-directory --jobs=2 docs tests
 
 clean:
-	rm -rf $(VENV) .kernels $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
+	rm -rf $(VENV) $(DEMO) build dist docs/_build docs/reference/api *.egg-info .coverage* \
 	    .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

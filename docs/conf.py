@@ -24,9 +24,6 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
 
 from blocks import Interpreter, blocks_of, prepare, run_page  # noqa: E402
-from kernel_cache import share_kernels  # noqa: E402
-
-share_kernels(HERE.parent)
 
 import iscat_analysis  # noqa: E402
 from iscat_analysis.schemas import schema, schema_names  # noqa: E402

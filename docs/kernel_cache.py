@@ -1,4 +1,4 @@
-"""One folder of compiled kernels for the tests, the manual, and every process that they start."""
+"""Compile, before tests and manual begin, the kernels that most of their processes need."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ import gc
 import os
 import sys
 import tempfile
-from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
-from subprocess import PIPE, Popen
+from subprocess import Popen
 
 ROOT = Path(__file__).resolve().parent.parent
 ANOTHER = "another"
@@ -25,20 +23,6 @@ MOVING = (
 )  # fmt: skip
 
 
-def share_kernels(root: Path) -> None:
-    """Name the folder in the environment, unless it is named there.
-
-    Kernels that were compiled with one version of NumPy or Numba do not serve another.
-
-    Parameters
-    ----------
-    root : Path
-        The checkout.
-    """
-    names = (f"{name}-{version(name)}" for name in ("numba", "numpy"))
-    os.environ.setdefault("NUMBA_CACHE_DIR", str(root / ".kernels" / "_".join(names)))
-
-
 def compile_kernels() -> None:
     """Do small jobs of every kind, so that no two processes compile the same kernel later.
 
@@ -46,20 +30,12 @@ def compile_kernels() -> None:
     in common are there, another process follows the particle that moves.
     """
     do_job("landing", FEW)
-    with Popen([sys.executable, __file__, ANOTHER], stdout=PIPE, text=True) as another:
-        another.stdout.readline()  # a process that begins removes files which are half written
+    with Popen([sys.executable, __file__, ANOTHER]) as another:
         for sample, changes in (("mass", ONE), ("mass", COMA), ("joint", ONE)):
             do_job(sample, changes)
         find_two_species()
     if another.returncode:
         raise RuntimeError(f"the particle that moves: status {another.returncode}")
-
-
-def follow_particle() -> None:
-    """Do the part of the other process."""
-    import_module("iscat_analysis._kernels")
-    print("begun", flush=True)
-    do_job("landing", MOVING)
 
 
 def do_job(sample: str, changes: tuple[str, ...]) -> None:
@@ -89,6 +65,5 @@ def find_two_species() -> None:
 
 if __name__ == "__main__":
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does, not its function
-    share_kernels(ROOT)
     gc.disable()  # compilers leave few cycles, and to look for them takes a tenth of the time
-    follow_particle() if sys.argv[1:] == [ANOTHER] else compile_kernels()
+    do_job("landing", MOVING) if sys.argv[1:] == [ANOTHER] else compile_kernels()

@@ -6,7 +6,6 @@ import gc
 import math
 import os
 import signal
-import sys
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
@@ -14,11 +13,6 @@ import pytest
 from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "docs"))
-
-from kernel_cache import share_kernels  # noqa: E402
-
-share_kernels(ROOT)
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("PYTHONFAULTHANDLER", "1")  # a crash of a command says where
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of workers and commands

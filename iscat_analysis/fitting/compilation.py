@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,19 +13,26 @@ from iscat_analysis import _kernels
 
 PATIENCE_S = 1.0  # of compilation, before it is announced
 _ROOM = f"{_kernels.__name__}."
+ANNOUNCED = threading.Event()
+"""Set once this process has said it."""
 
 
 class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
-    """Listens to Numba; `compiling` makes it."""
+    """Listens to Numba; `compiling` makes it.
+
+    Compilers leave few cycles of objects, and to look for them takes a tenth of the time.
+    """
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         self._notify = notify
         self._depth = 0
         self._timer: threading.Timer | None = None
+        self._collects = gc.isenabled()
 
     def on_start(self, event: event.Event) -> None:
         """Note that a function is being compiled."""
         self._depth += 1
+        gc.disable()
         ours = event.data["dispatcher"].py_func.__module__.startswith(_ROOM)
         if ours and self._timer is None:
             self._timer = threading.Timer(PATIENCE_S, self._announce)
@@ -35,10 +43,13 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
         """Note that it is compiled."""
         del event
         self._depth -= 1
+        if self._collects and not self._depth:
+            gc.enable()
 
     def _announce(self) -> None:
-        if self._depth:
-            self._notify("compiling the numerical kernels, once per installation…")
+        if self._depth and not ANNOUNCED.is_set():
+            ANNOUNCED.set()
+            self._notify("compiling the numerical kernels of this analysis; later runs load them…")
 
     def close(self) -> None:
         """Stop listening."""
@@ -48,22 +59,10 @@ class Compilation(event.Listener):  # type: ignore[misc]  # Numba is not typed
 
 @contextmanager
 def compiling(notify: Callable[[str], None]) -> Iterator[None]:
-    """Say which functions are being compiled while the block runs."""
-    if _kernels.TEMPORARY:
-        notify(
-            "compiled kernels cannot be kept, because neither the installation nor the home "
-            "folder can be written: every run compiles them anew; set NUMBA_CACHE_DIR to a folder "
-            "that can be written"
-        )
-    elif _kernels.NO_ROOM:
-        notify(
-            f"compiled kernels cannot be kept in {_kernels.FOLDER} ({_kernels.NO_ROOM}): every run "
-            "compiles them anew; make room there, or set NUMBA_CACHE_DIR to another folder"
-        )
+    """Say once in this process that kernels are compiled, if they are while the block runs."""
     listener = Compilation(notify)
     try:
         with event.install_listener("numba:compile", listener):
             yield
     finally:
         listener.close()
-        _kernels.record_checksums()

@@ -29,7 +29,6 @@ from report_factory import make_analysis
 from sketches import sketch_figures
 from small_movies import LANDING
 
-from iscat_analysis._kernels import record_checksums
 from iscat_analysis.config import load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
@@ -101,9 +100,8 @@ class Runner:
     ``{"status": …, "err": …, "seconds": …}``; a signal's status is negative.
     """
 
-    def __init__(self, folder: Path, kernels: Path) -> None:
+    def __init__(self, folder: Path) -> None:
         self.bench = folder
-        self.kernels = kernels
 
     @cached_property
     def duration(self) -> float:
@@ -139,10 +137,7 @@ class Runner:
             process = subprocess.Popen(
                 [sys.executable, str(script), told], cwd=order["cwd"], pass_fds=[ready],
                 stdout=subprocess.DEVNULL, stderr=err,
-                env={
-                    **os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1",
-                    "NUMBA_CACHE_DIR": str(self.kernels),
-                },
+                env={**os.environ, "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"},
             )  # fmt: skip
             os.close(ready)
             os.read(begun, 1)
@@ -166,13 +161,9 @@ def runner(tmp_path_factory: pytest.TempPathFactory) -> Runner:
     bench = tmp_path_factory.mktemp("bench")
     (bench / "setup.toml").write_text(SETUP)
     write_stack(load_config(bench / "setup.toml"), bench / "movie.tif")
-    kernels = tmp_path_factory.mktemp("kernels")
-    runner = Runner(bench, kernels)
+    runner = Runner(bench)
     first = runner.here({"run": FIT, "cwd": str(bench)})
     assert first["status"] == 0, first["err"]
-    # All that this run compiled is kept for those that are killed, in a folder of their own.
-    record_checksums()
-    shutil.copytree(os.environ["NUMBA_CACHE_DIR"], kernels, dirs_exist_ok=True)
     return runner
 
 

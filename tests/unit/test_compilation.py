@@ -1,25 +1,91 @@
-"""Compiled kernels: what is said while they are made, and where they are kept."""
+"""Compiled kernels: what is said while they are made, and that those kept are of these sources."""
 
 from __future__ import annotations
 
+import ast
+import gc
+import importlib
+import json
 import os
+import pkgutil
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 import time
+import zipfile
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 import iscat_analysis
 from iscat_analysis import _kernels
-from iscat_analysis._kernels import checksums
+from iscat_analysis._kernels.kept import Kept
 from iscat_analysis.fitting import compilation as module
 from iscat_analysis.fitting.compilation import compiling
 
 ROOM = "iscat_analysis._kernels"
+PACKAGE = Path(iscat_analysis.__file__).parent
+INLINED = """
+from iscat_analysis._kernels import kernel
+
+@kernel()
+def factor():
+    return 2.0
+"""
+CALLER = """
+from iscat_analysis._kernels import kernel
+from iscat_analysis._kernels.inlined import factor
+
+@kernel()
+def scaled(value):
+    return factor() * value
+"""
+LAYOUTS = """
+from iscat_analysis._kernels import kernel
+
+@kernel()
+def total(values):
+    total = 0.0
+    for value in values.flat:
+        total += value
+    return total
+"""
+SCALE = """
+from iscat_analysis._kernels.caller import scaled
+print(scaled(3.0), sum(scaled.stats.cache_hits.values()))
+"""
+WAIT = "print('begun', flush=True)\ninput()\n"
+SERVER = """
+import json, os, sys, traceback
+import numba, numpy
+numba.njit(lambda value: value + 1.0)(1.0)
+for line in sys.stdin:
+    environment, code, *streams = json.loads(line)
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            for stream, name in enumerate(streams, 1):
+                os.dup2(os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), stream)
+            os.environ.update(environment)
+            numba.config.reload_config()
+            sys.dont_write_bytecode = True
+            sys.path.insert(0, environment["PYTHONPATH"])
+            exec(code, {})
+            status = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            sys.stdout.flush()
+            os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 
 
 def kernel(name: str) -> dict[str, SimpleNamespace]:
@@ -27,23 +93,36 @@ def kernel(name: str) -> dict[str, SimpleNamespace]:
     return {"dispatcher": SimpleNamespace(py_func=SimpleNamespace(__module__=name))}
 
 
-def test_compilation_is_announced_in_one_line_once(monkeypatch):
+@pytest.fixture
+def new_process(monkeypatch):
+    """Begin as a process that has announced nothing."""
+    monkeypatch.setattr(module, "ANNOUNCED", threading.Event())
+
+
+@pytest.mark.usefixtures("new_process")
+def test_compilation_is_announced_once_in_a_process(monkeypatch):
     monkeypatch.setattr(module, "PATIENCE_S", 0.0)
     said = []
-    with compiling(said.append):
-        with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.radial")):
-            while not said:
-                time.sleep(0.001)
-            with event.trigger_event("numba:compile", data=kernel("numba.np.arrayobj")):
-                pass
-        for _ in range(2):
-            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.scoring")):
-                time.sleep(0.05)
+    with (
+        compiling(said.append),
+        event.trigger_event("numba:compile", data=kernel(f"{ROOM}.radial")),
+    ):
+        while not said:
+            time.sleep(0.001)
+        with event.trigger_event("numba:compile", data=kernel("numba.np.arrayobj")):
+            pass
+    with (
+        compiling(said.append),  # of another movie
+        event.trigger_event("numba:compile", data=kernel(f"{ROOM}.scoring")),
+    ):
+        time.sleep(0.05)
     with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.moving")):
         pass
-    assert said == ["compiling the numerical kernels, once per installation…"]
+    assert len(said) == 1
+    assert said[0].startswith("compiling the numerical kernels")
 
 
+@pytest.mark.usefixtures("new_process")
 def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
     monkeypatch.setattr(module, "PATIENCE_S", 0.05)
     said = []
@@ -52,6 +131,16 @@ def test_nothing_is_said_of_a_kernel_that_is_quick(monkeypatch):
             pass
         time.sleep(0.2)
     assert not said
+
+
+def test_cycles_are_looked_for_again_once_a_kernel_is_compiled():
+    assert gc.isenabled()
+    with compiling(print):
+        with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.sliding")):
+            with event.trigger_event("numba:compile", data=kernel(f"{ROOM}.lines")):
+                pass
+            assert not gc.isenabled()
+        assert gc.isenabled()
 
 
 @pytest.mark.large
@@ -73,222 +162,334 @@ print(*(len(kernel.signatures) for kernel in (radial_signal, lattice_signal, sta
     assert done.stdout.split() == ["1", "0", "0"]
 
 
-SUPPORT = """
-import numpy as np
-from iscat_analysis._kernels.support import supported
-from iscat_analysis.fitting import compilation
+def test_all_that_kernels_take_from_the_package_decides_the_folder():
+    """A constant from elsewhere would be compiled in, and not be hashed."""
+    for path in (PACKAGE / "_kernels").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [node.module] if isinstance(node, ast.ImportFrom) else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            for name in names:
+                assert (
+                    not name.startswith("iscat_analysis")
+                    or name.startswith(ROOM)
+                    or name == "iscat_analysis.errors"
+                ), f"{path.name} takes {name}"
 
-compilation.PATIENCE_S = 3600.0  # a busy machine takes longer, and says so
-with compilation.compiling(print):
-    edge = np.array([-100.0, 100.0])
-    places = np.array([[0, 0, 50, 1, 0], [900, 0, 50, 1, 0]], dtype=float)
-    print(*supported(places, edge, edge, 5.0, 500.0, 0.0, 100.0, 1.0))
-    print(sum(supported.stats.cache_hits.values()))
-"""
+
+def test_all_kernels_are_kept_but_those_that_have_no_code_of_their_own():
+    for found in pkgutil.iter_modules(_kernels.__path__):
+        names = vars(importlib.import_module(f"{ROOM}.{found.name}"))
+        for name, dispatcher in names.items():
+            if (
+                isinstance(dispatcher, Dispatcher)
+                and "no_cfunc_wrapper" in dispatcher.targetoptions
+            ):
+                assert isinstance(dispatcher._cache, Kept), f"{found.name}.{name}"
 
 
-def supported(folder, *, before=""):
-    """Run a kernel that is kept in a folder, and give what is printed."""
-    return subprocess.run(
-        [sys.executable, "-c", before + SUPPORT], env=os.environ | {"NUMBA_CACHE_DIR": str(folder)},
-        capture_output=True, text=True, check=True,
-    ).stdout.splitlines()  # fmt: skip
+class Small:
+    """A package of few small kernels around the real machinery, and processes that use it."""
+
+    def __init__(self, folder: Path) -> None:
+        self.root = folder / "root"
+        self.cache = folder / "cache"
+        self.kernels = self.root / "iscat_analysis" / "_kernels"
+        self.kernels.mkdir(parents=True)
+        (self.root / "iscat_analysis" / "__init__.py").touch()
+        shutil.copy(PACKAGE / "errors.py", self.root / "iscat_analysis")
+        for name in ("__init__.py", "kept.py"):
+            shutil.copy(PACKAGE / "_kernels" / name, self.kernels)
+        for name, text in (("inlined", INLINED), ("caller", CALLER), ("layouts", LAYOUTS)):
+            (self.kernels / f"{name}.py").write_text(text, encoding="utf-8")
+
+    def edit(self, before: str = "2.0", after: str = "200.0") -> None:
+        """Change the inlined kernel."""
+        path = self.kernels / "inlined.py"
+        path.write_text(path.read_text(encoding="utf-8").replace(before, after), encoding="utf-8")
+
+    def environment(self, **changes: str) -> dict[str, str]:
+        return os.environ | {
+            "PYTHONPATH": str(self.root), "NUMBA_CACHE_DIR": str(self.cache),
+            "PYTHONDONTWRITEBYTECODE": "1", **changes,
+        }  # fmt: skip
+
+    def run(self, code: str = SCALE, **changes: str) -> tuple[str, str]:
+        """Run a program in a copy of a process that has loaded Numba; give both streams."""
+        streams = [self.root / name for name in ("out", "err")]
+        order = [self.environment(**changes), code, *map(str, streams)]
+        status = tell(_server(), json.dumps(order))
+        out, err = (path.read_text(encoding="utf-8") for path in streams)
+        assert status == "0", err
+        return out.strip(), err
+
+    def run_afresh(self, code: str, **changes: str) -> tuple[str, str]:
+        """Run a program in a process of its own, with pipes; give both streams."""
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=self.environment(**changes), cwd=self.root.parent,
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        return done.stdout.strip(), done.stderr
+
+    def start(self, code: str) -> subprocess.Popen[str]:
+        """Start a program that is talked to."""
+        return subprocess.Popen(
+            [sys.executable, "-c", code], env=self.environment(), cwd=self.root.parent,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+
+    def files(self) -> list[Path]:
+        """Give all files of the cache."""
+        return sorted(path for path in self.cache.rglob("*") if path.is_file())
+
+
+@cache
+def _server() -> subprocess.Popen[str]:
+    """Start what copies itself for each order; it ends with this process, which it listens to."""
+    return subprocess.Popen(
+        [sys.executable, "-c", SERVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+
+
+def tell(process: subprocess.Popen[str], line: str = "go") -> str:
+    """Send a line, and give the one that is answered."""
+    process.stdin.write(f"{line}\n")
+    process.stdin.flush()
+    return process.stdout.readline().strip()
+
+
+@pytest.fixture
+def small(tmp_path):
+    return Small(tmp_path)
 
 
 @pytest.fixture(scope="module")
 def compiled(tmp_path_factory):
-    """Give a folder that holds a kernel."""
-    folder = tmp_path_factory.mktemp("kernels")
-    assert supported(folder) == ["True False", "0"]
-    return folder
+    """Give a package with compiled kernels, to be copied."""
+    small = Small(tmp_path_factory.mktemp("compiled"))
+    assert small.run() == ("6.0 0", "")
+    return small
 
 
 @pytest.fixture
 def kept(compiled, tmp_path):
-    """Give a copy of it to damage."""
-    return Path(shutil.copytree(compiled, tmp_path / "kernels"))
+    """Give a copy, to be damaged."""
+    copy = Small(tmp_path)
+    shutil.copytree(compiled.cache, copy.cache)
+    return copy
 
 
-def _cut(kept: bytes) -> bytes:
-    return kept[: len(kept) // 2]
+def test_an_inlined_kernel_that_is_edited_reaches_its_callers(kept):
+    assert kept.run() == ("6.0 1", "")  # control: kept kernels are taken
+    kept.edit()
+    assert kept.run() == ("600.0 0", "")
+    assert kept.run() == ("600.0 1", "")
+    kept.edit("200.0", "2.0")
+    assert kept.run() == ("6.0 1", "")  # those of before are there still
 
 
-def _flipped(kept: bytes) -> bytes:
-    """Flip a bit in the middle, where there is code."""
-    place = len(kept) // 2
-    return kept[:place] + bytes([kept[place] ^ 1]) + kept[place + 1 :]
+def test_a_process_that_began_before_an_edit_leaves_its_code_to_none_that_begin_later(small):
+    old = small.start(f"from {ROOM} import caller\n{WAIT}{SCALE}")
+    assert old.stdout.readline() == "begun\n"
+    small.edit()
+    shutil.rmtree(small.cache, ignore_errors=True)
+    out, _ = old.communicate("go\n", timeout=300)
+    assert out.split() == ["6.0", "0"]
+    assert small.run() == ("600.0 0", "")
 
 
-@pytest.mark.parametrize(
-    ("damage", "suffix"),
-    [
-        (_cut, "nbi"),
-        (_flipped, "nbc"),
-        *(
-            pytest.param(*case, marks=pytest.mark.large)
-            for case in ((_cut, "nbc"), (_flipped, "nbi"))
-        ),
-    ],
-)
-def test_kept_kernels_that_are_damaged_are_compiled_again(kept, suffix, damage):
-    (file,) = kept.glob(f"*/*.{suffix}")
-    file.write_bytes(damage(file.read_bytes()))
-    assert supported(kept) == ["True False", "0"]
+def test_kernels_that_are_loaded_after_an_edit_are_not_kept_as_those_of_before(small):
+    early = small.start(f"import {ROOM}\n{WAIT}{SCALE}")
+    assert early.stdout.readline() == "begun\n"
+    small.edit()
+    out, _ = early.communicate("go\n", timeout=300)
+    assert out.split() == ["600.0", "0"]
+    small.edit("200.0", "2.0")
+    assert small.run()[0].startswith("6.0 ")
 
 
-def test_kernels_that_nobody_vouches_for_are_compiled_again(kept):
-    """The process that wrote them was killed, perhaps while it wrote."""
-    (listed,) = kept.glob("*/checksums.json")
-    listed.unlink()
-    assert supported(kept) == ["True False", "0"]
-    assert supported(kept) == ["True False", "1"]  # control: those that are listed are taken
-
-
-def test_a_process_does_not_vouch_for_what_others_compiled(kept):
-    """A file is damaged while a process runs that takes another file from the same folder."""
-    (file,) = kept.glob("*/support.*.nbc")
-    whole = file.read_bytes()
-    damage = f"""
-import pathlib
-from iscat_analysis import _kernels
-pathlib.Path({str(file)!r}).write_bytes({_flipped(whole)!r})
+STEPS = """
+import os, sys
 import numpy as np
-from iscat_analysis._kernels.lines import largest
-largest(np.zeros(3))
-"""
-    subprocess.run(
-        [sys.executable, "-c", damage], env=os.environ | {"NUMBA_CACHE_DIR": str(kept)},
-        check=True,
-    )  # fmt: skip
-    assert supported(kept) == ["True False", "0"]  # removed, and compiled again
-
-
-def _list_in(folder: Path, name: str, content: bytes) -> None:
-    (folder / f"{name}-1.py311.1.nbc").write_bytes(content)
-
-
-def test_the_list_keeps_what_others_wrote_into_it(tmp_path):
-    for name in ("a.f", "b.g"):
-        _list_in(tmp_path, name, name.encode())
-        checksums.record(str(tmp_path), (f"{name}-1.",))
-    checksums.remove_damaged(str(tmp_path))
-    assert len(list(tmp_path.glob("*.nbc"))) == 2
-    _list_in(tmp_path, "a.f", b"damaged")
-    checksums.record(str(tmp_path), ("b.g-1.",))
-    checksums.remove_damaged(str(tmp_path))
-    assert [path.name for path in tmp_path.glob("*.nbc")] == ["b.g-1.py311.1.nbc"]
-
-
-def test_a_process_that_lives_on_lists_what_it_compiled(tmp_path):
-    """Others that start meanwhile would compile it again."""
-    code = """
-import json, pathlib, sys
-import numpy as np
-from iscat_analysis._kernels.lines import largest
-for values in (np.zeros(3), np.zeros(3, np.float32)):
-    largest(values)
-(listed,) = pathlib.Path(sys.argv[1]).glob("*/checksums.json")
-print(*json.loads(listed.read_text()))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True,
-        env=os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)},
-    )  # fmt: skip
-    assert "lines.largest-" in done.stdout
-
-
-def test_processes_that_end_together_lose_no_entry(tmp_path):
-    code = """
-import sys
-from iscat_analysis._kernels import checksums
+from iscat_analysis._kernels.layouts import total
+values = np.arange(10.0){layout}
+replace = os.replace
+def paused(*names):
+    print("paused", flush=True)
+    sys.stdin.readline()
+    replace(*names)
+os.replace = paused
 sys.stdin.readline()
-for k in range(20):
-    checksums.record(sys.argv[1], (f"{sys.argv[2]}{k}.f-1.",))
+result = total(values)
+os.replace = replace
+print(result, flush=True)
 """
-    for name in "abc":
-        for k in range(20):
-            _list_in(tmp_path, f"{name}{k}.f", name.encode())
-    running = [
-        subprocess.Popen(
-            [sys.executable, "-c", code, str(tmp_path), name], stdin=subprocess.PIPE, text=True
-        )
-        for name in "abc"
-    ]
-    for process in running:
-        process.communicate("go\n", timeout=300)
-        assert process.returncode == 0
-    checksums.remove_damaged(str(tmp_path))
-    assert len(list(tmp_path.glob("*.nbc"))) == 60
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
-def test_a_list_that_finds_no_room_leaves_nothing(tmp_path):
-    _list_in(tmp_path, "a.f", b"compiled")
-    code = """
-import resource, sys
-from iscat_analysis._kernels import checksums
-resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))
-checksums.record(sys.argv[1], ("a.f-1.",))
+def test_two_layouts_that_are_compiled_at_the_same_time_are_not_confused(small):
+    """The files of each process get their names while the other is between two such moments."""
+    first, other = (small.start(STEPS.format(layout=layout)) for layout in ("", "[::-2]"))
+    assert tell(first) == tell(other) == "paused"
+    answers = [tell(first)]
+    for process, right in ((other, "25.0"), (first, "45.0")):
+        answer = answers.pop() if process is first else "paused"
+        while answer == "paused":
+            answer = tell(process)
+        assert answer == right
+        process.communicate(timeout=300)
+    later = """
+import numpy as np
+from iscat_analysis._kernels.layouts import total
+print(total(np.arange(10.0)), total(np.arange(10.0)[::-2]), sum(total.stats.cache_hits.values()))
 """
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
-    assert {path.name for path in tmp_path.iterdir()} == {"a.f-1.py311.1.nbc", "checksums.lock"}
+    assert small.run(later) == ("45.0 25.0 2", "")
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
-def test_kernels_that_cannot_be_kept_for_want_of_room_end_no_run(tmp_path):
-    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
-    said, result, hits = supported(tmp_path, before=full)
-    assert (result, hits) == ("True False", "0")
-    assert said.startswith(f"compiled kernels cannot be kept in {tmp_path}")
-    assert "File too large" in said
-    assert not list(tmp_path.rglob("*.nb?"))  # that a later run could take
-
-
-def test_kernels_are_kept_where_nothing_can_be_written(tmp_path):
-    package = tmp_path / "iscat_analysis"
-    shutil.copytree(
-        Path(iscat_analysis.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGKILL")
+@pytest.mark.parametrize("moment", ["before", "after"])
+def test_what_a_killed_process_was_writing_is_not_used(kept, moment):
+    (kept.kernels / "caller.py").write_text(
+        CALLER.replace("value\n", "value + 1\n"), encoding="utf-8"
     )
-    blocked = tmp_path / "file"
-    blocked.write_text("a file is no folder, for whoever runs this", encoding="utf-8")
-    (package / "_kernels" / "__pycache__").write_text("", encoding="utf-8")
-    environment = {
-        **{name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"},
-        "PYTHONPATH": str(tmp_path),
-        "HOME": str(blocked),
-        "XDG_CACHE_HOME": str(blocked),
-        "LOCALAPPDATA": str(blocked),
-        "TMPDIR": str(tmp_path),
-        "PYTHONDONTWRITEBYTECODE": "1",
-    }
-    code = """
-import os, numpy as np
-from iscat_analysis import _kernels
-from iscat_analysis._kernels import checksums
-from iscat_analysis._kernels.curvature import _weighted
-assert _weighted(np.ones(4), np.ones(4)) == 4
-folder = _kernels.environment()["NUMBA_CACHE_DIR"]
-print(_kernels.TEMPORARY, folder, sum(len(files) for _, _, files in os.walk(folder)))
+    beside = kept.start(f"import {ROOM}\n{WAIT}{SCALE}")
+    assert beside.stdout.readline() == "begun\n"
+    die = f"""
+import os
+from iscat_analysis._kernels import inlined
+inlined.factor()
+replace = os.replace
+def dying(*names):
+    if {moment!r} == "after":
+        replace(*names)
+    os.kill(os.getpid(), {int(signal.SIGKILL)})
+os.replace = dying
 """
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment,
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    temporary, folder, files = done.stdout.split()
-    assert temporary == "True"
-    assert Path(folder).parent == tmp_path
-    assert int(files) == 2  # an index, and what it names
-    assert not Path(folder).exists()
+    killed = kept.start(die + SCALE)
+    killed.communicate(timeout=300)
+    assert killed.returncode == -signal.SIGKILL
+    out, _ = beside.communicate("go\n", timeout=300)
+    assert out.split() == ["7.0", str(int(moment == "after"))]
+    assert kept.run() == ("7.0 1", "")
 
 
-def test_it_is_said_where_kernels_cannot_be_kept(monkeypatch):
-    said = []
-    with compiling(said.append):
-        pass
-    assert not said
-    monkeypatch.setattr(_kernels, "TEMPORARY", True)
-    with compiling(said.append):
-        pass
-    assert len(said) == 1
-    assert "NUMBA_CACHE_DIR" in said[0]
+def wheel(small: Small, version: str, folder: Path) -> str:
+    """Pack the package."""
+    info = f"iscat_analysis-{version}.dist-info"
+    path = folder / f"iscat_analysis-{version}-py3-none-any.whl"
+    tag = "Wheel-Version: 1.0\nGenerator: test\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    files = {
+        str(file.relative_to(small.root)): file.read_bytes() for file in small.root.rglob("*.py")
+    } | {
+        f"{info}/METADATA": f"Metadata-Version: 2.1\nName: iscat-analysis\nVersion: {version}\n",
+        f"{info}/WHEEL": tag,
+    }
+    with zipfile.ZipFile(path, "w") as packed:
+        for name, content in files.items():
+            packed.writestr(name, content)
+        packed.writestr(
+            f"{info}/RECORD", "".join(f"{name},,\n" for name in (*files, f"{info}/RECORD"))
+        )
+    return str(path)
+
+
+def test_a_new_version_that_is_installed_over_the_old_one_runs_its_own_kernels(kept, tmp_path):
+    place = tmp_path / "installed"
+    for version, result in (("0.1.0", "6.0"), ("0.1.1", "600.0")):
+        subprocess.run(
+            [
+                sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index",
+                "--no-compile", "--upgrade", "--target", str(place), wheel(kept, version, tmp_path),
+            ],
+            check=True, stdin=subprocess.DEVNULL,
+        )  # fmt: skip
+        here = "import iscat_analysis, sys\nassert 'installed' in iscat_analysis.__file__\n"
+        said, _ = kept.run(here + SCALE, PYTHONPATH=str(place))
+        assert said.split()[0] == result
+        kept.edit()
+
+
+def _cut(content: bytes) -> bytes:
+    return content[: len(content) // 2]
+
+
+def _flipped(content: bytes) -> bytes:
+    """Flip a bit in the middle, where there is code."""
+    place = len(content) // 2
+    return content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :]
+
+
+@pytest.mark.parametrize("damage", [_cut, _flipped])
+def test_kept_kernels_that_are_damaged_are_compiled_again_and_it_is_said(kept, damage):
+    (file,) = (path for path in kept.files() if path.name.startswith("caller.scaled"))
+    file.write_bytes(damage(file.read_bytes()))
+    out, err = kept.run()
+    assert out == "6.0 0"
+    assert f"{file}: is damaged, and is compiled again" in err
+    assert kept.run() == ("6.0 1", "")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no sizes of files")
+def test_kernels_that_cannot_be_kept_for_want_of_room_end_no_run(small):
+    full = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))\n"
+    out, err = small.run_afresh(full + SCALE)
+    assert out == "6.0 0"
+    assert err.count("compiled kernels cannot be kept in ") == 1
+    assert f"{small.cache}" in err
+    assert "File too large" in err
+    assert "NUMBA_CACHE_DIR" in err
+    assert not small.files()
+
+
+FOLDER = SCALE + "from iscat_analysis._kernels import kept\nprint(kept.folder())\n"
+
+
+def test_where_kernels_are_kept(small, tmp_path):
+    """In the user's cache; in the package where the user has none; nowhere, which is said."""
+    blocked, home = tmp_path / "file", tmp_path / "home"
+    blocked.write_text("a file is no folder, for whoever runs this", encoding="utf-8")
+
+    def run(home: Path) -> tuple[str, str, str]:
+        names = ("HOME", "XDG_CACHE_HOME", "LOCALAPPDATA")
+        out, err = small.run(FOLDER, NUMBA_CACHE_DIR="", **dict.fromkeys(names, str(home)))
+        assert out.split()[:2] == ["6.0", "0"]
+        return out.split()[2], err, home.name
+
+    assert Path(run(home)[0]).is_relative_to(home)
+    assert run(home / "x")[1] == ""
+    package = small.kernels / "__pycache__"
+    assert Path(run(blocked)[0]).parent == package
+    shutil.rmtree(package)
+    package.touch()
+    assert run(blocked)[1].count("compiled kernels cannot be kept in ") == 1
+
+
+def test_what_decides_machine_code_decides_the_folder(kept):
+    """The processor; whether indices are checked.  Not how many threads there are."""
+    (folder,) = kept.cache.iterdir()
+    processor, _ = kept.run_afresh(FOLDER, NUMBA_CPU_NAME="generic")
+    checked, _ = kept.run(FOLDER, NUMBA_BOUNDSCHECK="1")
+    for said in (processor, checked):
+        assert said.split()[:2] == ["6.0", "0"]
+        assert said.split()[2] != str(folder)
+    assert kept.run(NUMBA_NUM_THREADS="1") == ("6.0 1", "")
+
+
+def test_kernels_that_are_not_compiled_at_all_run(small):
+    """NUMBA_DISABLE_JIT is for debuggers."""
+    code = "from iscat_analysis._kernels.caller import scaled\nprint(scaled(3.0))\n"
+    assert small.run(code, NUMBA_DISABLE_JIT="1") == ("6.0", "")
+    assert not small.files()
+
+
+def test_folders_that_nobody_used_for_a_month_are_removed_when_one_is_added(kept):
+    (used,) = kept.cache.iterdir()
+    days = {"iscat-kernels-old": 40, "iscat-kernels-last-week": 7, "of-somebody-else": 400}
+    for name, age in days.items():
+        (kept.cache / name).mkdir()
+        then = time.time() - 86400.0 * age
+        os.utime(kept.cache / name, (then, then))
+    kept.edit()
+    kept.run()
+    names = {path.name for path in kept.cache.iterdir()}
+    assert {used.name, "iscat-kernels-last-week", "of-somebody-else"} < names
+    assert "iscat-kernels-old" not in names
+    assert len(names) == 4
