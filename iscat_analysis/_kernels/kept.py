@@ -83,7 +83,8 @@ def folder() -> str:
     NUMBA_CACHE_DIR names the folder around it.  Otherwise that is the user's cache, or the
     package's where the user has none.
     """
-    parents = [config.CACHE_DIR] if config.CACHE_DIR else [
+    named = config.CACHE_DIR
+    parents = [os.path.abspath(named)] if named else [  # noqa: PTH100  # processes change theirs
         AppDirs("iscat-analysis", appauthor=False).user_cache_dir,
         os.path.join(_SOURCES, "__pycache__"),  # noqa: PTH118
     ]  # fmt: skip
@@ -102,11 +103,11 @@ def folder() -> str:
 
 def _remove_unused(parent: str) -> None:
     """Remove the folders of other sources that no process has begun with for a month."""
-    for entry in os.scandir(parent):
-        if entry.name.startswith(_PREFIX):
-            with suppress(OSError):
-                if time.time() - entry.stat().st_mtime > _UNUSED_S:
-                    shutil.rmtree(entry.path, ignore_errors=True)
+    with suppress(OSError):  # another process removes them as well
+        for entry in os.scandir(parent):
+            unused_s = time.time() - entry.stat().st_mtime
+            if entry.name.startswith(_PREFIX) and unused_s > _UNUSED_S:
+                shutil.rmtree(entry.path, ignore_errors=True)
 
 
 _CHANGED: set[str] = set()
@@ -181,15 +182,6 @@ class Kept:
         finally:
             with suppress(OSError):
                 os.unlink(made)  # noqa: PTH108
-
-    def enable(self) -> None:
-        """Numba asks for it; it is always on."""
-
-    def disable(self) -> None:
-        """Numba asks for it; it is always on."""
-
-    def flush(self) -> None:
-        """Numba asks for it when a function is compiled anew; nothing that is kept is stale."""
 
 
 def _refuse(error: OSError) -> None:
