@@ -9,9 +9,10 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from iscat_cli import INTERRUPTED
 from iscat_cli.batch import EXAMPLE as BATCH_EXAMPLE
@@ -84,7 +85,8 @@ def run(program: str, arguments: Sequence[str]) -> int:
     given = list(arguments)
     if program == "iscat-fit":
         app = _empty()
-        app.command(epilog=_as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit")))(fit)
+        example = _as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit"))
+        app.command(cls=Command, epilog=example)(fit)
     else:
         app = _umbrella()
         if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
@@ -106,7 +108,26 @@ def _umbrella() -> typer.Typer:
 def _add(app: typer.Typer, commands: Sequence[tuple[Callable[..., None], str]]) -> None:
     for command, example in commands:
         summary = (command.__doc__ or "").partition("\n")[0]
-        app.command(epilog=_as_written(example), short_help=summary)(command)
+        told = _as_written(example)
+        app.command(cls=Command, epilog=told, short_help=summary)(command)
+
+
+class Command(TyperCommand):
+    """A command that refuses what is given twice and means one thing."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Read the options, after a look at how often each is given."""
+        if not ctx.resilient_parsing:  # of completion, which has half a command
+            given, _, order = self.make_parser(ctx).parse_args(args=list(args))
+            for option in order:
+                repeated = getattr(option, "multiple", True) or option.nargs != 1
+                if not repeated and order.count(option) > 1:
+                    ctx.fail(f"{option.opts[0]} is given twice and means one thing; leave one out")
+            keys = [text.partition("=")[0].strip() for text in given.get("settings") or ()]
+            for key in keys:
+                if keys.count(key) > 1:
+                    ctx.fail(f"--set {key} is given twice and means one thing; leave one out")
+        return super().parse_args(ctx, args)
 
 
 def _empty() -> typer.Typer:

@@ -12,6 +12,7 @@ import typer
 from iscat_cli.console import Messages, failures, print_json, print_result, short, table
 from iscat_cli.kd import Reaction, upper_end
 from iscat_cli.options import (
+    CalibrationOption,
     ConfigOption,
     JsonOption,
     SchedulerFileOption,
@@ -95,6 +96,7 @@ def batch(
     ],
     config: ConfigOption = None,
     settings: SetOption = None,
+    calibration: CalibrationOption = None,
     standards: StandardsOption = None,
     kd: KdOption = None,
     kd_masses: KdMassesOption = None,
@@ -133,6 +135,7 @@ def batch(
                 out=out,
                 config=config,
                 settings=with_workers(settings, workers),
+                calibration=calibration,
                 standards=standards,
                 kd=None if kd is None else kd.value,
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),

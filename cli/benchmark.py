@@ -41,7 +41,7 @@ def benchmark(
     messages: Messages,
     *,
     config: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(metavar="C.toml", help="Configuration; [bounds] describes the experiment."),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="DIR", help="Output folder.")] = None,
@@ -92,7 +92,7 @@ def benchmark(
         if listed:
             print_result(estimators_table())
             return
-        if config is None:
+        if not config:
             raise ConfigError("--config is missing: give the configuration of the experiment")
         from iscat_analysis.config import load_config
 

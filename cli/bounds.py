@@ -183,7 +183,7 @@ def bounds(
         if preset is not None:
             if out is None:
                 raise ConfigError(f"--preset {preset} needs --out DIR, the folder to write")
-            if config is not None or settings or mode is not None:
+            if config or settings or mode is not None:
                 raise ConfigError(
                     f"--preset {preset} has its own configuration: leave --config, --set and "
                     "--mode away"

@@ -281,7 +281,7 @@ def optics(
 
 def _measure(
     movie: Path,
-    config: Path | None,
+    config: list[Path] | None,
     settings: list[str] | None,
     free: str | None,
     focus_step: float | None,

@@ -59,7 +59,7 @@ def make(
         ),
     ] = None,
     config: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             metavar="C.toml",
             help="In place of a preset: stacks of [bounds], and a movie of [simulation].",
@@ -88,17 +88,18 @@ def make(
     with failures(messages):
         from iscat_analysis.errors import ConfigError
 
-        if (preset is None) == (config is None):
+        if (preset is None) == (not config):
             raise ConfigError("give --preset or --config, one of them")
         if preset is not None and settings:
             raise ConfigError("--set changes a configuration: give --config, and no --preset")
         from iscat_analysis.study.challenge import make_challenge, truth_beside
         from iscat_analysis.study.challenge_presets import parts_of_config, preset_parts
 
-        if config is not None:
+        if config:
             from iscat_analysis.config import load_config
 
-            parts, name = parts_of_config(load_config(config, settings or ()), stacks), config.stem
+            parts = parts_of_config(load_config(config, settings or ()), stacks)
+            name = "-".join(path.stem for path in config)
         else:
             name = str(preset)
             parts = preset_parts(name)

@@ -217,9 +217,9 @@ def failures(messages: Messages) -> Iterator[None]:
 _OPTIONS = {
     **{
         name: name
-        for name in ("config", "dark", "draws", "free", "hold", "inactive", "inject", "k", "kd",
-                     "ladder", "landing", "maps", "model", "offset", "optimize", "out", "overwrite",
-                     "scan", "scheduler", "standards", "steps", "target", "truth")
+        for name in ("calibration", "config", "dark", "draws", "free", "hold", "inactive", "inject",
+                     "k", "kd", "ladder", "landing", "maps", "model", "offset", "optimize", "out",
+                     "overwrite", "scan", "scheduler", "standards", "steps", "target", "truth")
     },
     "above_kda": "above",
     "settings": "set",

@@ -12,6 +12,7 @@ import typer
 
 from iscat_cli.console import Messages, failures, print_json, print_result
 from iscat_cli.options import (
+    CalibrationOption,
     JsonOption,
     Mode,
     ModeOption,
@@ -59,12 +60,14 @@ def fit(
     *,
     mode: ModeOption = None,
     config: Annotated[
-        Path | None,
+        list[Path] | None,
         typer.Option(
             metavar="C.toml",
-            help="Configuration; default iscat.toml beside STACK, which `iscat init` writes.",
+            help="Configuration; default iscat.toml beside STACK, which `iscat init` writes. Of "
+            "several, keys of later ones win.",
         ),
     ] = None,
+    calibration: CalibrationOption = None,
     out: Annotated[
         Path | None,
         typer.Option(metavar="DIR", help="Output folder; default the movie's name with .iscat."),
@@ -143,9 +146,11 @@ def fit(
 
         changes = _changes(settings, mode, frames, background, channels, posterior, workers)
 
+        from iscat_analysis.calibration.mass.tables import with_line
         from iscat_analysis.movie.addresses import MARK, path_beside
 
-        resolved = load_config(setup_of(stack, config, messages), changes)
+        sources = with_line(setup_of(stack, config, messages), calibration)
+        resolved = load_config(sources, changes)
 
         from iscat_analysis.executors import open_executor
 

@@ -17,7 +17,7 @@ from iscat_cli.console import (
     table,
     with_options,
 )
-from iscat_cli.options import JsonOption, OverwriteOption, command
+from iscat_cli.options import CalibrationOption, JsonOption, OverwriteOption, command
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ def kd(
         Path,
         typer.Argument(
             metavar="SAMPLES.csv",
-            help="One row per table: path, and concentration_nm, or a_nm and b_nm.",
+            help="One row per table or movie: path, and concentration_nm, or a_nm and b_nm.",
         ),
     ],
     *,
@@ -89,6 +89,7 @@ def kd(
     sigma: SigmaOption = None,
     limit: LimitOption = None,
     above: AboveOption = None,
+    calibration: CalibrationOption = None,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for kd.csv, kd.json and a figure.")
     ] = None,
@@ -116,6 +117,7 @@ def kd(
             limit_kda=middle,
             limit_sigma_kda=spread,
             above_kda=above,
+            calibration=calibration,
             out=out,
             overwrite=overwrite,
         )

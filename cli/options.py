@@ -69,8 +69,22 @@ ModeOption = Annotated[
 ]
 
 ConfigOption = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--config",
+        metavar="C.toml",
+        help="Configuration; `iscat config` prints one. Of several, keys of later ones win.",
+    ),
+]
+
+CalibrationOption = Annotated[
     Path | None,
-    typer.Option("--config", metavar="C.toml", help="Configuration; `iscat config` prints one."),
+    typer.Option(
+        "--calibration",
+        metavar="LINE.toml",
+        help="Mass line, as `iscat calibrate mass` writes it, in place of any other: masses are "
+        "those of the contrasts.",
+    ),
 ]
 
 SetOption = Annotated[
@@ -144,6 +158,9 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     @wraps(work)
     def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
         told = Messages(context.command_path, quiet=quiet, debug=debug, command=context.obj)
+        if len(configs := given.get("config") or ()) > 1:
+            first, *later = map(str, configs)
+            told.notify(f"the configuration is {first}, with the keys of {', then '.join(later)}")
         work(told, **given)
 
     _, *own = inspect.signature(work, eval_str=True).parameters.values()
@@ -159,13 +176,15 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def setup_of(movie: Path, config: Path | None, messages: Messages) -> Path | None:
-    """Give the configuration of a movie: the one that is named, else ``iscat.toml`` beside it."""
+def setup_of(
+    movie: Path, config: list[Path] | None, messages: Messages
+) -> Path | list[Path] | None:
+    """Give the configuration of a movie: those that are named, else ``iscat.toml`` beside it."""
     from iscat_analysis.movie.addresses import setup_beside
     from iscat_analysis.reading import is_file
 
     beside = setup_beside(movie)
-    if config is not None or not is_file(beside):
+    if config or not is_file(beside):
         return config
     messages.notify(f"the configuration is {beside}, which lies beside the movie")
     return beside

@@ -21,7 +21,8 @@ def simulate(
     messages: Messages,
     *,
     config: Annotated[
-        Path, typer.Option(metavar="C.toml", help="Configuration with a [simulation] section.")
+        list[Path],
+        typer.Option(metavar="C.toml", help="Configuration with a [simulation] section."),
     ],
     out: Annotated[
         Path,

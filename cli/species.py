@@ -19,7 +19,13 @@ from iscat_cli.console import (
     table,
     with_options,
 )
-from iscat_cli.options import JsonOption, OverwriteOption, command, frame_range
+from iscat_cli.options import (
+    CalibrationOption,
+    JsonOption,
+    OverwriteOption,
+    command,
+    frame_range,
+)
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair, whole
 
 if TYPE_CHECKING:
@@ -62,8 +68,8 @@ def species(
         typer.Argument(
             metavar="EVENTS",
             help="Output folder of iscat fit, fits.csv or .parquet, a table of Refeyn's or for "
-            "PhotoMol (h5, csv), or any CSV with a column mass_kda. Of several, the others are "
-            "compared with the first.",
+            "PhotoMol (h5, csv; FILE::movie is one of several movies), or any CSV with a column "
+            "mass_kda or Mass [kDa]. Of several, the others are compared with the first.",
         ),
     ],
     *,
@@ -142,6 +148,7 @@ def species(
     sigma: SigmaOption = None,
     limit: LimitOption = None,
     above: AboveOption = None,
+    calibration: CalibrationOption = None,
     frame_rate: Annotated[
         float | None,
         typer.Option(
@@ -196,8 +203,8 @@ def species(
             )  # fmt: skip
             _compare(
                 messages, events, k, given, monomer, rungs, background=background,
-                sigma=sigma, limit=(middle, spread), above=above, out=out, overwrite=overwrite,
-                as_json=as_json,
+                sigma=sigma, limit=(middle, spread), above=above, calibration=calibration, out=out,
+                overwrite=overwrite, as_json=as_json,
             )  # fmt: skip
             return
 
@@ -206,8 +213,9 @@ def species(
 
         notes: list[str] = []
         events_of = event_table(
-            events[0], sigma_kda=sigma, limit_kda=middle, limit_sigma_kda=spread, above_kda=above
-        )
+            events[0], sigma_kda=sigma, limit_kda=middle, limit_sigma_kda=spread, above_kda=above,
+            calibration=calibration,
+        )  # fmt: skip
         rates = _rates(events[0], events_of, frame_rate, frames)
         found = find_species(
             events_of,
@@ -276,6 +284,7 @@ def _compare(
     sigma: float | None,
     limit: tuple[float | None, float | None],
     above: float | None,
+    calibration: Path | None,
     out: Path | None,
     overwrite: bool,
     as_json: bool,
@@ -288,7 +297,8 @@ def _compare(
         found = compare_tables(
             events, k=k, masses_kda=masses, ladder=monomer, steps=steps,
             background=background, sigma_kda=sigma, limit_kda=limit[0], limit_sigma_kda=limit[1],
-            above_kda=above, out=out, overwrite=overwrite, progress=progress, notify=notes.append,
+            above_kda=above, calibration=calibration, out=out, overwrite=overwrite,
+            progress=progress, notify=notes.append,
         )  # fmt: skip
     names = [str(path) for path in events]
     if as_json:

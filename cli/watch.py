@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,7 @@ from iscat_cli.batch import (
 )
 from iscat_cli.console import Messages, failures, print_json, print_result, with_options
 from iscat_cli.options import (
+    CalibrationOption,
     ConfigOption,
     JsonOption,
     SchedulerFileOption,
@@ -29,6 +30,9 @@ from iscat_cli.options import (
     with_workers,
 )
 from iscat_cli.tables import numbers
+
+if TYPE_CHECKING:
+    from iscat_analysis.config.overrides import Source
 
 EXAMPLE = """Example: a folder that the microscope writes to.
 
@@ -72,6 +76,7 @@ def watch(
     ] = None,
     config: ConfigOption = None,
     settings: SetOption = None,
+    calibration: CalibrationOption = None,
     standards: StandardsOption = None,
     kd: KdOption = None,
     kd_masses: KdMassesOption = None,
@@ -98,7 +103,10 @@ def watch(
                 "--scheduler-file": scheduler_file,
             }  # fmt: skip
             _refuse_options_of_folders(folder, given)
-            _watch_one(messages, folder, out, config, settings, workers, interval, as_json=as_json)
+            from iscat_analysis.calibration.mass.tables import with_line
+
+            setup = with_line(setup_of(folder, config, messages), calibration)
+            _watch_one(messages, folder, out, setup, settings, workers, interval, as_json=as_json)
             return
         from iscat_analysis.day.watch import FOLDER
         from iscat_analysis.day.watch import watch as run
@@ -109,6 +117,7 @@ def watch(
                 out=out,
                 config=config,
                 settings=with_workers(settings, workers),
+                calibration=calibration,
                 standards=standards,
                 kd=None if kd is None else kd.value,
                 kd_masses_kda=None if kd_masses is None else numbers("--kd-masses", kd_masses),
@@ -156,7 +165,7 @@ def _watch_one(
     messages: Messages,
     movie: Path,
     out: Path | None,
-    config: Path | None,
+    setup: Source | Sequence[Source] | None,
     settings: list[str] | None,
     workers: int | None,
     interval: float,
@@ -172,7 +181,7 @@ def _watch_one(
     with messages.progress() as progress:
         found = watch_movie(
             movie,
-            configure(setup_of(movie, config, messages), settings=with_workers(settings, workers)),
+            configure(setup, settings=with_workers(settings, workers)),
             out=folder,
             interval_s=interval,
             progress=progress,

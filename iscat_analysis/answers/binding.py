@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +12,12 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.monomer import monomer_of
+from iscat_analysis.calibration.mass.tables import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
-from iscat_analysis.movie.text_tables import refuse_twice, separator, without_remarks
-from iscat_analysis.reading import is_file, is_folder, read_text
+from iscat_analysis.movie.addresses import path_beside, split_address
+from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.binding import binding_figure
@@ -28,7 +29,13 @@ from iscat_analysis.species.describe import LEAST_EFFICIENCY
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import Model, landing_logits
-from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
+from iscat_analysis.species.tables import (
+    EventTable,
+    event_table,
+    mass_in,
+    refuse_far,
+    sentences,
+)
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 
@@ -117,6 +124,7 @@ def fit_kd(
     limit_kda: float | None = None,
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
+    calibration: Line | None = None,
     tables: Sequence[EventTable | pd.DataFrame] | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -130,8 +138,9 @@ def fit_kd(
         One row for each table of events: ``path``, and ``concentration_nm`` (monomers in all), or
         ``a_nm`` and ``b_nm`` (A and B in all) [nM]; further columns are kept.  Of a column
         ``role`` only rows with ``sample`` are used.  Paths are as for `find_species`, beside the
-        file of the samples; a movie stands for its output folder.  Of the ``movies.csv`` of a batch
-        those movies are used that the batch would use: analysed, with a concentration and events.
+        file of the samples; a movie of any format stands for the output folder beside it.  Of the
+        ``movies.csv`` of a batch those movies are used that the batch would use: analysed, with a
+        concentration and events.
     model : {"dimer", "ab"}
         2 M ⇌ D, K_D = [M]²/[D]; or A + B ⇌ AB, K_D = [A][B]/[AB].
     masses_kda : sequence of float, optional
@@ -146,6 +155,9 @@ def fit_kd(
         Fit the part of monomers, or of A, that does not bind.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
         What is known of errors and of what was missed, as for `find_species` [kDa].
+    calibration : str, Path, Calibration or MassCalibration, optional
+        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
+        place of masses that a table has.
     tables : sequence of EventTable or pandas.DataFrame, optional
         The tables of all rows themselves, in place of ``path``.
     out : str or Path, optional
@@ -195,7 +207,7 @@ def fit_kd(
     rows = (
         samples
         if isinstance(samples, pd.DataFrame)
-        else _read_samples(path_in("`samples`", samples))
+        else from_table(read_frame(path_in("`samples`", samples)))
     )
     rows, kept = _used(rows, name)
     notes: list[str] = []
@@ -217,7 +229,7 @@ def fit_kd(
         else event_table(
             table, name=None if isinstance(table, Path) else f"table {number + 1}",
             sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-            above_kda=above_kda,
+            above_kda=above_kda, calibration=calibration,
         )
         for number, table in enumerate(sources)
     ]  # fmt: skip
@@ -295,19 +307,6 @@ def check_reaction(
         raise ConfigError(f"`{names[1]}`: model {model} takes {wanted} [kDa]")
     for mass in masses_kda:
         mass_in(f"`{names[1]}`", mass)
-
-
-def _read_samples(path: Path) -> pd.DataFrame:
-    try:
-        text = read_text(path)
-        rows, parts = io.StringIO("\n".join(without_remarks(text))), separator(text)
-        return from_table(pd.read_csv(rows, sep=parts, decimal="," if parts == ";" else "."))
-    except OSError as error:
-        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
-        raise DataError(f"{path}: {what}; give a CSV file with a row for each table") from None
-    except ValueError as error:
-        reason = str(error).splitlines()[0] if str(error) else "it is empty"
-        raise DataError(f"{path}: is no CSV file with a first line of names ({reason})") from None
 
 
 def _used(rows: pd.DataFrame, name: str) -> tuple[pd.DataFrame, BoolArray]:
@@ -388,15 +387,26 @@ def _paths(rows: pd.DataFrame, base: Path | None, name: str) -> list[Path]:
     for given in rows[column].astype(object).fillna("").astype(str):
         path = Path(given.strip())
         path = path.parent if column == "report" else path
-        there = path if base is None else base / path
-        if is_file(there) or is_folder(there):
-            path = there
-        folder = path.with_suffix(".iscat")
-        found.append(folder if path.suffix in _MOVIES and is_folder(folder) else path)
+        places = [path if base is None else base / path, path]
+        results = (_result_of(place) for place in places)
+        there = (place for place in places if _is_there(split_address(place)[0]))
+        found.append(next((each for each in results if each), next(there, path)))
     return found
 
 
-_MOVIES = (".tif", ".tiff", ".mp")
+def _result_of(movie: Path) -> Path | None:
+    """Give the output folder beside a movie, which says what kind of file it is of; else None."""
+    folder = path_beside(movie, ".iscat")
+    try:
+        source = read_json(folder / "summary.json")["input"]["path"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return None
+    files = (split_address(address)[0] for address in (Path(str(source)), movie))
+    return folder if len({file.suffix.lower() for file in files}) == 1 else None
+
+
+def _is_there(path: Path) -> bool:
+    return is_file(path) or is_folder(path)
 
 
 def _to_fit(table: EventTable) -> Events:
@@ -438,7 +448,7 @@ def _notes(
     *,
     inactive: bool,
 ) -> tuple[str, ...]:
-    notes = list(dict.fromkeys(note for table in tables for note in table.notes))
+    notes = sentences(note for table in tables for note in table.notes)
     for given, fitted in zip(masses_kda, fit.masses_kda, strict=False):
         if abs(fitted / given - 1) > _OTHER_MASS:
             notes.append(

@@ -21,18 +21,16 @@ from iscat_analysis.calibration.mass import (
     find_contrast_peaks,
     standards_of,
 )
+from iscat_analysis.calibration.mass.tables import made_with, measured_contrasts
 from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
-from iscat_analysis.config import Config, load_config
-from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.config import Config
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.template import MeasuredPicture, measure_template
 from iscat_analysis.movie import ArrayLike, open_stack
 from iscat_analysis.movie.event_tables import read_events
-from iscat_analysis.movie.text_tables import decimal_mark, separator
 from iscat_analysis.optics.measured import sha256_of
-from iscat_analysis.reading import first_line, is_file, open_regular
-from iscat_analysis.records import FloatArray, Progress, Status, silent
+from iscat_analysis.records import FloatArray, Progress, silent
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.calibration import camera_page, mass_page
 from iscat_analysis.report.optics import optics_page
@@ -205,7 +203,7 @@ def mass_calibration(
         landing=landing,
         name=str(events),
     )
-    standards = analysed_with(events) if standards is None else standards
+    standards = made_with(table) if standards is None else standards
     if standards is None:
         notes = (*found.notes, f"{events}: {_NO_RECORD}")
         found = replace(found, notes=notes)
@@ -253,60 +251,9 @@ def contrast_peaks(events: Path) -> tuple[FloatArray, list[ContrastPeak]]:
     return size[known], find_contrast_peaks(size[known], sigma[known])
 
 
-def analysed_with(events: Path) -> Config | None:
-    """Read the configuration with which a table of this package was made; None where it is lost."""
-    path = _table(events)
-    config_path = path.with_name("config.toml")
-    if path.name != "fits.csv" or not is_file(config_path):
-        return None
-    try:
-        return load_config(config_path)
-    except ConfigError:
-        return None
-
-
-def _table(path: Path) -> Path:
-    return path / "fits.csv" if is_file(path / "fits.csv") else path
-
-
 def read_contrasts(path: Path) -> pd.DataFrame:
-    """Read contrasts and masses from a table of this package or of Refeyn's programs."""
-    path = _table(path)
-    try:
-        with open_regular(path) as file:
-            first = file.readline(4096)
-    except OSError:
-        return read_events(path)  # says what is wrong with it
-    heading = first.decode("utf-8", errors="replace").lstrip("\ufeff").strip()
-    between = separator(heading)
-    names = heading.split(between)
-    if not {"event", "contrast", "mass_kda", "status"} <= set(names):
-        table = read_events(path)
-        if table["contrast"].isna().all():
-            raise DataError(
-                f"{path}: has masses and no contrasts, which a calibration begins with; export the "
-                "table with contrasts"
-            )
-        return table
-    try:
-        table = pd.read_csv(path, sep=between, decimal=decimal_mark(between))
-        # a scale that other optics have makes the masses wrong, not the contrasts
-        good = table[table["status"].isin([Status.OK.value, Status.UNCALIBRATED_OPTICS.value])]
-        columns = good[["contrast", "mass_kda", "sigma_mass_kda"]].astype(float)
-    except (ValueError, KeyError, UnicodeDecodeError) as error:
-        raise DataError(
-            f"{path}: cannot be read as fits.csv ({first_line(error)}); run the fit again"
-        ) from None
-    relative = columns["sigma_mass_kda"] / columns["mass_kda"].abs()
-    columns["sigma_contrast"] = relative * columns["contrast"].abs()
-    if columns.empty or not np.isfinite(columns["contrast"]).any():
-        raise DataError(
-            f"{path}: holds no event with status ok and a contrast; a calibration needs landing "
-            "events of the standards"
-        )
-    if not np.isfinite(columns["sigma_contrast"]).any():
-        columns = columns.drop(columns="sigma_contrast")
-    return columns
+    """Read contrasts and masses from any table of events."""
+    return measured_contrasts(read_events(path), path)
 
 
 def _landing(contrast: np.ndarray[Any, Any], mass: np.ndarray[Any, Any]) -> Landing:

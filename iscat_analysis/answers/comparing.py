@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.species import choice_of
+from iscat_analysis.calibration.mass.tables import Line
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.records import FloatArray, Progress, silent
@@ -21,7 +22,7 @@ from iscat_analysis.schemas import jsonable, to_json
 from iscat_analysis.species import LEAST_EVENTS, Comparison
 from iscat_analysis.species.comparison import compare
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.tables import EventTable, event_table
+from iscat_analysis.species.tables import EventTable, event_table, sentences
 from iscat_analysis.text import in_table
 from iscat_analysis.threads import processors, threads
 from iscat_analysis.units import count
@@ -53,6 +54,7 @@ def compare_samples(
     limit_kda: float | None = None,
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
+    calibration: Line | None = None,
 ) -> Comparison:
     """Test whether two samples are one, and measure by how much they differ.
 
@@ -72,6 +74,8 @@ def compare_samples(
         Whether something else may be there, broad and faint.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
         What is known of errors and of what was missed, as for `find_species` [kDa].
+    calibration : str, Path, Calibration or MassCalibration, optional
+        A mass line, as for `find_species`.
 
     Returns
     -------
@@ -100,7 +104,7 @@ def compare_samples(
     return compare_tables(
         [first, other], k=k, masses_kda=masses_kda, ladder=ladder, steps=steps,
         background=background, sigma_kda=sigma_kda, limit_kda=limit_kda,
-        limit_sigma_kda=limit_sigma_kda, above_kda=above_kda,
+        limit_sigma_kda=limit_sigma_kda, above_kda=above_kda, calibration=calibration,
     )[0]  # fmt: skip
 
 
@@ -116,6 +120,7 @@ def compare_tables(
     limit_kda: float | None = None,
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
+    calibration: Line | None = None,
     workers: int | None = None,
     out: str | Path | None = None,
     overwrite: bool = False,
@@ -140,6 +145,9 @@ def compare_tables(
         Whether something else may be there, broad and faint.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
         As for `find_species` [kDa].
+    calibration : str, Path, Calibration or MassCalibration, optional
+        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
+        place of masses that a table has.
     workers : int, optional
         Threads; default as many as there are processors.
     out : str or Path, optional
@@ -185,7 +193,7 @@ def compare_tables(
             one = event_table(
                 one, name=f"table {number + 1}" if isinstance(one, pd.DataFrame) else None,
                 sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-                above_kda=above_kda,
+                above_kda=above_kda, calibration=calibration,
             )  # fmt: skip
         if one.mass_kda.size < LEAST_EVENTS:
             raise DataError(
@@ -279,7 +287,7 @@ def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:
 
 def _notes(tables: Sequence[EventTable], found: Sequence[Comparison]) -> list[str]:
     """List what the tests assume."""
-    notes = list(dict.fromkeys(note for table in tables for note in table.remarks))
+    notes = sentences(note for table in tables for note in table.remarks)
     if any(table.scale_error is not None for table in tables):
         notes.append(
             "errors of shifts do not include that of the mass scale: samples with different "

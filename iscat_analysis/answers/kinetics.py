@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from iscat_analysis.calibration.mass.tables import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in, shown
 from iscat_analysis.reading import read_text, toml_of
@@ -71,6 +72,7 @@ def fit_kinetics(
     frame_rate_hz: float | None = None,
     frames: tuple[int, int] | None = None,
     radius_px: float = RADIUS_PX,
+    calibration: Line | None = None,
 ) -> Kinetics:
     """Fit how fast particles land, how that is depleted, and how fast they leave.
 
@@ -86,6 +88,9 @@ def fit_kinetics(
         event.
     radius_px : float
         Farthest that landing and leaving of one particle may lie apart [px].
+    calibration : str, Path, Calibration or MassCalibration, optional
+        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
+        place of masses that the table has.
 
     Returns
     -------
@@ -115,7 +120,9 @@ def fit_kinetics(
     >>> found.landing.per_second_low < 400 / 60 < found.landing.per_second_high
     True
     """
-    table = events if isinstance(events, EventTable) else event_table(events)
+    table = events
+    if not isinstance(table, EventTable):
+        table = event_table(table, calibration=calibration)
     if frame_rate_hz is None and isinstance(events, (str, Path)):
         frame_rate_hz = configured_frame_rate(Path(events))
     if frame_rate_hz is None:

@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.kinetics import Kinetics
+from iscat_analysis.calibration.mass.tables import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown, truth_in
 from iscat_analysis.report import atomic_folder, check_output
@@ -30,7 +31,13 @@ from iscat_analysis.species.choices import (
     Widths,
 )
 from iscat_analysis.species.describe import Branch
-from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far
+from iscat_analysis.species.tables import (
+    EventTable,
+    event_table,
+    mass_in,
+    refuse_far,
+    sentences,
+)
 from iscat_analysis.units import count
 
 SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})
@@ -58,6 +65,7 @@ def find_species(
     limit_kda: float | None = None,
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
+    calibration: Line | None = None,
     kinetics: Kinetics | None = None,
     draws: int = 100,
     seed: int = 1,
@@ -70,8 +78,9 @@ def find_species(
     Parameters
     ----------
     events : str, Path, pandas.DataFrame or EventTable
-        As for `event_table`: an output folder, ``fits.csv``, a table of Refeyn's, or a table with a
-        column ``mass_kda``.
+        An output folder, ``fits.csv``, a table of Refeyn's, or a table with a column ``mass_kda``.
+        ``FILE::movie`` is one of several movies of a file, whose events are otherwise taken
+        together.
     k : int, optional
         So many species; by default as many as the Bayesian information criterion likes.
     masses_kda : sequence of float, optional
@@ -95,6 +104,9 @@ def find_species(
         Which events: |mass| of all, or one side.
     sigma_kda, limit_kda, limit_sigma_kda, above_kda : float, optional
         What is known of errors and of what was missed, as for `event_table` [kDa].
+    calibration : str, Path, Calibration or MassCalibration, optional
+        A mass line, as ``iscat calibrate mass`` writes it: masses are those of the contrasts, in
+        place of masses that the table has.
     kinetics : Kinetics, optional
         Rates of the same table, from `fit_kinetics`, to be written beside the species.
     draws : int
@@ -146,7 +158,7 @@ def find_species(
     if not isinstance(table, EventTable):
         table = event_table(
             table, sigma_kda=sigma_kda, limit_kda=limit_kda, limit_sigma_kda=limit_sigma_kda,
-            above_kda=above_kda,
+            above_kda=above_kda, calibration=calibration,
         )  # fmt: skip
     wanted, fewer = k or 0, "a smaller `k`"
     if isinstance(choice, Begun):
@@ -182,7 +194,7 @@ def find_species(
             f"{table.name}: holds {count(found.events, kind)}, too few for species; "
             f"{LEAST_EVENTS} are needed"
         )
-    notes = (*table.remarks, *found.notes, *(() if kinetics is None else kinetics.notes))
+    notes = (*sentences(table.remarks), *found.notes, *(() if kinetics is None else kinetics.notes))
     if notify is not None:
         for note in notes:
             notify(note)

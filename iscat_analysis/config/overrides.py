@@ -8,10 +8,10 @@ keyword argument always has the same effect.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from pydantic import ValidationError
 
@@ -35,8 +35,12 @@ _EXCLUSIVE_KEYS = {
 """Keys that exclude each other: the one that is given later removes the other."""
 
 
+Source: TypeAlias = str | Path | Mapping[str, Any] | Config
+"""Where a configuration comes from."""
+
+
 def configure(
-    source: str | Path | Mapping[str, Any] | Config | None = None,
+    source: Source | Sequence[Source] | None = None,
     *,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
     arguments: Mapping[str, Any] | None = None,
@@ -47,9 +51,11 @@ def configure(
 
     Parameters
     ----------
-    source : str, Path, mapping or Config, optional
+    source : str, Path, mapping or Config, or a list of them, optional
         A TOML file, sections of keys as in ``{"optics": {"na": 1.3}}`` or
-        ``{"optics.na": 1.3}``, or a configuration to change; without it, the defaults.
+        ``{"optics.na": 1.3}``, or a configuration to change; without it, the defaults.  Of several
+        the keys of a later one replace those of the ones before, and its ``[calibration]``, which
+        is one line, the whole of theirs.
     settings : mapping of str to Any, or iterable of str, optional
         Changes, which replace values of the source, in their order:
         ``{"optics.na": 1.3, "fit.frames": (200, 400)}``, or text as in ``["optics.na=1.3"]``.
@@ -75,26 +81,18 @@ def configure(
         The file cannot be read, a key is unknown (the nearest known one is named), or a value is
         impossible.
     """
-    if isinstance(source, Config):
-        if not settings and not arguments and instrument is None:
-            return source
-        values = source.model_dump(exclude_none=True)
-        where = "arguments" if called else "settings"
-    elif source is None:
-        values, where = {}, "configuration"
-    elif isinstance(source, Mapping):
-        values, where = _nested(source), "configuration"
-    elif isinstance(source, (str, Path)):
-        values, where = read_toml(Path(source)), str(source)
-    else:
-        raise ConfigError(
-            f"a configuration is made from a file, a mapping or a Config, not from a "
-            f"{type(source).__name__}: give the path of a TOML file, or sections of keys as in "
-            '{"optics": {"na": 1.42}}'
-        )
+    if isinstance(source, Config) and not settings and not arguments and instrument is None:
+        return source
+    given: list[Any] = list(source) if isinstance(source, (list, tuple)) else [source]
+    values, changes = _merged(given)
     if instrument is not None:
-        values = _with_instrument(instrument, values, complete=isinstance(source, Config))
-    changes = _changes(settings) + _changes(arguments)
+        complete = any(isinstance(each, Config) for each in given)
+        values = _with_instrument(instrument, values, complete=complete)
+    changes += _changes(settings) + _changes(arguments)
+    files = [str(each) for each in given if isinstance(each, (str, Path))]
+    where = ", ".join(files) or "configuration"
+    if isinstance(source, Config):
+        where = "arguments" if called else "settings"
     for section, key, value in changes:
         _change(values, section, key, value)
     if any(change[:2] in _METHOD_FOLLOWS for change in changes):
@@ -116,13 +114,44 @@ def _with_instrument(name: str, values: dict[str, Any], *, complete: bool) -> di
     return begun
 
 
-def load_config(path: str | Path | None = None, overrides: Iterable[str] = ()) -> Config:
+def _merged(given: Sequence[Any]) -> tuple[dict[str, Any], list[Change]]:
+    """Give the sections of the first source, and the keys by which later ones change them."""
+    values = _values_of(given[0]) if given else {}
+    changes: list[Change] = []
+    for later in map(_values_of, given[1:]):
+        if "calibration" in later:
+            values.pop("calibration", None)
+            changes = [change for change in changes if change[0] != "calibration"]
+        changes += _changes(later)
+    return values, changes
+
+
+def _values_of(source: Source | None) -> dict[str, Any]:
+    """Give the sections of one source."""
+    if source is None:
+        return {}
+    if isinstance(source, Config):
+        return source.model_dump(exclude_none=True)
+    if isinstance(source, Mapping):
+        return _nested(source)
+    if isinstance(source, (str, Path)):
+        return read_toml(Path(source))
+    raise ConfigError(
+        f"a configuration is made from a file, a mapping or a Config, not from a "
+        f"{type(source).__name__}: give the path of a TOML file, or sections of keys as in "
+        '{"optics": {"na": 1.42}}'
+    )
+
+
+def load_config(
+    path: Source | Sequence[Source] | None = None, overrides: Iterable[str] = ()
+) -> Config:
     """Read a configuration file and change keys of it.
 
     Parameters
     ----------
-    path : str or Path, optional
-        TOML file; without it, the defaults.
+    path : str or Path, or a list of them, optional
+        TOML file, or several, of which later ones win; without it, the defaults.
     overrides : iterable of str
         ``"section.key=value"``, the value as TOML would write it (quotes may be left out).
 

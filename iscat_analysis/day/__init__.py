@@ -15,7 +15,9 @@ from typing import Any
 
 import pandas as pd
 
-from iscat_analysis.config import Config, configure
+from iscat_analysis.calibration.mass.tables import Line, with_line
+from iscat_analysis.config import configure
+from iscat_analysis.config.overrides import Source
 from iscat_analysis.day.calibrate import Day, calibrate_day
 from iscat_analysis.day.equilibria import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
@@ -92,8 +94,9 @@ def batch(
     samples: str | Path | Table,
     *,
     out: str | Path,
-    config: str | Path | Mapping[str, Any] | Config | None = None,
+    config: Source | Sequence[Source] | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
+    calibration: Line | None = None,
     standards: str | Sequence[float] | None = None,
     kd: Model | None = None,
     kd_masses_kda: Sequence[float] | None = None,
@@ -121,11 +124,14 @@ def batch(
         ``background.frames``, sets it for that movie, and any other is kept.
     out : str or Path
         Folder of the batch; it may hold an earlier one, which is brought up to date.
-    config : str, Path, mapping or Config, optional
+    config : str, Path, mapping or Config, or a list of them, optional
         As for `configure`; of all movies.
     settings : mapping of str to Any, or iterable of str, optional
         As for `configure`; they win over `config`, the day's calibrations over both, and the table
         over all.
+    calibration : str, Path, Calibration or MassCalibration, optional
+        The mass line of all movies, as ``iscat calibrate mass`` writes it; where the batch has
+        standards of its own, it is refused.
     standards : str or sequence of float, optional
         Masses in the calibrants [kDa], beside those of the table; as text with standard errors, as
         in ``"66,146:1.5,480"``, otherwise 1 %.
@@ -185,7 +191,13 @@ def batch(
         named = read_standards(standards) if standards is not None else ()
     except ValueError as error:
         raise ConfigError(f"`standards`: {error}") from None
-    plan = make_plan(table, configure(config, settings=settings), named)
+    common = configure(with_line(config, calibration), settings=settings)
+    plan = make_plan(table, common, named)
+    if calibration is not None and plan.standards:
+        raise ConfigError(
+            "`calibration` is a mass line, and the standards of the calibrants give another; leave "
+            "one of them out"
+        )
     claim_folder(folder)
     warn = notify or (lambda _: None)
     command_text = command or f"iscat_analysis.batch({str(table.source)!r}, out={str(out)!r})"

@@ -21,7 +21,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.addresses import MARK, path_beside, split_address
 from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
 from iscat_analysis.movie.ome_zarr import is_zarr
-from iscat_analysis.movie.text_tables import separator
+from iscat_analysis.movie.text_tables import read_table_text, table_lines
 from iscat_analysis.reading import is_file, is_folder, read_text, toml_of
 from iscat_analysis.text import printable
 
@@ -180,7 +180,7 @@ def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ..
 
 def _text(source: Path) -> str:
     try:
-        return read_text(source)
+        return read_text(source) if source.suffix.lower() == ".toml" else read_table_text(source)
     except FileNotFoundError:
         raise ConfigError(
             f"{source}: there is no such table or folder; give a CSV or TOML file with one movie "
@@ -188,21 +188,21 @@ def _text(source: Path) -> str:
         ) from None
     except OSError as error:
         raise ConfigError(f"{source}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
+    except UnicodeError:
         raise ConfigError(
-            f"{source}: is not a text file in UTF-8: give a table of movies, saved as CSV in UTF-8"
+            f"{source}: is not a text file: give a table of movies, saved as CSV in UTF-8"
         ) from None
 
 
 def _from_csv(source: Path, text: str) -> Records:
-    delimiter = separator(text)
+    _, delimiter, _ = table_lines(text.splitlines())
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     names: list[str] = []
     records: Records = []
     try:
         for cells in reader:
             stripped = [cell.strip() for cell in cells]
-            if not any(stripped) or stripped[0].startswith("#"):
+            if not any(stripped) or stripped[0].startswith(("#", "sep=")):
                 continue
             where = f"line {reader.line_num}"
             if not names:

@@ -16,7 +16,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from iscat_analysis.config import Config, configure
+from iscat_analysis.calibration.mass.tables import Line, mass_line
+from iscat_analysis.config import configure
+from iscat_analysis.config.overrides import Source
 from iscat_analysis.day import Batch, batch
 from iscat_analysis.day.equilibria import reaction_of
 from iscat_analysis.day.state import Records, claim_folder
@@ -49,8 +51,9 @@ def watch(
     folder: str | Path,
     *,
     out: str | Path | None = None,
-    config: str | Path | Mapping[str, Any] | Config | None = None,
+    config: Source | Sequence[Source] | None = None,
     settings: Mapping[str, Any] | Iterable[str] | None = None,
+    calibration: Line | None = None,
     standards: str | Sequence[float] | None = None,
     kd: Model | None = None,
     kd_masses_kda: Sequence[float] | None = None,
@@ -74,9 +77,10 @@ def watch(
         are, as for `batch`, and may grow as well; movies that it does not name are samples.
     out : str or Path, optional
         Folder of the batch; default ``batch`` in `folder`.
-    config, settings, standards, kd, kd_masses_kda, scheduler, scheduler_file : optional
-        As for `batch`; `standards` are used once there is a calibrant, and one movie is analysed
-        after another.
+    config, settings, calibration, standards, kd, kd_masses_kda : optional
+        As for `batch`; `standards` are used once there is a calibrant.
+    scheduler, scheduler_file : optional
+        As for `batch`; one movie is analysed after another.
     interval_s : float
         Time between two looks at the folder [s].
     stop : threading.Event, optional
@@ -118,6 +122,7 @@ def watch(
         batch,
         out=results,
         config=configure(config, settings=settings),
+        calibration=None if calibration is None else mass_line(calibration),
         kd=kd,
         kd_masses_kda=kd_masses_kda,
         scheduler=scheduler,

@@ -1,6 +1,4 @@
-"""Event tables of other programs: Refeyn's, which PhotoMol reads too, and Picasso's.
-
-Of Refeyn's, what their fits found, and the calibration they used.
+"""Tables of events: ours, those of other programs, and columns of one's own; one reader for all.
 
 A calibration is odd-symmetric: contrast c and mass m obey c = s·m + sign(m)·o, so that a particle
 that leaves weighs what it weighed when it landed; m = sign(−c)·(−|c| − o)/s.  A plain line through
@@ -9,44 +7,52 @@ both branches is wrong by 2|o/s| on one of them.
 
 from __future__ import annotations
 
-import csv
 import math
-import os
-from array import array
-from collections.abc import Mapping
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.addresses import MARK, split_address
 from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import first_line, is_folder, open_regular
+from iscat_analysis.movie.text_tables import read_cells, refuse_twice
+from iscat_analysis.reading import first_line, is_file, is_folder, open_regular, read_parquet
 from iscat_analysis.records import FloatArray
 
 if TYPE_CHECKING:
     from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
 
 TABLE_COLUMNS = ("frame", "x_px", "y_px", "contrast", "mass_kda")
-"""The columns of `read_events`, in order."""
+"""The columns of `read_events`, in order; those of `FURTHER_COLUMNS` follow, and of several movies
+of one file ``movie``."""
 
-FURTHER_COLUMNS = ("sigma_mass_kda", "snr")
-"""Columns after them, of tables that ``iscat export`` wrote."""
+TEXTS = ("status", "rejected_by_hand")
+"""Columns of text."""
 
-_NAMES: Mapping[str, tuple[str, ...]] = {
-    "frame": ("frame_indices",),
-    "x_px": ("x_coords",),
-    "y_px": ("y_coords",),
-    "contrast": ("contrasts",),
-    "mass_kda": ("masses_kDa", "calibrated_values"),
-    "sigma_mass_kda": ("sigma_mass_kda",),
-    "snr": ("snr",),
-}
-"""What each column is called in the files, newest last."""
+_WORDS = ("mass", "masses", "molecular_mass", "molecular_weight", "mw", "masse", "massen")
+_KDA = {"kda": 1.0, "da": 1e-3, "mda": 1e3}
+_PER_KDA = {f"{word}_{unit}": each for unit, each in _KDA.items() for word in _WORDS}
+_NAMES: Mapping[str, Mapping[str, float]] = {
+    "frame": dict.fromkeys(("frame_indices", "frame", "frames", "frame_index"), 1.0),
+    "x_px": {"x_coords": 1.0, "x_px": 1.0},
+    "y_px": {"y_coords": 1.0, "y_px": 1.0},
+    "contrast": {"contrasts": 1.0, "contrast": 1.0, "kontrast": 1.0, "contrast_%": 0.01},
+    "mass_kda": {
+        "mass_kda": 1.0, "masses_kda": 1.0, "calibrated_values": 1.0, **_PER_KDA,
+        **dict.fromkeys(_WORDS, math.nan),  # a row of units must say
+    },
+    "sigma_mass_kda": {f"sigma_mass_{unit}": each for unit, each in _KDA.items()},
+    **{name: {name: 1.0} for name in (
+        "systematic_mass_kda", "systematic_contrast", "snr", "n_after", *TEXTS
+    )},
+}  # fmt: skip
+"""What each column is called in the files, the first first, and what its values are times."""
 
 _LOCS: Mapping[str, str] = {
     "frame": "frame", "x_px": "x", "y_px": "y", "contrast": "contrast", "mass_kda": "mass_kda",
@@ -54,6 +60,8 @@ _LOCS: Mapping[str, str] = {
 }  # fmt: skip
 """The same in Picasso's ``locs``; its own program knows the first three."""
 
+_OURS = ("fits.parquet", "fits.csv")
+_OF_TRACKPY = {"x", "y", "frame", "mass", "signal"}
 _CALIBRATIONS = (
     ("mass_model/c_1kDa", "mass_model/o_0kDa", "mass_model/contrasts", "mass_model/masses"),
     (
@@ -66,8 +74,8 @@ _CALIBRATIONS = (
 _GROUPS = ("", "analysis/events/events_fitted/")  # tables of their own, and inside .mpr movies
 _MOVIES = "per_movie_events"
 _MISSING = 1e300  # the largest double stands for "none"
-_LARGEST_CSV = 500_000_000
 _LARGEST_FRAME = 2**53
+_USUAL_KDA = (1.0, 2e4)  # medians of masses beyond are likely in another unit than their heading
 
 
 @dataclass(frozen=True)
@@ -88,26 +96,77 @@ class StoredCalibration:
 
 
 def read_events(path: Path) -> pd.DataFrame:
-    """Read an event table of another program.
+    """Read a table of events.
 
-    Refeyn's, and tables that PhotoMol reads: HDF5 (``masses_kDa`` with ``mass_model``, or
-    ``calibrated_values`` with ``calibration``; also inside ``.mpr`` movies) or CSV
-    (``eventsFitted.csv``; ``contrasts`` or ``masses_kDa`` are enough).  Picasso's: HDF5 with
-    ``locs``, if these have a column ``mass_kda``, as those of ``iscat export`` do.
+    Ours: an output folder, ``fits.csv`` or ``fits.parquet``.  Refeyn's, and tables that PhotoMol
+    reads: HDF5 (``masses_kDa`` with ``mass_model``, or ``calibrated_values`` with ``calibration``;
+    also inside ``.mpr`` movies) or text (``eventsFitted.csv``).  Of a file with several movies the
+    events of all are read, or of the one that ``FILE::movie`` names.  Picasso's: HDF5 with
+    ``locs``, if these have a column ``mass_kda``, as those of ``iscat export`` do.  Any other table
+    of text whose first line names contrasts, or masses with their unit (``Mass [kDa]``,
+    ``mass_da``).
+
+    What was assumed is in ``attrs["notes"]``, the file that was read in ``attrs["file"]``.
     """
     path = Path(path)
+    address, movie = split_address(path)
+    file = _file_of(address)
     try:
-        with open_regular(path) as file:
-            signature = file.read(len(HDF5_SIGNATURE))
-            size = file.seek(0, os.SEEK_END)
+        with open_regular(file) as opened:
+            signature = opened.read(len(HDF5_SIGNATURE))
+        if signature.startswith(b"PAR1"):
+            table = named(read_parquet(file), path)
     except OSError as error:
-        what = "is a folder" if is_folder(path) else f"cannot be read ({error.strerror})"
-        raise DataError(f"{path}: {what}; give the path of one event table") from None
+        raise DataError(
+            f"{path}: cannot be read ({error.strerror}); give the path of one table of events"
+        ) from None
+    except ValueError as error:
+        raise DataError(
+            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
+        ) from None
     if signature == HDF5_SIGNATURE:
-        columns, calibration = _from_hdf5(path)
-    else:
-        columns, calibration = _from_csv(path, size), None
-    return _table(columns, calibration, path)
+        table = _from_hdf5(file, movie)
+    elif movie:
+        raise _of_one_movie(file, movie)
+    elif not signature.startswith(b"PAR1"):
+        table = _from_text(file)
+    table.attrs["file"] = str(file)
+    return table
+
+
+def _of_one_movie(path: Path, movie: str) -> DataError:
+    return DataError(f"{path}: holds the events of one movie; leave out {MARK}{movie}")
+
+
+def _file_of(path: Path) -> Path:
+    """Give the table in an output folder, or the file itself."""
+    if not is_folder(path):
+        return path
+    inside = next((path / name for name in _OURS if is_file(path / name)), None)
+    if inside is None:
+        raise DataError(
+            f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or the "
+            "path of one table of events"
+        )
+    return inside
+
+
+def named(table: pd.DataFrame, source: object) -> pd.DataFrame:
+    """Give the columns of a table in memory their names and units."""
+    places, factors = _places([str(name) for name in table.columns], source)
+    columns = {name: table.iloc[:, place].to_numpy() for name, place in places.items()}
+    numbers = {}
+    for name, values in columns.items():
+        try:
+            numbers[name] = values if name in TEXTS else np.asarray(values, np.float64)
+        except (ValueError, TypeError, OverflowError) as error:
+            raise DataError(
+                f"{source}: holds in {name} what is no number ({first_line(error)}); correct the "
+                "table"
+            ) from None
+    made = _table(numbers, None, source, factors)
+    made.attrs |= {key: table.attrs[key] for key in ("calibration",) if key in table.attrs}
+    return made
 
 
 def stored_calibration(table: pd.DataFrame) -> StoredCalibration | None:
@@ -124,66 +183,94 @@ def stored_calibration(table: pd.DataFrame) -> StoredCalibration | None:
 
 
 def _table(
-    columns: Mapping[str, FloatArray], calibration: StoredCalibration | None, path: Path
+    columns: Mapping[str, Any],
+    calibration: StoredCalibration | None,
+    source: object,
+    factors: Mapping[str, float] | None = None,
+    notes: Iterable[str] = (),
 ) -> pd.DataFrame:
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
-        shown = ", ".join(f"{_NAMES[name][0]} {length}" for name, length in lengths.items())
-        raise DataError(f"{path}: its columns differ in length ({shown}); export it again")
+        called = {name: next(iter(_NAMES[name])) for name in lengths}
+        shown = ", ".join(f"{called[name]} {length}" for name, length in lengths.items())
+        raise DataError(f"{source}: its columns differ in length ({shown}); export it again")
     nothing = np.full(next(iter(lengths.values())), np.nan)
-    frame = columns.get("frame", nothing)
-    bad = ~((np.abs(frame) < _LARGEST_FRAME) & (frame >= 0) & (frame == np.floor(frame)))
-    if bad.any() and "frame" in columns:
+    known = {**dict.fromkeys(TABLE_COLUMNS, nothing), **columns}
+    for name, values in known.items():
+        if name not in TEXTS:
+            factor = (factors or {}).get(name, 1.0)
+            if math.isnan(factor):
+                raise DataError(
+                    f"{source}: does not say the unit of its masses; name their column mass_kda, "
+                    "or mass_da"
+                )
+            known[name] = factor * np.where(np.abs(values) < _MISSING, values, np.nan)
+    frame = known["frame"]
+    if (bad := (frame < 0) | (frame > _LARGEST_FRAME)).any():
         row = int(np.argmax(bad))
         raise DataError(
-            f"{path}: frame_indices is {frame[row]:g} in row {row}, which is no frame number; "
-            "export the table again"
+            f"{source}: the frame is {frame[row]:g} in row {row}, which is no frame number; export "
+            "the table again"
         )
-    cleaned = {
-        name: np.where(np.abs(values) < _MISSING, values, np.nan)
-        for name, values in columns.items()
-    }
-    mass = cleaned.get("mass_kda")
-    if mass is None or np.isnan(mass).all():
-        contrast = cleaned.get("contrast", nothing)
-        mass = np.full(contrast.shape, np.nan)
-        if calibration is not None:
-            mass = calibration.mass_kda(contrast)
-    known = {**dict.fromkeys(TABLE_COLUMNS, nothing), **cleaned, "mass_kda": mass}
-    if "frame" in columns:
+    if np.array_equal(frame, np.floor(frame)):
         known["frame"] = frame.astype(np.int64)
+    if calibration is not None and np.isnan(known["mass_kda"]).all():
+        known["mass_kda"] = calibration.mass_kda(known["contrast"])
     table = pd.DataFrame({name: known[name] for name in _NAMES if name in known})
     table.attrs["calibration"] = None
     if calibration is not None:
+        fields = asdict(calibration).items()
         table.attrs["calibration"] = {
-            "gradient_per_kda": calibration.gradient_per_kda,
-            "offset": calibration.offset,
-            "standard_masses_kda": list(calibration.standard_masses_kda),
-            "standard_contrasts": list(calibration.standard_contrasts),
+            key: list(value) if isinstance(value, tuple) else value for key, value in fields
         }
+    table.attrs["notes"] = list(notes)
     return table
 
 
-def _from_hdf5(path: Path) -> tuple[dict[str, FloatArray], StoredCalibration | None]:
+def _from_hdf5(path: Path, movie: str) -> pd.DataFrame:
     from iscat_analysis.movie.hdf5 import Hdf5Reader  # h5py takes long
 
     with closing(Hdf5Reader(path)) as reader:
         try:
             locs = reader.records("locs")
+            if locs is not None and movie:
+                raise _of_one_movie(path, movie)
             if locs is not None:
-                return _from_locs(locs, path), None
-            group = _group(reader, path)
-            columns = {}
-            for column, names in _NAMES.items():
-                values = [_column(reader, f"{group}{name}", path) for name in names]
-                found = next((value for value in values if value is not None), None)
-                if found is not None:
-                    columns[column] = found
-            if "contrast" not in columns:
-                raise DataError(f"{path}: contrasts is no column of numbers; export it again")
-            return columns, _calibration(reader, group, path)
+                return _table(_from_locs(locs, path), None, path)
+            groups = _groups(reader, path, movie)
+            tables = {name: _from_group(reader, group, path) for name, group in groups.items()}
         finally:
             reader.data.close()
+    if len(tables) == 1:
+        return next(iter(tables.values()))
+    joined = pd.concat(
+        [table.assign(movie=name) for name, table in tables.items()], ignore_index=True
+    ).assign(frame=math.nan)
+    lines = [table.attrs["calibration"] for table in tables.values()]
+    joined.attrs = {
+        "calibration": lines[0] if all(line == lines[0] for line in lines) else None,
+        "notes": [
+            f"the events of {len(tables)} movies are taken together, without their frames, because "
+            f"each movie counts from 0; {path.name}{MARK}{next(iter(tables))} is one of them"
+        ],
+    }
+    return joined
+
+
+def _from_group(reader: Hdf5Reader, group: str, path: Path) -> pd.DataFrame:
+    """Read the table of one movie."""
+    columns: dict[str, FloatArray] = {}
+    factors: dict[str, float] = {}
+    names = {_plain(name): name for name in reader.names(group.rstrip("/"))}
+    for column, kinds in _NAMES.items():
+        known = {kind: each for kind, each in kinds.items() if each == each and kind in names}
+        for kind in known if column not in TEXTS else ():
+            values = _column(reader, f"{group}{names[kind]}", path)
+            if values is not None and column not in columns:
+                columns[column], factors[column] = values, kinds[kind]
+    if "contrast" not in columns:
+        raise DataError(f"{path}: contrasts is no column of numbers; export it again")
+    return _table(columns, _calibration(reader, group, path), path, factors)
 
 
 def _from_locs(locs: StoredArray, path: Path) -> dict[str, FloatArray]:
@@ -206,22 +293,28 @@ def _from_locs(locs: StoredArray, path: Path) -> dict[str, FloatArray]:
     }
 
 
-def _group(reader: Hdf5Reader, path: Path) -> str:
-    """Where in the file the table lies."""
-    movies = reader.names(_MOVIES)
-    groups = [*_GROUPS, *(f"{_MOVIES}/{name}/" for name in movies[:2])]
-    found = [group for group in groups if "contrasts" in reader.names(group.rstrip("/"))]
+def _groups(reader: Hdf5Reader, path: Path, movie: str) -> dict[str, str]:
+    """Where in the file the table of each wanted movie lies."""
+    movies = {name: f"{_MOVIES}/{name}/" for name in reader.names(_MOVIES)}
+    groups = {**{group: group for group in _GROUPS}, **movies}
+    found = {
+        name: group
+        for name, group in groups.items()
+        if "contrasts" in reader.names(group.rstrip("/"))
+    }
     if not found:
         raise DataError(
             f"{path}: is an HDF5 file without an event table (it lacks contrasts); "
             "export the fitted events"
         )
-    if found[0].startswith(_MOVIES) and len(movies) > 1:
-        raise DataError(
-            f"{path}: holds the events of {len(movies)} movies, whose frames cannot be told "
-            "apart; export the events of each movie to a file of its own"
-        )
-    return found[0]
+    if movie:
+        name = movie.strip("/").removeprefix(f"{_MOVIES}/")
+        if name not in found or name not in movies:
+            held = ", ".join(each for each in found if each in movies) or "one table for all"
+            raise DataError(f"{path}: holds no movie {name!r}; its movies are {held}")
+        return {name: found[name]}
+    whole = next((name for name in _GROUPS if name in found), None)
+    return found if whole is None else {whole: found[whole]}
 
 
 def _column(reader: Hdf5Reader, name: str, path: Path) -> FloatArray | None:
@@ -257,53 +350,72 @@ def _calibration(reader: Hdf5Reader, group: str, path: Path) -> StoredCalibratio
     return None
 
 
-def _from_csv(path: Path, size: int) -> dict[str, FloatArray]:
-    """Read columns that commas part, or semicolons or tabs, between which a comma is a point."""
-    if size > _LARGEST_CSV:
-        raise DataError(f"{path}: is {size} bytes long, which no event table is; check the path")
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = (line for line in file if not line.startswith("#"))
-            first = next(lines, "")
-            between = separator(first)
-            rows = csv.reader(lines, delimiter=between)
-            header = [name.strip() for name in next(csv.reader([first], delimiter=between), [])]
-            places = _places(header, path)
-            columns = {column: array("d") for column in places}
-            for number, row in enumerate(rows):
-                if not any(row):
-                    continue
-                if len(row) != len(header):
-                    raise DataError(
-                        f"{path}: row {number} has {len(row)} values where the first line names "
-                        f"{len(header)}; the copy was interrupted, or the table was edited: "
-                        "export it again"
-                    )
-                for column, place in places.items():
-                    value = row[place].strip()
-                    value = value.replace(decimal_mark(between), ".")
-                    columns[column].append(float(value) if value else math.nan)
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: is neither an HDF5 file nor a text file in UTF-8") from None
-    except (ValueError, MemoryError, csv.Error) as error:
-        raise DataError(
-            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
-        ) from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-    return {column: np.array(values) for column, values in columns.items()}
+def _from_text(path: Path) -> pd.DataFrame:
+    """Read a table of text; its units are those of its headings, or of a row below them."""
+    factors: dict[str, float] = {}
+
+    def choose(names: Sequence[str]) -> dict[str, int]:
+        places, found = _places(names, path)
+        factors.update(found)
+        return places
+
+    cells = read_cells(path, choose)
+    unit = _KDA.get(cells.units.get("mass_kda", "").strip("[]() ").lower())
+    if unit is not None:
+        factors["mass_kda"] = unit
+    whole = ["mass_kda"] if factors.get("mass_kda") == _KDA["da"] else []
+    numbers = [name for name in cells.columns if name not in TEXTS]
+    columns, notes = cells.numbers(numbers, whole)
+    texts = {
+        name: np.array([cell.strip() for cell in cells.columns[name]], dtype=object)
+        for name in TEXTS
+        if name in cells.columns
+    }
+    return _table({**columns, **texts}, None, path, factors, notes)
 
 
-def _places(header: list[str], path: Path) -> dict[str, int]:
-    places = {}
-    for column, names in _NAMES.items():
-        refuse_twice(header, names, path)
-        found = next((name for name in names if name in header), None)
-        if found is not None:
-            places[column] = header.index(found)
-    if not {"contrast", "mass_kda"} & set(places):
-        raise DataError(
-            f"{path}: lacks the columns contrasts and masses_kDa in its first line, and needs one "
-            "of them; it is not a table of fitted events (eventsFitted.csv), export it again"
+def unit_note(mass_kda: FloatArray) -> str | None:
+    """Say where masses are so large or so small that their heading likely names another unit."""
+    known = np.abs(mass_kda[np.isfinite(mass_kda)])
+    middle = float(np.median(known)) if known.size else math.nan
+    low, high = _USUAL_KDA
+    if middle > high:
+        return (
+            f"half of the events are heavier than {middle:.3g} kDa: if the masses are in Da, name "
+            "their column mass_da"
         )
-    return places
+    if 0 < middle < low:
+        return (
+            f"half of the events are lighter than {middle:.3g} kDa: if the masses are in kDa or "
+            "MDa, name their column mass_kda or mass_mda"
+        )
+    return None
+
+
+def _plain(heading: str) -> str:
+    """Write a heading as a name: ``Mass [kDa]`` and ``Mass (kDa)`` are mass_kda."""
+    return re.sub(r"[^\w%]+|_+", "_", heading.strip().lower()).strip("_")
+
+
+def _places(names: Sequence[str], source: object) -> tuple[dict[str, int], dict[str, float]]:
+    """Find the columns by their headings: the place of each, and what its values are times."""
+    plain = [_plain(name) for name in names]
+    if set(plain) >= _OF_TRACKPY and "mass_kda" not in plain:
+        raise DataError(
+            f"{source}: is a table of trackpy's, whose mass is a brightness; give fits.csv, or "
+            "name a column of masses in kDa mass_kda"
+        )
+    places, factors = {}, {}
+    for column, kinds in _NAMES.items():
+        found = next((kind for kind in kinds if kind in plain), None)
+        if found is not None:
+            given = names[plain.index(found)]
+            refuse_twice([given if each == found else "" for each in plain], [given], source)
+            places[column], factors[column] = plain.index(found), kinds[found]
+    if {"contrast", "mass_kda"} & set(places):
+        return places, factors
+    raise DataError(
+        f"{source}: is no table of events: it lacks the columns contrasts and masses_kDa in its "
+        f"first line, which names {', '.join(names[:8]) or 'nothing'}; give fits.csv, a table of "
+        "Refeyn's (eventsFitted.csv or h5), or name a column mass_kda, Mass [kDa] or mass_da"
+    )

@@ -17,7 +17,7 @@ instrument's; the width of a species then holds its error.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,19 +26,11 @@ import pandas as pd
 import scipy
 from scipy.special import log_ndtr
 
+from iscat_analysis.calibration.mass.tables import Line, mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
-from iscat_analysis.movie.event_tables import read_events
-from iscat_analysis.movie.mapped import HDF5_SIGNATURE
-from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import (
-    first_line,
-    is_file,
-    is_folder,
-    open_regular,
-    read_json,
-    read_parquet,
-)
+from iscat_analysis.movie.event_tables import named, read_events, unit_note
+from iscat_analysis.reading import read_json
 from iscat_analysis.records import FloatArray, Status
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count
@@ -51,10 +43,8 @@ _LEAST_EXTRA = 0.05  # of σ_d: noise of the filter's estimate beyond that of th
 _FEWEST_EVENTS = 10  # events to measure σ_d by
 _NEAR_EDGE = 10  # values that tell where a distribution begins
 _CUT_WIDTH = 1e-6  # of a cut: its width
-_OURS = ("fits.parquet", "fits.csv")
 # Of the lightest mass, and the heaviest over it, between which an event must lie
 _LEAST_MASS_RATIO = 0.5
-_LARGEST = 2_000_000_000  # bytes
 _FRAMES, _PIXELS, _RATIOS = (0.0, 2.0**40), (0.0, 1e6), (0.0, 1e9)
 _RANGES = {
     "mass_kda": POSSIBLE_KDA, "sigma_mass_kda": POSSIBLE_KDA,
@@ -65,7 +55,34 @@ _RANGES = {
 """The columns of numbers that are used, and how large their magnitudes can be."""
 
 _REJECTED = "rejected_by_hand"  # true of events that somebody left out
-_USED = (*_RANGES, "status", _REJECTED)
+_NAMED = 3  # tables that a note names
+
+
+@dataclass(frozen=True)
+class Note:
+    """What the user should know of a table: a sentence that other tables may share."""
+
+    table: str
+    sentence: str
+    of_table: str = ""
+    """What is different in each table, as how many events are meant."""
+
+
+def sentences(notes: Iterable[Note]) -> list[str]:
+    """Write each sentence once, with the tables that it is about."""
+    tables: dict[str, dict[tuple[str, str], None]] = {}
+    for note in notes:
+        tables.setdefault(note.sentence, {})[note.table, note.of_table] = None
+    found = []
+    for sentence, about in tables.items():
+        named = [f"{name} ({own})" if own else name for name, own in about]
+        if len(about) == 1:
+            ((name, own),) = about
+            found.append(f"{name}: {own} {sentence}" if own else f"{name}: {sentence}")
+            continue
+        more = f" and {len(named) - _NAMED} more" if len(named) > _NAMED else ""
+        found.append(f"{', '.join(named[:_NAMED])}{more}: {sentence}")
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +98,7 @@ class EventTable:
     efficiency: Efficiency | None = None
     window_frames: int | None = None
     scale_error: Callable[[FloatArray], FloatArray] | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
     edge_kda: float | None = None
     """The lightest event, where nothing but it tells what was missed."""
     errors_known: bool = True
@@ -93,16 +110,15 @@ class EventTable:
         return Events(np.abs(self.mass_kda), self.sigma_kda, self.efficiency)
 
     @property
-    def remarks(self) -> tuple[str, ...]:
+    def remarks(self) -> tuple[Note, ...]:
         """Notes for the user, with one where the lightest event stands for the limit."""
         if self.edge_kda is None:
             return self.notes
-        return (
-            *self.notes,
-            f"{self.name}: what was missed is taken to lie below the lightest event, "
-            f"{self.edge_kda:.3g} kDa; `above_kda` cuts where all are still detected, `limit_kda` "
-            "says where half are",
+        sentence = (
+            "lies the lightest event, below which all is taken to be missed; `above_kda` cuts "
+            "where all are still detected, `limit_kda` says where half are"
         )
+        return *self.notes, Note(self.name, sentence, f"at {self.edge_kda:.3g} kDa")
 
 
 def mass_in(name: str, value: float, what: str = "mass in kDa") -> float:
@@ -133,8 +149,13 @@ def event_table(
     limit_kda: float | None = None,
     limit_sigma_kda: float | None = None,
     above_kda: float | None = None,
+    calibration: Line | None = None,
 ) -> EventTable:
-    """Take events from a file or a table in memory."""
+    """Take events from a file or a table in memory.
+
+    With `calibration` their masses are those of its line, from their contrasts, whatever masses
+    the table has.
+    """
     for option, value in (
         ("sigma_kda", sigma_kda),
         ("limit_kda", limit_kda),
@@ -150,15 +171,28 @@ def event_table(
     if limit_sigma_kda is not None and limit_kda is None:
         raise ConfigError("`limit_sigma_kda` is the spread of a limit; give `limit_kda` as well")
     if isinstance(events, pd.DataFrame):
-        table, path, called = events, None, name or "table"
-    elif not isinstance(events, (str, Path)):
+        called = name or "table"
+        table = named(events, called)
+    elif isinstance(events, (str, Path)):
+        called = name or str(events)
+        table = read_events(Path(events))
+    else:
         raise ConfigError(
             f"`events`: is {type(events).__name__}; give the path of a table, or a pandas.DataFrame"
         )
-    else:
-        table, path = _read(Path(events))
-        called = name or str(events)
-    table = _checked(table, called)
+    file = table.attrs.get("file")
+    said = [*table.attrs["notes"]]
+    if calibration is not None:
+        table, replaced = weighed(table, mass_line(calibration), called)
+        said += [replaced] if replaced else []
+    elif table["mass_kda"].isna().all() and table["contrast"].notna().any():
+        raise DataError(
+            f"{called}: has contrasts and no masses; give `calibration`, a mass line as iscat "
+            "calibrate mass writes it"
+        )
+    if "status" not in table and (doubt := unit_note(table["mass_kda"].to_numpy(float))):
+        said.append(doubt)
+    table = _checked(table)
     found = _usable(table, called, sigma_kda)
     efficiency = found.efficiency
     if above_kda is not None:
@@ -168,12 +202,13 @@ def event_table(
         spread = limit_sigma_kda or float(np.median(found.sigma_kda))
         efficiency = Efficiency(limit_kda / spread, spread)
     elif "snr" in table:
-        efficiency = _from_snr(table, path)
+        efficiency = _from_snr(table, None if file is None else Path(file))
     edge = None
     if efficiency is None:
         edge = float(np.abs(found.mass_kda).min())
         efficiency = _sharp(edge * (1 - 10 * _CUT_WIDTH))
-    return replace(found, efficiency=efficiency, edge_kda=edge)
+    notes = (*(Note(called, sentence) for sentence in said), *found.notes)
+    return replace(found, efficiency=efficiency, edge_kda=edge, notes=notes)
 
 
 def filter_efficiency(
@@ -236,69 +271,16 @@ def shared_error(good: pd.DataFrame) -> Callable[[FloatArray], FloatArray] | Non
     return lambda masses: np.interp(masses, size[order], error[order])
 
 
-def _read(path: Path) -> tuple[pd.DataFrame, Path]:
-    """Read a table of whichever program; the path of the file that was read."""
-    if is_folder(path):
-        inside = next((path / name for name in _OURS if is_file(path / name)), None)
-        if inside is None:
-            raise DataError(
-                f"{path}: is a folder without fits.csv; give an output folder of iscat fit, or a "
-                "table of events"
-            )
-        path = inside
-    try:
-        with open_regular(path, _LARGEST) as file:
-            head = file.read(65536)
-    except OSError:
-        return read_events(path), path  # says what is wrong with it
-    try:
-        if head.startswith(b"PAR1"):
-            return read_parquet(path), path
-        first = head.splitlines()[0].decode("utf-8", errors="replace") if head else ""
-        between = separator(first)
-        names = [name.strip() for name in first.lstrip("\ufeff").split(between)]
-        if "mass_kda" in names:
-            refuse_twice(names, _USED, path)  # which pandas would rename
-            table = pd.read_csv(
-                path, sep=between, decimal=decimal_mark(between),
-                keep_default_na=False, na_values=["", "nan", "NaN"],
-            )  # fmt: skip
-            return table, path
-    except (ValueError, OSError, MemoryError) as error:
-        raise DataError(
-            f"{path}: cannot be read as a table ({first_line(error)}); export it again"
-        ) from None
-    try:
-        return read_events(path), path
-    except DataError:
-        if head.startswith(HDF5_SIGNATURE) or {"contrasts", "masses_kDa"} & set(names):
-            raise
-        if {"x", "y", "frame", "mass", "signal"} <= set(names):
-            raise DataError(
-                f"{path}: is a table of trackpy's, whose mass is a brightness; give fits.csv, or "
-                "name a column of masses in kDa mass_kda"
-            ) from None
-        raise DataError(
-            f"{path}: is no table of events; give fits.csv, a table of Refeyn's (eventsFitted.csv "
-            "or h5), or a CSV file whose first line names a column mass_kda"
-        ) from None
-
-
-def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
+def _checked(table: pd.DataFrame) -> pd.DataFrame:
     """Take the columns that are used; whatever is no possible number becomes NaN.
 
     All that is computed later, and every kernel, gets numbers of these ranges.
     """
-    refuse_twice(list(table.columns), _USED, name)
-    columns = {}
+    checked = table.copy()
     for column, (least, most) in _RANGES.items():
         if column in table:
-            values = _numbers(table, column, name)
-            size = np.abs(values)
-            columns[column] = np.where((size >= least) & (size <= most), values, math.nan)
-    checked = pd.DataFrame(columns, index=range(len(table)))
-    if "status" in table:
-        checked["status"] = table["status"].to_numpy()
+            size = table[column].abs()
+            checked[column] = table[column].where((size >= least) & (size <= most))
     if _REJECTED in table:
         checked[_REJECTED] = table[_REJECTED].astype(str).str.lower().eq("true").to_numpy()
     return checked
@@ -306,11 +288,6 @@ def _checked(table: pd.DataFrame, name: str) -> pd.DataFrame:
 
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
     """Select rows with a mass and without a disqualifying flag."""
-    if "mass_kda" not in table:
-        raise DataError(
-            f"{name}: has no column mass_kda; give fits.csv, a table of Refeyn's, or name the "
-            "column so"
-        )
     good = table
     if "status" in table:
         good = table[table["status"] == Status.OK.value]
@@ -319,22 +296,21 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
     notes = []
     if _REJECTED in good and (by_hand := int(good[_REJECTED].sum())):
         good = good[~good[_REJECTED]]
-        notes.append(f"{name}: {count(by_hand, 'event')} that somebody rejected left out")
+        notes.append(Note(name, "that somebody rejected left out", count(by_hand, "event")))
     mass, sigma, frame, x, y = (
-        good[column].to_numpy() if column in good else np.full(len(good), math.nan)
+        good[column].to_numpy(np.float64) if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
     )
-    if "tick" in good:  # the camera dropped frames, and time went on
-        frame = _numbers(good, "tick", name)
     errors_known = sigma_kda is not None or bool(np.isfinite(sigma[np.isfinite(mass)]).any())
     if sigma_kda is not None:
         sigma = np.full(mass.shape, sigma_kda)
     elif not errors_known:
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
-        notes.append(
-            f"{name}: its events have no errors of their own, so that the width of a species holds "
-            "them; `sigma_kda` gives them one"
+        sentence = (
+            "no event has an error of its own, so that the width of a species holds the errors; "
+            "`sigma_kda` gives them one"
         )
+        notes.append(Note(name, sentence))
     known = possible(mass, sigma)
     between = "between {:g} and {:g} kDa".format(*POSSIBLE_KDA)
     if not known.any():
@@ -343,9 +319,10 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
             "or joint) or export the table with masses"
         )
     if missing := int(np.count_nonzero(~known)):
-        notes.append(
-            f"{name}: {count(missing, 'event')} without a mass and an error {between} left out"
-        )
+        sentence = f"without a mass and an error {between} left out"
+        if good["contrast"][~known].notna().any():
+            sentence += "; `calibration` gives them the mass of their contrast"
+        notes.append(Note(name, sentence, count(missing, "event")))
     rows = good[known]
     window = (
         int(rows["n_after"].max()) if "n_after" in rows and rows["n_after"].notna().any() else 0
@@ -362,16 +339,6 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         notes=tuple(notes),
         errors_known=errors_known,
     )
-
-
-def _numbers(table: pd.DataFrame, column: str, name: str) -> FloatArray:
-    """Give a column as numbers."""
-    try:
-        return np.asarray(table[column].to_numpy(dtype=np.float64))
-    except (ValueError, TypeError, OverflowError) as error:
-        raise DataError(
-            f"{name}: holds in {column} what is no number ({first_line(error)}); correct the table"
-        ) from None
 
 
 def _cut(found: EventTable, above_kda: float) -> EventTable:

@@ -7,7 +7,6 @@ never scored as nanometres.
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,8 +17,8 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.text_tables import decimal_mark, refuse_twice, separator
-from iscat_analysis.reading import first_line, is_folder, read_text
+from iscat_analysis.movie.text_tables import read_frame, refuse_twice
+from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FloatArray
 from iscat_analysis.units import count
 
@@ -244,24 +243,12 @@ def _median_ratio(estimates: pd.Series, truth: pd.Series) -> float:
 
 
 def _read(path: Path) -> pd.DataFrame:
-    try:
-        lines = [line for line in read_text(path).splitlines() if not line.startswith("#")]
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: is no text file in UTF-8; export the results as CSV") from None
-    if len(lines) < 2:
+    table = read_frame(path)
+    if table.empty:
         raise DataError(f"{path}: has no rows; a table needs a line of names and its rows")
-    between = separator(lines[0])
-    first = [name.strip().strip('"').lower() for name in lines[0].split(between)]
-    refuse_twice(first, {name for names in NAMES.values() for name, _ in names}, path)
-    try:
-        return pd.read_csv(
-            io.StringIO("\n".join(lines)), sep=between, decimal=decimal_mark(between),
-            skipinitialspace=True,
-        )  # fmt: skip
-    except (ValueError, pd.errors.ParserError) as error:
-        raise DataError(f"{path}: cannot be read as a table ({first_line(error)})") from None
+    names = [str(name).lower() for name in table.columns]
+    refuse_twice(names, {name for names in NAMES.values() for name, _ in names}, path)
+    return table
 
 
 def _is_text(column: pd.Series) -> bool:

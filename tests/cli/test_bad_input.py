@@ -192,7 +192,7 @@ def test_heights_at_one_time(refused: Run, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("span", ["0:24", "0:25", "0:4000"])
 def test_fewer_frames_than_the_background_wants(span: str, refused: Run, movie: Path) -> None:
-    line = refused(movie, "--background", span)
+    line = refused(movie, "--background", span, options=[*GOOD[:2], *GOOD[4:]])
     assert "24" in line
     assert "background" in line
 
@@ -227,7 +227,8 @@ def test_pixel_size_unknown_everywhere(refused: Run, movie: Path) -> None:
 @pytest.mark.parametrize("size", ["84400", "0.0844", "0", "-84.4", "nan", "84,4"])
 def test_pixel_size_in_the_wrong_unit(size: str, refused: Run, movie: Path) -> None:
     """Picometres or micrometres, where nanometres are asked for."""
-    line = refused(movie, "--set", f"camera.pixel_size_nm={size}", status=USAGE)
+    own = ["--set", f"camera.pixel_size_nm={size}"]
+    line = refused(movie, *own, options=GOOD[2:], status=USAGE)
     assert "camera.pixel_size_nm" in line
 
 

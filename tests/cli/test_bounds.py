@@ -13,11 +13,14 @@ from iscat_analysis.bounds import paper
 from iscat_analysis.report.paper import PAPER_FILES
 from iscat_cli import main
 
-SETUP = ["bounds", "--set", "camera.pixel_size_nm=84.4", "--set", "bounds.pixels=25"]
+SETUP = {"camera.pixel_size_nm": "84.4", "bounds.pixels": "25"}
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    status = main([*SETUP, *arguments])
+def run(
+    capsys: pytest.CaptureFixture[str], *arguments: str, setup: dict[str, str] = SETUP
+) -> tuple[int, str, str]:
+    setup_words = [word for item in setup.items() for word in ("--set", "=".join(item))]
+    status = main(["bounds", *setup_words, *arguments])
     said = capsys.readouterr()
     return status, said.out, said.err
 
@@ -97,7 +100,7 @@ def test_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         (["--set", "optics.attenuation=-0.1"], "optics.attenuation"),
         (["--set", "bounds.z_nm=-1"], "bounds.z_nm"),
         (["--set", "particle.height_nm=-1"], "particle.height_nm"),
-        (["--set", "bounds.pixels=0"], "bounds.pixels"),
+        (["--set", "bounds.pixels=0"], "--set bounds.pixels is given twice"),
         (["--scan", "z=0-100"], "start:stop:step"),
         (["--scan", "depth=0:1:1"], "NAME one of z, focus"),
         (["--optimize", "focus"], "go together"),
@@ -129,10 +132,8 @@ def test_bad_input_gets_one_line(
 
 
 def test_unidentifiable_directions_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    status, out, _ = run(
-        capsys, "--mode", "joint", "--set", "bounds.pixels=2",
-        "--set", "camera.pixel_size_nm=150",
-    )  # fmt: skip
+    few = {"bounds.pixels": "2", "camera.pixel_size_nm": "150"}
+    status, out, _ = run(capsys, "--mode", "joint", setup=few)
     assert status == 0
     assert "unidentifiable: z_nm–mass_kda" in out
 

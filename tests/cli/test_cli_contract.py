@@ -357,8 +357,9 @@ def test_simulate_makes_one_call(monkeypatch, capsys, tmp_path) -> None:
 
 
 def test_bounds_prints_tables_or_json(capsys) -> None:
-    arguments = ["bounds", "--mode", "joint", "--set", "camera.pixel_size_nm=84.4"]
-    arguments += ["--set", "particle.mass_kda=1000", "--set", "bounds.pixels=31"]
+    common = ["bounds", "--set", "camera.pixel_size_nm=84.4", "--set", "particle.mass_kda=1000"]
+    common += ["--set", "bounds.pixels=31"]
+    arguments = [*common, "--mode", "joint"]
     assert main(arguments) == 0
     out = capsys.readouterr().out
     assert all(word in out for word in ("per photon", "CRB joint", "QCRB", "mass_kda"))
@@ -366,7 +367,7 @@ def test_bounds_prints_tables_or_json(capsys) -> None:
     result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert result["at"]["mode"] == "joint"
     assert result["at"]["mass_kda"] == 1000
-    assert main([*arguments, "--json", "--mode", "mass"]) == 0
+    assert main([*common, "--json", "--mode", "mass"]) == 0
     result = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
     assert result["per_photon"]["crb_joint"]["z_nm"] is None
 

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import tifffile
+import typer
 from event_tables import draw_series
 from scenes import write_bright_landings
 from sketches import sketch, sketch_figures
@@ -26,7 +27,7 @@ from iscat_analysis.species import describe_tracks
 from iscat_analysis.study.challenge import make_challenge
 from iscat_analysis.study.challenge_presets import parts_of_config
 from iscat_cli import console, main, main_fit
-from iscat_cli.app import COMMANDS, GROUPS
+from iscat_cli.app import COMMANDS, GROUPS, _umbrella
 from iscat_cli.console import Messages, duration
 
 PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
@@ -311,3 +312,49 @@ def test_short_stages_say_one_line_each_and_repeat_nothing(clock, capsys) -> Non
                 clock(0.01)
                 progress(stage, 1, 1)
     assert capsys.readouterr().err == "iscat-fit: detect: 1 of 1\n"
+
+
+# ---- options that are given twice ----------------------------------------------------------------
+
+
+def _commands() -> list[tuple[tuple[str, ...], typer.core.TyperCommand]]:
+    umbrella = typer.main.get_command(_umbrella())
+    found = []
+    for words, _ in NAMED:
+        command = umbrella
+        for word in words:
+            command = command.commands[word]
+        found.append((words, command))
+    return found
+
+
+@pytest.mark.parametrize(("words", "command"), _commands(), ids=lambda each: str(each)[:20])
+def test_what_is_given_twice_and_means_one_thing_is_refused(words, command, capsys) -> None:
+    """Every option of every command, whatever it is; the others are lists."""
+    for option in command.params:
+        if option.param_type_name != "option" or option.is_eager:
+            continue
+        if option.multiple:
+            assert option.opts[0] in ("--config", "--set", "--estimator"), words
+            continue
+        value = [] if option.is_flag else ["1"]
+        again = (option.secondary_opts or option.opts)[0]
+        assert main([*words, option.opts[0], *value, again, *value]) == 2
+        error = capsys.readouterr().err
+        assert f"{option.opts[0]} is given twice" in error
+        assert len(error.splitlines()) == 1
+
+
+def test_one_key_set_twice_and_files_that_are_merged(tmp_path: Path, capsys) -> None:
+    for number, na in enumerate((1.2, 1.3)):
+        (tmp_path / f"{number}.toml").write_text(f"[optics]\nna = {na}\n")
+    files = [f"{tmp_path}/{number}.toml" for number in range(2)]
+    more = ["--set", "camera.pixel_size_nm=84.4", "--set", "bounds.pixels=31", "--json"]
+    bounds = ["bounds", "--config", files[0], *more]
+    assert main([*bounds, "--set", "optics.na=1.3", "--set", "optics.na=1.4"]) == 2
+    assert "--set optics.na is given twice" in capsys.readouterr().err
+    assert main([*bounds, "--config", files[1]]) == 0
+    printed = capsys.readouterr()
+    assert f"the configuration is {files[0]}, with the keys of {files[1]}" in printed.err
+    assert main(["bounds", "--config", files[1], *more]) == 0
+    assert capsys.readouterr().out == printed.out

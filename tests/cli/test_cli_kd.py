@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import jsonschema
@@ -11,6 +12,7 @@ import pandas as pd
 import pytest
 from event_tables import draw_series
 
+from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.schemas import schema
 from iscat_cli import main
 
@@ -75,3 +77,32 @@ def test_what_is_wrong_is_said_with_the_option(
     error = capsys.readouterr().err
     assert said in error
     assert len(error.splitlines()) == 1
+
+
+FORMATS = [
+    ("{}.TIF", "{}.ome.tiff", "{}.nd2"), ("{}.npy", "{}.mp", "{}"),
+    ("{}.zarr", "{}.h5::/run/movie", "{}.bin::64x64,uint16"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("formats", FORMATS)
+def test_a_movie_of_any_format_stands_for_its_result(
+    formats: tuple[str, ...], samples: Path, tmp_path: Path, capsys
+) -> None:
+    """The movies themselves may be elsewhere; a table beside a result is not its movie."""
+    addresses = [Path(name.format(number)) for number, name in enumerate(formats)]
+    for number, address in enumerate(addresses):
+        folder = path_beside(tmp_path / "day" / address, ".iscat")
+        folder.mkdir(parents=True)
+        shutil.copy(tmp_path / f"{number}.csv", folder / "fits.csv")
+        summary = {"input": {"path": f"elsewhere/{address}"}}
+        (folder / "summary.json").write_text(json.dumps(summary))
+    expected = [len(pd.read_csv(tmp_path / f"{number}.csv")) for number in range(3)]
+    rows = pd.read_csv(samples)
+    rows["path"] = [f"day/{address}" for address in addresses]
+    shutil.copy(tmp_path / "2.csv", tmp_path / "day" / "0.csv")
+    rows.loc[3] = ["day/0.csv", 90.0]
+    rows.to_csv(samples, index=False)
+    assert main(["kd", str(samples), "--model", "dimer", "--masses", "66", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["samples"]
+    assert [row["events"] for row in found] == [*expected, expected[2]]

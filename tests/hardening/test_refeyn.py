@@ -22,6 +22,8 @@ from hardening.samples import (
 from numpy.typing import NDArray
 from tiff_files import movie
 
+import iscat_analysis as ia
+from iscat_analysis.answers.calibrations import read_contrasts
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.movie import refeyn as refeyn_module
@@ -261,12 +263,35 @@ def test_missing_values_are_nan(tmp_path: Path) -> None:
     assert table[["x_px", "y_px"]].isna().iloc[1].all()
 
 
-def test_the_events_of_several_movies_are_not_mixed(tmp_path: Path) -> None:
+def test_the_events_of_several_movies_are_together_or_one_by_one(tmp_path: Path) -> None:
     path = write_events(tmp_path / "events.h5", "one movie")
     with h5py.File(path, "r+") as file:
-        file.copy("per_movie_events/0", "per_movie_events/1")
-    with pytest.raises(DataError, match="events of 2 movies"):
-        read_events(path)
+        file.copy("per_movie_events/0", "per_movie_events/b")
+        file["per_movie_events/b/contrasts"][...] *= 2
+        del file["per_movie_events/b/calibration/offset"]
+        file["per_movie_events/b/calibration/offset"] = 0.0
+    slope, _ = CALIBRATION
+    twice = 2 * EVENTS["contrasts"]
+    table = read_events(path)
+    assert table["movie"].tolist() == ["0"] * 4 + ["b"] * 4
+    np.testing.assert_array_equal(table["contrast"], [*EVENTS["contrasts"], *twice])
+    np.testing.assert_allclose(table["mass_kda"], [*masses(), *(twice / slope)], rtol=1e-14)
+    assert table["frame"].isna().all()  # each movie counts from 0
+    assert "events of 2 movies are taken together" in table.attrs["notes"][0]
+    assert stored_calibration(table) is None  # of two that differ
+    for part, expected in (("b", twice), ("per_movie_events/0", EVENTS["contrasts"])):
+        one = read_events(Path(f"{path}::{part}"))
+        np.testing.assert_array_equal(one["contrast"], expected)
+        assert one["frame"].tolist() == EVENTS["frame_indices"].tolist()
+        assert stored_calibration(one) is not None
+    np.testing.assert_array_equal(read_contrasts(Path(f"{path}::b"))["contrast"], twice)
+    (tmp_path / "series.csv").write_text("path,concentration_nm\nevents.h5::b,3\n")
+    with pytest.raises(DataError, match=r"events\.h5::b: holds 4 events, too few"):
+        ia.fit_kd(tmp_path / "series.csv", model="dimer", masses_kda=[66.0])
+    with pytest.raises(DataError, match="holds no movie 'c'; its movies are 0, b"):
+        read_events(Path(f"{path}::c"))
+    with pytest.raises(DataError, match="holds the events of one movie; leave out ::c"):
+        read_events(Path(f"{write_events(tmp_path / 'events.csv', 'csv')}::c"))
 
 
 def test_columns_of_different_length_are_refused(tmp_path: Path) -> None:

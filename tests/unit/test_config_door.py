@@ -363,3 +363,27 @@ def test_a_blank_is_a_movie_without_particles(tmp_path: Path) -> None:
     truth = ia.simulate_movie(setup, tmp_path / "blank.tif")
     assert truth.empty
     assert (tmp_path / "blank.truth.csv").read_text().startswith("event,frame")
+
+
+def test_keys_of_later_files_win_and_a_mass_line_is_one(tmp_path: Path) -> None:
+    """Nothing of the first file is dropped but what the second says too."""
+    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
+    first.write_text(
+        "[optics]\nna = 1.3\nfocus_nm = 120.0\n[particle]\nmass_kda = 66.0\n"
+        "[calibration]\ngradient_per_kda = -3e-5\noffset = 1e-4\n"
+    )
+    second.write_text(
+        "[optics]\nna = 1.42\n[particle]\ndiameter_nm = 20.0\n"
+        "[calibration]\ngradient_per_kda = -4e-5\n"
+    )
+    both = load_config([first, second], ["optics.wavelength_nm=500"])
+    assert (both.optics.na, both.optics.focus_nm, both.optics.wavelength_nm) == (1.42, 120.0, 500)
+    assert (both.particle.mass_kda, both.particle.diameter_nm) == (None, 20.0)
+    assert both.calibration is not None
+    assert (both.calibration.gradient_per_kda, both.calibration.offset) == (-4e-5, 0.0)
+    assert load_config([second, first]).optics.na == 1.3
+    assert configure([first]) == load_config(first)
+    assert configure([]) == configure()
+    second.write_text("[optics]\nnaa = 1.42\n")
+    with pytest.raises(ConfigError, match=r"first\.toml, .*second\.toml: unknown key optics\.naa"):
+        load_config([first, second])

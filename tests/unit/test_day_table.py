@@ -98,7 +98,7 @@ def _empty(folder: Path) -> Path:
         ("path,concentration_nm\na.tif,-1\n", "line 2, concentration_nm: '-1' is not"),
         ("path,role,standards\na.tif,calibrant,x\n", "line 2, standards: 'x' is not a mass"),
         ("path,standards\na.tif,66\n", "line 2, standards: are of a calibrant"),
-        ("path\na.tif,b\n", "line 2 has 2 cells, but the heading names 1"),
+        ("path,sample\na.tif,b,c\n", "line 2 has 3 cells, but the heading names 2"),
         ("path\n", "it lists no movie"),
     ],
 )
@@ -138,9 +138,17 @@ def test_a_wrong_toml_table(folder: Path, text: str, said: str) -> None:
 def test_files_that_are_no_table(folder: Path) -> None:
     with pytest.raises(ConfigError, match="no such table or folder"):
         read_table(folder / "absent.csv")
-    (folder / "excel.csv").write_bytes("path,µ\n".encode("cp1252"))
-    with pytest.raises(ConfigError, match="UTF-8"):
-        read_table(folder / "excel.csv")
+    (folder / "noise.csv").write_bytes(b"path,\x00\x81\n")
+    with pytest.raises(ConfigError, match="is not a text file"):
+        read_table(folder / "noise.csv")
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-8-sig", "utf-16", "utf-16-le"])
+def test_a_table_as_spreadsheets_save_it(folder: Path, encoding: str) -> None:
+    path = folder / "excel.csv"
+    path.write_bytes("sep=;\r\npath;Größe\r\na.tif;1,5\r\n".encode(encoding))
+    (row,) = read_table(path).rows
+    assert (row.given, row.further) == ("a.tif", {"Größe": "1,5"})
 
 
 def test_standards_are_masses() -> None:
