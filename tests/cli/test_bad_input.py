@@ -353,7 +353,8 @@ def _simulation(folder: Path, text: str) -> Path:
         ),
         ("[simulation]\nframes = 4\n", USAGE, "pixel_size_nm"),
         (
-            "[camera]\npixel_size_nm = 84.4\n[simulation]\nphotons_per_pixel = 1e6\n",
+            "[camera]\npixel_size_nm = 84.4\ngain_e_per_adu = 1.0\n"
+            "[simulation]\nphotons_per_pixel = 1e6\n",
             USAGE,
             "16 bits",
         ),
