@@ -79,7 +79,7 @@ def event_bounds(
     if unknown or not free:
         raise ConfigError(f"free = {list(free)}: choose one or more of {', '.join(PARAMETERS)}")
     model = likelihood.model
-    if model.is_measured:  # nothing is known of the light itself
+    if model.is_measured or math.isnan(collected):  # nothing is known of the light itself
         quantum, collected = np.zeros((4, 4), dtype=complex), 0.0
     if quantum is None:
         height = max(theta[2], 0.0)  # a nuisance may be below

@@ -209,22 +209,29 @@ def fit_particle(
 
 
 def detection_snr(likelihood: Likelihood, best: Optimum, box: Box) -> float:
-    """Signal-to-noise ratio of a particle: √(2 Δℓ) against the same light without it.
+    """Signal-to-noise ratio of a particle: √(2 Δℓ) against the same light without it."""
+    return math.sqrt(
+        2 * max(best.log_likelihood - without_particle(likelihood, best.theta, box), 0.0)
+    )
+
+
+def without_particle(likelihood: Likelihood, theta: FloatArray, box: Box) -> float:
+    """Log-likelihood of the same light without a particle, relative to no change of the level.
 
     Where the level is a nuisance it is fitted without the particle too: a region that became
-    brighter as a whole is no evidence of a particle in it.
+    brighter as a whole is no evidence of a particle in it.  The height of a particle that is not
+    there is that of θ.
+
+    Shapes: `theta` (5,).
     """
-    nothing = 0.0  # log-likelihoods count from no particle and no change of the level
-    if likelihood.prior is not None:  # whatever the height of a particle that is not there
-        nothing = float(likelihood.prior.log_density(best.theta[2]))
     if box.free[LEVEL]:
         alone = np.arange(box.free.size) == LEVEL
-        empty = best.theta.copy()
+        empty = theta.copy()
         empty[AMPLITUDE] = 0.0
         empty[LEVEL] = 0.0
         lower, upper = (np.where(alone, end, empty) for end in (box.lower, box.upper))
-        nothing = likelihood.maximize(empty, alone, lower, upper).log_likelihood
-    return math.sqrt(2 * max(best.log_likelihood - nothing, 0.0))
+        return likelihood.maximize(empty, alone, lower, upper).log_likelihood
+    return 0.0 if likelihood.prior is None else float(likelihood.prior.log_density(theta[2]))
 
 
 def start_theta(likelihood: Likelihood, start: Candidate) -> FloatArray:

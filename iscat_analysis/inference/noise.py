@@ -8,6 +8,8 @@ What to use when
 `poisson`
     The background is known, or adds to the signal (dark field).  A measured background adds its own
     variance, and read noise its own, through the shifted Poisson law of Huang et al. (2013).
+`gaussian`
+    A contrast image, whose noise is normal with a known σ in every pixel.
 `asimov_conditional`, `asimov_poisson`
     The same with expected instead of measured counts: the bounds of a planned experiment.
 """
@@ -30,6 +32,10 @@ from iscat_analysis.inference.precision import precision
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 FloatArray = NDArray[np.float64]
+
+_STIFFNESS = (
+    1e3  # contrast that would double a variance: 1e-4 of it at 10 %, and sums keep 7 digits
+)
 
 
 def conditional(
@@ -108,6 +114,33 @@ def poisson(
         )
     data = np.stack([counts + extra, background, scale, extra])
     data[:, masked | (scale <= 0)] = 0.0
+    return Likelihood(model, grid, POISSON, data)
+
+
+def gaussian(
+    model: ForwardModel,
+    grid: PixelGrid,
+    contrast: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    masked: ArrayLike | None = None,
+) -> Likelihood:
+    """Make the normal likelihood of contrasts of known standard deviations.
+
+    Notes
+    -----
+    The shifted Poisson law with so much extra variance that it is normal.  A contrast s changes the
+    variance by the share s/`_STIFFNESS`.
+
+    Shapes: `contrast, sigma` (ny, nx), `masked` (ny, nx).
+    """
+    masked = mask_of("masked", masked, grid.shape)
+    seen = pixels_of("contrast", contrast, grid.shape, masked)
+    spread = pixels_of("sigma", sigma, grid.shape, masked, scalar=True)
+    used = ~masked & (spread > 0)
+    light = _STIFFNESS / np.where(used, spread, 1.0) ** 2
+    data = np.stack([light * (_STIFFNESS + seen), light, light, light * (_STIFFNESS - 1)])
+    data[:, ~used] = 0.0
     return Likelihood(model, grid, POISSON, data)
 
 

@@ -225,8 +225,9 @@ class Poisson(NoiseModel):
         if np.any(rate[used] <= 0):
             return PixelTerms.impossible(signal.shape)
         rate = np.where(used, rate, 1.0)
-        empty = np.where(used, c1 + c3, 1.0)
-        value = float(np.sum(np.where(used, c0 * np.log(rate / empty) - rate + empty, 0.0)))
+        change = expected - c1  # by itself: it may be far smaller than the counts
+        gain = np.log1p(change / np.where(used, c1 + c3, 1.0))
+        value = float(np.sum(np.where(used, c0 * gain - change, 0.0)))
         score = np.where(used, c0 / rate - 1, 0.0)
         return PixelTerms(value, score, np.where(used, 1 / rate, 0.0), level * c2, expected)
 

@@ -6,7 +6,7 @@ same sections that a configuration file has, and arrays otherwise:
 `psf`
     images of a particle, for arrays of positions, heights or masses;
 `fit_rois`
-    fits of many regions, counts before and after, into one table;
+    fits of many regions, counts before and after or contrast images, into one table;
 `fit_rods`
     the same of rods of any direction;
 `log_likelihood`

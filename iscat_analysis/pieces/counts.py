@@ -1,4 +1,4 @@
-"""Counts of regions before and after, checked once, and the likelihood of each."""
+"""Counts before and after, or contrasts, of regions, checked once, and the likelihood of each."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import BoolArray, array_of, number_in, real_array, truth_in
 from iscat_analysis.inference.counts import KNOWN, MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.fit import window_nm
 from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import gaussian
 from iscat_analysis.optics.collected import collected_area_nm2, photons_per_intensity
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.pieces.setups import darkfield_photons
@@ -24,10 +25,17 @@ FloatArray = NDArray[np.float64]
 LARGEST_RATIO = 1e9
 """Largest ratio of the light after and before, and of the light before and after."""
 
+_LARGEST_CONTRAST, _SMALLEST_SCATTER = 0.5, 0.1
+"""Median below which an image is one of contrasts, and interquartile range below which numbers
+about 0 or 1 are no photoelectrons: shot noise makes so few scatter by 1."""
+
 
 @dataclass(frozen=True)
 class Counts:
-    """Regions of one size under one microscope; build it with `gather`."""
+    """Regions of one size under one microscope; build it with `gather`.
+
+    Where `sigma` is given, `after` has contrasts, and nothing is known of the light.
+    """
 
     config: Config
     model: ForwardModel
@@ -40,9 +48,15 @@ class Counts:
     n_after: int
     masked: BoolArray
     saturated: BoolArray
+    sigma: FloatArray | None = None
 
     def likelihood(self, index: int) -> Likelihood:
         """Likelihood of one region."""
+        if self.sigma is not None:
+            return gaussian(
+                self.model, self.grid, self.after[index], self.sigma[index],
+                masked=self.masked[index],
+            )  # fmt: skip
         read = float(self.config.camera.assumed.read_noise_e) ** 2
         ratio = float(self.ratio[index])
         return counts_likelihood(
@@ -58,7 +72,9 @@ class Counts:
         )  # fmt: skip
 
     def collected(self, index: int, z_nm: float, mass_kda: float) -> float:
-        """Scattered photons that the pupil collected in the frames after."""
+        """Scattered photons that the pupil collected in the frames after; NaN if not known."""
+        if self.sigma is not None:
+            return math.nan
         area = collected_area_nm2(self.model, z_nm, mass_kda) / self.grid.pixel_nm**2
         ratio = float(self.ratio[index])
         if not self.model.rho:
@@ -75,28 +91,41 @@ class Counts:
 
 def gather(
     config: Config,
-    before: ArrayLike,
-    after: ArrayLike,
+    before: ArrayLike | None,
+    after: ArrayLike | None,
     *,
-    n_before: int,
-    n_after: int,
+    contrast: ArrayLike | None = None,
+    sigma: ArrayLike | None = None,
+    n_before: int | None,
+    n_after: int | None,
     power_ratio: ArrayLike | None,
     level: bool | None,
     masked: ArrayLike | None,
     saturated: ArrayLike | None = None,
 ) -> Counts:
-    """Check the counts and the arguments that describe them.
+    """Check the counts, or contrasts, and the arguments that describe them.
 
-    Shapes: `before, after` (n, y, x).
+    Contrasts of a known light, `before`, are counts too.
+
+    Shapes: `before, after, contrast` (n, y, x).
     """
-    frames_before = int(number_in("n_before", n_before, least=0, whole=True))
-    frames_after = int(number_in("n_after", n_after, least=1, whole=True))
-    events = real_array("after", after)
+    _require(
+        before=before, after=after, contrast=contrast, sigma=sigma, n_before=n_before,
+        n_after=n_after, power_ratio=power_ratio,
+    )  # fmt: skip
+    name, given = ("after", after) if contrast is None else ("contrast", contrast)
+    events = real_array(name, () if given is None else given)
     if events.ndim != 3 or min(events.shape[1:], default=0) < 5:
         raise DataError(
-            f"after: has shape {events.shape}; give regions of at least 5 x 5 pixels as (n, y, x)"
+            f"{name}: has shape {events.shape}; give regions of at least 5 x 5 pixels as (n, y, x)"
         )
-    background = real_array("before", before)
+    spread: FloatArray | None = None
+    if sigma is not None:
+        spread = _sigma_of(sigma, events.shape)
+        before, n_before, n_after = 1.0, 0, 1
+    frames_before = int(number_in("n_before", n_before, least=0, whole=True))
+    frames_after = int(number_in("n_after", n_after, least=1, whole=True))
+    background = real_array("before", () if before is None else before)
     if background.shape != events.shape:
         known = not frames_before and background.shape in ((), events.shape[1:])
         if not known:
@@ -107,11 +136,11 @@ def gather(
         background = np.array(np.broadcast_to(background, events.shape))
     burnt = _mask_of("saturated", saturated, events.shape)
     out = _mask_of("masked", masked, events.shape) | burnt
-    for name, array in (("before", background), ("after", events)):
+    for label, array in (("before", background), (name, events)):
         wrong = int(np.count_nonzero(~np.isfinite(array) & ~out))
         if wrong:
             raise DataError(
-                f"{name}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
+                f"{label}: is not finite in {count(wrong, 'pixel')}; mask them with masked=…"
             )
     frames = frames_after / max(frames_before, 1)
     ratio = real_array("power_ratio", frames if power_ratio is None else power_ratio)
@@ -129,7 +158,16 @@ def gather(
     rows, columns = events.shape[1:]
     reach = math.hypot(rows + 2, columns + 2) * pixel_nm + window_nm(pixel_nm)
     model = forward_model(config, reach)
-    guessed = frames_before > 0 and power_ratio is None and bool(model.rho)
+    guessed = (frames_before > 0 or sigma is not None) and power_ratio is None and bool(model.rho)
+    if model.rho:
+        _refuse_other_numbers(name, events, out)
+    elif contrast is not None:
+        raise ConfigError(
+            'contrast: optics.scheme = "darkfield" has no reference that light is compared with: '
+            "give photoelectrons as before=… and after=…"
+        )
+    if contrast is not None and sigma is None:
+        events = ratio.reshape(-1, 1, 1) * background * (1 + events)
     return Counts(
         config=config,
         model=model,
@@ -142,7 +180,64 @@ def gather(
         n_after=frames_after,
         masked=out,
         saturated=burnt,
+        sigma=spread,
     )
+
+
+def _require(**given: ArrayLike | None) -> None:
+    """Refuse a choice of arguments that does not describe regions."""
+    counts, contrasts = ("before", "after", "n_before", "n_after"), ("contrast", "sigma")
+    wanted = counts
+    if given["contrast"] is not None:
+        wanted = contrasts if given["sigma"] is not None else ("contrast", "before", *counts[2:])
+    missing = [name for name in wanted if given[name] is None]
+    allowed = {*wanted, *(() if wanted == contrasts else ("power_ratio",))}
+    needless = [name for name, value in given.items() if value is not None and name not in allowed]
+    if missing or needless:
+        what = "missing" if missing else "not needed"
+        raise ConfigError(
+            f"{', '.join(missing or needless)}: {what}; give before, after, n_before and n_after "
+            "(photoelectrons), contrast and sigma (contrast images with their noise), or contrast, "
+            "before, n_before and n_after (contrast images with their light in photoelectrons)"
+        )
+
+
+def _sigma_of(value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
+    """Give the noise of every pixel, from a number, an image or one image for each region."""
+    sigma = real_array("sigma", value)
+    if sigma.shape not in ((), shape[1:], shape):
+        raise DataError(f"sigma: has shape {sigma.shape}; give a number, {shape[1:]} or {shape}")
+    wrong = ~((sigma > 0) & np.isfinite(sigma))
+    if wrong.any():
+        raise DataError(
+            f"sigma = {sigma[wrong].flat[0]:g}: give the standard deviation of a pixel of the "
+            "contrast images, above 0, and leave pixels out with masked=…"
+        )
+    return np.array(np.broadcast_to(sigma, shape))
+
+
+def _refuse_other_numbers(name: str, events: FloatArray, masked: BoolArray) -> None:
+    """Refuse ratios and contrasts that are given as counts, and others that are given as contrasts.
+
+    Shapes: `events` (n, y, x).
+    """
+    used = events[~masked]
+    if not used.size:
+        return
+    low, middle, high = np.quantile(used, (0.25, 0.5, 0.75)).tolist()
+    if name == "contrast" and abs(middle) > _LARGEST_CONTRAST:
+        raise DataError(
+            f"contrast: its median is {middle:.2g}; give the light over that without the particle, "
+            "minus 1, which is about 0" + (" (subtract 1)" if middle < 2 else "")
+        )
+    whole = bool(np.all(used == np.round(used)))
+    if name == "after" and abs(middle) < 2 and high - low < _SMALLEST_SCATTER and not whole:
+        minus = "" if abs(middle) < _LARGEST_CONTRAST else " minus 1"
+        raise DataError(
+            f"after: half of its pixels are between {low:.5g} and {high:.5g}; these are no "
+            f"photoelectrons but {'ratios' if minus else 'contrasts'}: give them{minus} to "
+            "fit_rois as contrast=…, with sigma=… or before=…"
+        )
 
 
 def _mask_of(name: str, value: ArrayLike | None, shape: tuple[int, ...]) -> BoolArray:

@@ -10,10 +10,12 @@ from numpy.typing import ArrayLike, NDArray
 from iscat_analysis.config import Calibration, CameraConfig, Optics, Particle, refuse_rod
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import real_array
+from iscat_analysis.inference.fit import without_particle
 from iscat_analysis.inference.likelihood import LARGEST_LEVEL, LEVEL, Likelihood
 from iscat_analysis.pieces.counts import gather
+from iscat_analysis.pieces.regions import templates_of
 from iscat_analysis.pieces.setups import config_of
-from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
+from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Box
 
 FloatArray = NDArray[np.float64]
 
@@ -34,11 +36,15 @@ class LogLikelihood:
     lower, upper : ndarray, shape (k,)
         The support: the region's edges, the heights searched, the possible masses (0 to ∞, or any
         mass if particles of either sign are possible).
+    detected_above : float
+        Log-likelihood that noise alone exceeds in at most 1 of 100 regions without a particle, for
+        some θ: `fit_rois` calls a region ``not_detected`` whose maximum is not higher.
     """
 
     names: tuple[str, ...]
     lower: FloatArray
     upper: FloatArray
+    detected_above: float
     _likelihood: Likelihood
     _fixed: FloatArray
 
@@ -247,10 +253,16 @@ def log_likelihood(
     if counts.level:
         names, free = (*names, "log_level"), [*free, LEVEL]
     amplitude = model.scale.amplitude(model.material.mass_kda)
+    likelihood = counts.likelihood(0)
+    fixed = np.array([0.0, 0.0, particle.nominal_height_nm, amplitude, 0.0])
+    level = np.array([False] * LEVEL + [counts.level])
+    around = Box(level, fixed - level * LARGEST_LEVEL, fixed + level * LARGEST_LEVEL)
+    nothing = without_particle(likelihood, fixed, around)
     return LogLikelihood(
         names=names,
         lower=np.array([*lower, -LARGEST_LEVEL])[free],
         upper=np.array([*upper, LARGEST_LEVEL])[free],
-        _likelihood=counts.likelihood(0),
-        _fixed=np.array([0.0, 0.0, particle.nominal_height_nm, amplitude, 0.0]),
+        detected_above=nothing + templates_of(counts).threshold ** 2 / 2,
+        _likelihood=likelihood,
+        _fixed=fixed,
     )

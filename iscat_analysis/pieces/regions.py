@@ -43,19 +43,25 @@ FloatArray = NDArray[np.float64]
 SATURATION_NM = 500.0
 """A fit is flagged if a saturated pixel is nearer than this."""
 
+FALSE_ALARMS_PER_REGION = 0.01
+"""Share of regions without a particle in which the highest peak of the noise is taken for one; the
+others are ``not_detected``."""
+
 _LEAST_USABLE_SHARE = 0.5  # share of a region's pixels that must be usable
 _EDGE_SHARE = 0.15  # of the region's side at each edge, where a particle is not looked for
 
 
 def fit_rois(
-    before: ArrayLike,
-    after: ArrayLike,
-    optics: Optics,
-    particle: Particle,
-    camera: CameraConfig,
+    before: ArrayLike | None = None,
+    after: ArrayLike | None = None,
+    optics: Optics | None = None,
+    particle: Particle | None = None,
+    camera: CameraConfig | None = None,
     *,
-    n_after: int,
-    n_before: int,
+    contrast: ArrayLike | None = None,
+    sigma: ArrayLike | None = None,
+    n_after: int | None = None,
+    n_before: int | None = None,
     mode: str = "mass",
     power_ratio: ArrayLike | None = None,
     level: bool | None = None,
@@ -66,7 +72,10 @@ def fit_rois(
     calibration: Calibration | None = None,
     workers: int = 1,
 ) -> pd.DataFrame:
-    """Fit one particle in each of many regions.
+    """Fit one particle in each of many regions, from counts or from contrast images.
+
+    Give `before`, `after`, `n_before` and `n_after`; or `contrast` and `sigma`; or `contrast` and
+    its light, as `before`, `n_before` and `n_after`; and always `optics`, `particle` and `camera`.
 
     Parameters
     ----------
@@ -81,6 +90,11 @@ def fit_rois(
         Its material, and the height or mass that a mode holds fixed.
     camera : Camera
         Pixel size, samples per pixel and read noise.
+    contrast : array_like, shape (n, y, x), optional
+        Contrast images in place of counts: light over the light without the particle, minus 1.
+    sigma : float or array_like, shape (n, y, x) or (y, x), optional
+        Standard deviation of the noise of every pixel of `contrast`, which is taken as normal and
+        independent from pixel to pixel.  `n_scattered` and ``qcrb_…`` are then unknown.
     n_after, n_before : int
         Frames in the sums; ``n_before=0`` where the background is known.
     mode : {"mass", "localize", "joint", "size"}
@@ -91,7 +105,8 @@ def fit_rois(
         larger field; default the ratio of the frames, with `level` fitted.
     level : bool, optional
         Whether a common level of the light is fitted as a nuisance; default where the background
-        is measured, interferes, and no `power_ratio` is given.
+        is measured, interferes, and no `power_ratio` is given.  A level that contrasts have in
+        common is one too.
     z_range_nm : (float, float)
         Heights that are searched where z is free [nm].
     masked, saturated : array_like of bool, shape (n, y, x) or (y, x), optional
@@ -107,8 +122,9 @@ def fit_rois(
     -------
     pandas.DataFrame
         One row for each region, in their order, with the columns of ``fits.csv``.  `frame` is
-        empty: sums do not say when.  A region without half of its pixels is ``not_converged`` and
-        has no estimate.
+        empty: sums do not say when.  A region in which no particle stands out from the noise is
+        ``not_detected``; noise alone does in at most 1 of 100.  One without half of its pixels is
+        ``not_converged`` and has no estimate.
 
     Raises
     ------
@@ -121,6 +137,10 @@ def fit_rois(
     -----
     Likelihood, estimator, bounds and flags are those of `fit_movie` and `iscat-fit`, which also
     find the regions and take neighbours into account.
+
+    Detection compares the likelihood with that of no particle.  Its threshold takes into account
+    that the best place, and height where it is free, was searched in the whole region: Adler and
+    Taylor, Random Fields and Geometry (2007), section 12.4.
 
     Examples
     --------
@@ -142,21 +162,15 @@ def fit_rois(
     if mode == "track":
         raise ConfigError('mode = "track" links frames: give "joint", frame by frame')
     counts = gather(
-        config, before, after, n_before=n_before, n_after=n_after, power_ratio=power_ratio,
-        level=level, masked=masked, saturated=saturated,
+        config, before, after, contrast=contrast, sigma=sigma, n_before=n_before, n_after=n_after,
+        power_ratio=power_ratio, level=level, masked=masked, saturated=saturated,
     )  # fmt: skip
     count = len(counts.after)
     corners = np.zeros((count, 2)) if corners_px is None else real_array("corners_px", corners_px)
     if corners.shape != (count, 2) or not np.all(np.isfinite(corners)):
         raise DataError(f"corners_px: has shape {corners.shape}; give {(count, 2)} finite numbers")
     n_threads = int(number_in("workers", workers, least=1, whole=True))
-    templates = make_templates(
-        counts.model, config.detection,
-        pixel_nm=counts.grid.pixel_nm,
-        roi_nm=min(counts.grid.shape) * counts.grid.pixel_nm,
-        z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[mode] else None,
-        field_px=counts.grid.shape,
-    )  # fmt: skip
+    templates = templates_of(counts)
     parts = parts_of(FREE_PARAMETERS[mode], heights=has_prior(config), posteriors=False)
     compile_kernels(counts.model, parts)
     with threads(n_threads) as pool:
@@ -166,6 +180,19 @@ def fit_rois(
         table = with_diameters(table, config.particle.density)
     refused = bool(counts.model.scale.refusal)
     return flagged(table, Status.UNCALIBRATED_OPTICS) if refused else table
+
+
+def templates_of(counts: Counts) -> Templates:
+    """Make the matched filter of a region, with the threshold of its detection."""
+    config, grid = counts.config, counts.grid
+    alarms = {"false_alarms_per_movie": FALSE_ALARMS_PER_REGION}
+    return make_templates(
+        counts.model, config.detection.model_copy(update=alarms),
+        pixel_nm=grid.pixel_nm,
+        roi_nm=min(grid.shape) * grid.pixel_nm,
+        z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[config.fit.mode] else None,
+        field_px=grid.shape,
+    )  # fmt: skip
 
 
 def line_of(
@@ -276,7 +303,7 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
             "status": str(status),
             "flags": ";".join(str(flag) for flag in noticed),
         }
-    start = _start(likelihood, templates)
+    start = _start(likelihood, templates, level=counts.level)
     free = FREE_PARAMETERS[config.fit.mode]
     if "mass_kda" not in free:
         start = replace(start, mass_kda=model.material.mass_kda)
@@ -289,6 +316,8 @@ def _row(counts: Counts, templates: Templates, index: int, corner: FloatArray) -
         likelihood, start, config.fit.mode, config.fit.z_range_nm, level=counts.level
     )
     flags = list(fit.flags)
+    if not fit.snr > templates.threshold:
+        flags.append(Status.NOT_DETECTED)
     if saturated_near(saturated, fit.x_nm, fit.y_nm, pixel_nm):
         flags.append(Status.SATURATED)
     collected = counts.collected(index, fit.z_nm, fit.mass_kda)
@@ -316,9 +345,17 @@ def saturated_near(
     return bool(np.any(np.hypot(dx, dy) < SATURATION_NM))
 
 
-def _start(likelihood: Likelihood, templates: Templates) -> Candidate:
-    """Where the matched filter is largest, away from the edges of the region."""
-    snr, strength = signal_to_noise(likelihood, templates)
+def _start(likelihood: Likelihood, templates: Templates, *, level: bool) -> Candidate:
+    """Where the matched filter is largest, away from the edges of the region.
+
+    Where the level is not known, its mean over the region is no particle.
+    """
+    common: FloatArray | None = None
+    if level:
+        used, signal = likelihood.used, likelihood.measured_signal()
+        weight = likelihood.signal_information()[used]
+        common = np.full(signal.shape, np.average(signal[used], weights=weight))
+    snr, strength = signal_to_noise(likelihood, templates, common)
     ranked = np.abs(snr) if templates.two_sided else snr
     rows, columns = likelihood.grid.shape
     inner = np.full(ranked.shape, -np.inf)

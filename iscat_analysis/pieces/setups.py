@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,29 +16,34 @@ from iscat_analysis.records import FREE_PARAMETERS
 
 FloatArray = NDArray[np.float64]
 
+T = TypeVar("T")
+
 LARGEST_REGION = 1500
 """Pixels along a side of a region, whose bounds take half a gigabyte."""
 
 
+def _given(name: str, value: T | None, kind: type[T], example: str) -> T:
+    """Refuse an argument of another type."""
+    if not isinstance(value, kind):
+        raise ConfigError(
+            f"{name}: is {type(value).__name__}; give what iscat_analysis.{example} returns"
+        )
+    return value
+
+
 def config_of(
-    optics: Optics,
-    particle: Particle,
-    camera: CameraConfig,
+    optics: Optics | None,
+    particle: Particle | None,
+    camera: CameraConfig | None,
     *,
     mode: str = "joint",
     z_range_nm: tuple[float, float] | None = None,
     calibration: Calibration | None = None,
 ) -> Config:
     """Put microscope, particle and camera together."""
-    for name, value, kind, example in (
-        ("optics", optics, Optics, "Optics(na=1.42)"),
-        ("particle", particle, Particle, "Particle(mass_kda=480)"),
-        ("camera", camera, CameraConfig, "Camera(pixel_size_nm=84.4)"),
-    ):
-        if not isinstance(value, kind):
-            raise ConfigError(
-                f"{name}: is {type(value).__name__}; give what iscat_analysis.{example} returns"
-            )
+    optics = _given("optics", optics, Optics, "Optics(na=1.42)")
+    particle = _given("particle", particle, Particle, "Particle(mass_kda=480)")
+    camera = _given("camera", camera, CameraConfig, "Camera(pixel_size_nm=84.4)")
     if calibration is not None and not isinstance(calibration, Calibration):
         raise ConfigError(
             f"calibration: is {type(calibration).__name__}; give what "

@@ -20,6 +20,7 @@ class Status(StrEnum):
     SATURATED = "saturated"
     UNCALIBRATED_OPTICS = "uncalibrated_optics"
     SIDELOBE = "sidelobe"
+    NOT_DETECTED = "not_detected"
     NONLINEAR = "nonlinear"
     PROCESSED = "processed"
     CHANGING = "changing"
@@ -50,6 +51,8 @@ _ADVICE = {
     "treat the mass as shared between them.",
     Status.SIDELOBE: "Not larger than the residual of a brighter particle beside it, and not "
     "counted: check focus, NA and aberrations to tell whether it is a particle.",
+    Status.NOT_DETECTED: "No particle stands out from the noise of the region, as noise alone does "
+    "in at most 1 of 100 regions: use more frames or more light, or check where it was cut out.",
     Status.UNCALIBRATED_OPTICS: "The contrast is right, but the mass scale was measured with "
     "other optics: measure standards with these optics (iscat calibrate mass).",
     Status.SATURATED: "The camera is saturated here: lower the exposure or the laser power.",
@@ -70,6 +73,7 @@ _ADVICE = {
 
 SEVERITY = (
     Status.SIDELOBE,
+    Status.NOT_DETECTED,
     Status.NOT_CONVERGED,
     Status.AT_BOUND,
     Status.LARGE,
@@ -85,11 +89,11 @@ SEVERITY = (
     Status.NONLINEAR,
     Status.PROCESSED,
 )
-"""Flags of a fit, worst first: perhaps no particle; no estimate; no estimate inside the bounds; no
-dipole and so no mass; a model that does not describe the data, their change in time or their width;
-one of several diameters, heights or directions; a mass shared with a neighbour; pixels left out; a
-mass on the scale of other optics; counts that are not in proportion to the light; frames that were
-processed."""
+"""Flags of a fit, worst first: perhaps no particle; none above the noise; no estimate; no estimate
+inside the bounds; no dipole and so no mass; a model that does not describe the data, their change
+in time or their width; one of several diameters, heights or directions; a mass shared with a
+neighbour; pixels left out; a mass on the scale of other optics; counts that are not in proportion
+to the light; frames that were processed."""
 
 
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
