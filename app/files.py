@@ -12,6 +12,7 @@ import panel as pn
 import iscat_analysis as ia
 from iscat_analysis.movie.addresses import path_beside
 from iscat_analysis.reading import read_json
+from iscat_analysis.report.answer import answer_in
 from iscat_app.chosen import Chosen, Notice, in_line, table_of
 
 Kind = Literal["folder", "movie", "result"]
@@ -83,7 +84,9 @@ def result_facts(result: Path) -> list[tuple[str, str]]:
     """Say what stands in a result."""
     summary: dict[str, Any] = read_json(result / "summary.json")
     state = "interrupted; Run goes on from there" if summary.get("interrupted") else "complete"
-    return [("result", f"{result.name}, {state}"), ("events", str(summary["events"]))]
+    facts = [("result", f"{result.name}, {state}"), ("events", str(summary["events"]))]
+    answer = answer_in(result)
+    return [*facts, ("answer", answer)] if answer else facts
 
 
 class Files:

@@ -185,18 +185,18 @@ def print_batch(found: Batch) -> None:
     done = int((found.movies["state"] == "done").sum())
     shown = table("movie")
     shown.add_column("sample", no_wrap=True)
-    for heading in ("events", "landings", "species", "main mass [kDa]"):
+    for heading in ("events", "landings"):
         shown.add_column(heading, justify="right", no_wrap=True)
+    shown.add_column("answer")
     shown.add_column("cautions")
     for row in found.movies.head(ROWS_SHOWN).to_dict("records"):
-        numbers = ("events", "landings", "species", "main_mass_kda")
         cautions = row["why"] if row["state"] == "failed" else row["cautions"]
         cautions = "not analysed yet" if row["state"] == "missing" else cautions
         shown.add_row(
             str(row["movie"]),
             str(row["sample"]),
-            *(short(row[name]) for name in numbers),
-            cautions if isinstance(cautions, str) else "",
+            *(short(row[name]) for name in ("events", "landings")),
+            *(text if isinstance(text, str) else "" for text in (row["answer"], cautions)),
         )
     print_result(shown)
     for row in found.kd.to_dict("records"):

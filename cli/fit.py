@@ -182,7 +182,7 @@ def fit(
                 found["tracks"] = analysis.tracks.to_dict("records")
             print_json("fit", found)
         else:
-            _print_table(analysis, rows, folder)
+            _print_table(analysis, folder)
         flagged = [row for row in rows if _is_flagged(row)]
         if flagged:
             _advise(messages, flagged)
@@ -229,40 +229,35 @@ def _is_flagged(row: Mapping[str, Any]) -> bool:
 
 
 def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
-    from iscat_analysis.records import Status
+    from iscat_analysis.records import NO_EVENT, Status
 
     flag_counts: Counter[str] = Counter()
     for row in flagged:
         found = {str(row["status"]), *str(row["flags"] or "").split(";")}
-        flag_counts.update(found & {"sidelobe"} or found)  # which is no event
+        flag_counts.update(found & NO_EVENT or found)
     for status in Status:
         if status != Status.OK and flag_counts[status.value]:
             messages.notify(f"{flag_counts[status.value]} {status}: {status.advice}")
 
 
-def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
+def _print_table(analysis: Analysis, folder: Path) -> None:
     from rich.console import Console
 
-    from iscat_analysis.records import FREE_PARAMETERS
-    from iscat_analysis.report.headline import (
-        NOT_A_MASS,
-        as_contrasts,
-        as_diameters,
-        caution,
-        main_quantity,
-    )
-    from iscat_analysis.report.headline import is_uncalibrated as uncalibrated
-    from iscat_analysis.units import count
+    from iscat_analysis.records import FREE_PARAMETERS, counted, tally
+    from iscat_analysis.report.answer import answers, caution, main_quantity
+    from iscat_analysis.report.answer import is_uncalibrated as uncalibrated
+    from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, as_diameters
 
     if analysis.tracks is not None:
         _print_tracks(analysis, folder)
         return
-    if rows:
+    found = tally(analysis.table)
+    if found.number:
         console = Console()
         width = console.width if console.is_terminal else None
         if (flagged := caution(analysis.table)) is not None:
             print_result(flagged)
-        shown, mass = analysis.table.head(ROWS_SHOWN), ("mass", "kDa")
+        shown, mass = counted(analysis.table).head(ROWS_SHOWN), ("mass", "kDa")
         if uncalibrated(analysis):
             print_result(NOT_A_MASS)
             mass = ("mass, model scale", "kDa")
@@ -272,19 +267,18 @@ def _print_table(analysis: Analysis, rows: Sequence[Mapping[str, Any]], folder: 
             shown, mass = as_diameters(shown), ("diameter", "nm")
         free = FREE_PARAMETERS[analysis.mode]
         print_result(events_table(shown.to_dict("records"), free, mass=mass, width=width))
-    if len(rows) > ROWS_SHOWN:
-        print_result(f"… and {len(rows) - ROWS_SHOWN} more in {folder / 'fits.csv'}")
-    counts = Counter(str(row["status"]) for row in rows)
-    verdict = ", ".join(f"{n} {status}" for status, n in counts.most_common())
-    found = count(len(rows) - counts["sidelobe"], "event")
-    print_result(f"{found}{': ' if verdict else ''}{verdict}; results in {folder}")
+        if found.number > ROWS_SHOWN:
+            print_result(f"… and {found.number - ROWS_SHOWN} more in {folder / 'fits.csv'}")
+        for answer in answers(analysis, analysis.table):
+            print_result(answer.text)
+    print_result(f"{found.text()}; results in {folder}")
 
 
 def _print_tracks(analysis: Analysis, folder: Path) -> None:
-    from iscat_analysis.report.headline import main_quantity
+    from iscat_analysis.records import tally
+    from iscat_analysis.report.answer import main_quantity, tracks_of
     from iscat_analysis.report.tables import event_table
-    from iscat_analysis.report.tracks import track_lines, tracks_headline, tracks_of
-    from iscat_analysis.units import count
+    from iscat_analysis.report.tracks import track_lines, tracks_headline
 
     tracks = tracks_of(analysis)
     if len(tracks):
@@ -294,7 +288,7 @@ def _print_tracks(analysis: Analysis, folder: Path) -> None:
         print_result(f"… and {len(tracks) - ROWS_SHOWN} more in {folder / 'tracks.csv'}")
     for line in (*tracks_headline(analysis, event_table(analysis)), *track_lines(analysis.summary)):
         print_result(line)
-    print_result(f"{count(len(tracks), 'track')}; results in {folder}")
+    print_result(f"{tally(tracks).text('track')}; results in {folder}")
 
 
 def tracks_table(tracks: pd.DataFrame, *, contrast: bool = False) -> Table:

@@ -24,23 +24,17 @@ from iscat_analysis.records import (
     FloatArray,
     Progress,
     silent,
+    tally,
 )
 from iscat_analysis.report import write_report
+from iscat_analysis.report.answer import caution, main_quantity, tracks_of
 from iscat_analysis.report.exchange import to_napari, to_trackpy
-from iscat_analysis.report.headline import (
-    as_contrasts,
-    caution,
-    headline,
-    label_of,
-    main_quantity,
-    precision_of,
-)
+from iscat_analysis.report.headline import as_contrasts, headline, label_of, precision_of
 from iscat_analysis.report.numbers import UNITS, number
 from iscat_analysis.report.pictures import draw, draw_corner, draw_event, posterior_of, view_of
 from iscat_analysis.report.posterior import posterior_groups
-from iscat_analysis.report.spread import counted
 from iscat_analysis.report.tables import event_table
-from iscat_analysis.report.tracks import tracks_headline, tracks_of
+from iscat_analysis.report.tracks import tracks_headline
 from iscat_analysis.text import in_page
 from iscat_analysis.units import count
 
@@ -275,7 +269,7 @@ class Result:
     def _heading(self) -> str:
         analysis = self.analysis
         name = Path(analysis.provenance.input_path).name or "movie"
-        found = count(len(counted(analysis.table)), "event")
+        found = count(tally(analysis.table).number, "event")
         if analysis.tracks is not None:
             found = f"{count(len(self.tracks), 'track')} of {count(len(self), 'position')}"
         return f"{found} in {name}, mode {analysis.mode}"
@@ -284,8 +278,8 @@ class Result:
         table, tracked = event_table(self.analysis), self.analysis.tracks is not None
         headlines = tracks_headline if tracked else headline
         facts = [("", text) for text in headlines(self.analysis, table)] if len(self) else []
-        counts = (self.tracks if tracked else table)["status"].value_counts()
-        facts.append(("status", ", ".join(f"{n} {s}" for s, n in counts.items()) or "no events"))
+        rows = tally(self.tracks if tracked else table)
+        facts.append(("status", rows.text("track" if tracked else "event")))
         for name in FREE_PARAMETERS[self.mode] if caution(table) is None else ():
             p = precision_of(self.analysis, table, name)
             if p.events:

@@ -19,7 +19,7 @@ from scipy.special import betaincinv, gammaincinv
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
-from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.records import BoolArray, FloatArray, is_event
 from iscat_analysis.species.describe import Branch
 from iscat_analysis.species.tables import EventTable, event_table
 
@@ -74,7 +74,7 @@ def counted_rows(
     """Tell which rows of ``fits.csv`` count: of one branch, ok or flagged too, and not rejected."""
     choice_in("`branch`", branch, ("magnitude", "landing", "leaving"))
     mass = table["mass_kda"].to_numpy(float)
-    counts = np.isfinite(mass) & (table["status"] != "sidelobe").to_numpy(bool)
+    counts = np.isfinite(mass) & is_event(table)
     if branch != "magnitude":
         counts &= (mass > 0) == (branch == "landing")
     if ok_only:

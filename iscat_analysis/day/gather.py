@@ -21,13 +21,14 @@ from iscat_analysis.day.plan import Movie, Plan
 from iscat_analysis.day.quality import judge, noise_of
 from iscat_analysis.day.run import Outcome
 from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.report.answer import answer_in
 
 LABELS = ("movie", "sample", "condition", "concentration_nm", "replicate", "role")
 """What tells a movie in every table."""
 
 MOVIE_COLUMNS = (
     *LABELS, "path", "state", "why", "cautions", "report", "events", "ok", "landings", "leavings",
-    "species", "main_mass_kda", "rate_per_s", "rate_low", "rate_high", "rate_per_um2_s",
+    "species", "main_mass_kda", "answer", "rate_per_s", "rate_low", "rate_high", "rate_per_um2_s",
     "frames_searched", "seconds_searched", "field_um2", "frames", "drift_px", "focus_shift_nm",
     "noise_over_shot", "noise_frames", "median_p_value", "small_p_values", "repeat_over_crb",
     "standards_seen", "optics", "mass_scale", "outside_standards", "remarks", "sha256",
@@ -202,6 +203,7 @@ def _numbers(each: Found, day: Day, out: Path) -> dict[str, Any]:
         "leavings": landing.get("leavings"),
         "species": len(counted) if summary.get("distribution") else None,
         "main_mass_kda": main["mass_kda"] if main else None,
+        "answer": answer_in(each.folder),
         "rate_per_s": rate,
         "rate_low": low,
         "rate_high": high,

@@ -41,7 +41,7 @@ from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
 from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.searched import searched_warning
 from iscat_analysis.landing.step_maps import maps_are_local
-from iscat_analysis.records import CountSource, Progress, Status, silent
+from iscat_analysis.records import CountSource, Progress, Status, counted, silent
 from iscat_analysis.search.sliding import FieldSums, boundaries, stride_of
 from iscat_analysis.search.sliding.planning import Part, plan_parts
 from iscat_analysis.threads import one_thread_algebra, start_in_thread, threads
@@ -372,7 +372,7 @@ def _median_snr(table: pd.DataFrame) -> float:
 
 def _counted(table: pd.DataFrame) -> dict[str, int]:
     """Count landings and leavings."""
-    left = table["mass_kda"][table["status"] != Status.SIDELOBE] < 0
+    left = counted(table)["mass_kda"] < 0
     return {"landings": int((~left).sum()), "leavings": int(left.sum())}
 
 

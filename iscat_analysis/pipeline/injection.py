@@ -32,7 +32,7 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run, notify_nobody
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline.rows import reported_rows
-from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status
+from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status, counted
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 FEWEST_WINDOWS_PRESENT = 3
@@ -192,7 +192,7 @@ def inject_and_recover(
     rows = reported_rows(again).table
     return recovery(
         particles,
-        rows[rows["status"] != Status.SIDELOBE],
+        counted(rows),
         frames[1],
         result.context.roi_px / 2,
         window,

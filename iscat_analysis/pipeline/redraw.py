@@ -38,7 +38,15 @@ from iscat_analysis.landing.steps import StepEvent
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.landing.traces import patch_of, trace_of
 from iscat_analysis.movie import Stack
-from iscat_analysis.records import Candidate, CountSource, EventView, FloatArray, Windows, silent
+from iscat_analysis.records import (
+    Candidate,
+    CountSource,
+    EventView,
+    FloatArray,
+    Windows,
+    is_event,
+    silent,
+)
 from iscat_analysis.search.sliding import StepFrame, Tile, stride_of
 from iscat_analysis.search.sliding.chunks import Reader, reader_of
 from iscat_analysis.search.sliding.planning import HALO, halo_px
@@ -120,7 +128,7 @@ def _landings(
             chunk, pattern = corrected(chunk, wanted=wanted, mapper=pool.map)
         neighbours = Neighbours(context, chunk, window, pattern)
         near = (table["frame"] - frame).abs() < 3 * window
-        known = near & table["mass_kda"].notna() & (table["status"] != "sidelobe")
+        known = near & table["mass_kda"].notna() & is_event(table)
         known &= tile.holds(table["y_px"].to_numpy(float), table["x_px"].to_numpy(float))
         numbers = [row, *(int(i) for i in np.flatnonzero(known) if i != row)]
         steps = [_step(neighbours, table.iloc[i], tile.corner) for i in numbers]
@@ -194,7 +202,7 @@ def _before_after(
     def seen(span: tuple[int, int]) -> tuple[Windows, list[int]]:
         """Give the sums, with the light that the particles leave, and the rows in them."""
         windows = measured_windows(movie, config, camera, before, span)
-        rows = table.index[table["mass_kda"].notna() & (table["status"] != "sidelobe")]
+        rows = table.index[table["mass_kda"].notna() & is_event(table)]
         here = [int(i) for i in rows if not tracked or int(table["frame"].iloc[i]) == span[0]]
         if config.background.power_normalization:
             signal = context.left(drawn(whole, here))

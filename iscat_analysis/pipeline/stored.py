@@ -17,7 +17,8 @@ from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.pipeline.redraw import Redraw, redraw
 from iscat_analysis.reading import read_json, read_parquet
-from iscat_analysis.records import EventView
+from iscat_analysis.records import EventView, tally
+from iscat_analysis.report.answer import answer_in
 from iscat_analysis.report.pictures import draw_view, event_facts
 
 
@@ -104,7 +105,11 @@ class StoredResult:
         self.config: Config = load_config(folder / "config.toml")
 
     def __repr__(self) -> str:
-        return f"<StoredResult {self.folder.name}: {len(self)} rows, mode {self.mode}>"
+        said = [tally(self.table).text(), answer_in(self.folder)]
+        if self.tracks is not None:
+            said[0] = tally(self.tracks).text("track")
+        text = "; ".join(filter(None, said))
+        return f"<StoredResult {self.folder.name}, mode {self.mode}: {text}>"
 
     def __enter__(self) -> StoredResult:
         return self

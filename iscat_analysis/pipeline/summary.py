@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -15,7 +14,14 @@ from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread
-from iscat_analysis.records import FREE_PARAMETERS, FloatArray, Status, TrackStatus, free_parameters
+from iscat_analysis.records import (
+    FREE_PARAMETERS,
+    FloatArray,
+    Status,
+    TrackStatus,
+    free_parameters,
+    tally,
+)
 from iscat_analysis.report.numbers import number
 from iscat_analysis.report.spread import rejection
 from iscat_analysis.species import LEAST_EVENTS, describe
@@ -46,6 +52,7 @@ def summary_of(
     achieved: Mapping[str, EmpiricalSpread] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Gather counts, medians and efficiency, for ``summary.json``; `species_of` has the rest."""
+    rows = tally(table)
     good = table[table["status"] == Status.OK]
     free = free_parameters(context.mode, table)
     conflict = {"z_nm", "mass_kda"} <= set(free) and len(good) > 0
@@ -73,8 +80,9 @@ def summary_of(
         "convention": context.model.optics.convention,
         "mass_scale": mass_scale_of(context.config),
         **_scale_transfer(context),
-        "events": int((table["status"] != Status.SIDELOBE).sum()),
-        "status": dict(sorted(Counter(table["status"]).items())),
+        "events": rows.number,
+        "status": dict(sorted(rows.status.items())),
+        **({"no_events": rows.left_out} if rows.left_out else {}),
         "frames_before": list(compared.frames_before),
         "frames_after": list(compared.frames_after),
         "power_ratio": compared.power_ratio,
@@ -125,10 +133,20 @@ def species_of(
             "across_particles": [],
             "sizes": None if found is None else found.to_dict(),
         }
-    good = table[table["status"] == Status.OK]
-    distribution = _distribution(context, good, searched or 1.0)
-    across = species_width(context, table, distribution)
-    return {"distribution": distribution, "across_particles": across}
+    used = species_rows(table)
+    distribution = _distribution(context, used, searched or 1.0)
+    if distribution is not None and (used["status"] == Status.POOR_FIT).any():
+        distribution["notes"].append("poor fits are counted too, because the model is rejected")
+    return {"distribution": distribution, "across_particles": species_width(used, distribution)}
+
+
+def species_rows(table: pd.DataFrame) -> pd.DataFrame:
+    """Select the rows that species are found among: ok, and poor fits if the model is rejected.
+
+    Then a poor fit is no other kind of row: the bright particles are poor, all the same.
+    """
+    judged = [Status.OK, Status.POOR_FIT] if rejection(table) else [Status.OK]
+    return table[table["status"].isin(judged)]
 
 
 def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:
@@ -230,18 +248,10 @@ def _distribution(
 
 
 def species_width(
-    context: AnalysisContext, table: pd.DataFrame, distribution: Mapping[str, Any] | None
+    used: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
-    """Compare the width of each species with σ; poor fits are included if the model is rejected."""
-    if distribution is None:
-        return []
-    species, status = distribution["species"], table["status"]
-    used = table[status == Status.OK]
-    if rejection(table):
-        used = table[status.isin([Status.OK, Status.POOR_FIT])]
-        mass, sigma = (used[name].to_numpy(float) for name in ("mass_kda", "sigma_mass_kda"))
-        found = describe(mass, sigma, seed=context.config.compute.seed)
-        species = found.to_dict()["species"]
+    """Compare the width of each species with the σ of its events."""
+    species = distribution["species"] if distribution is not None else []
     if not species:
         return []
     means = np.array([one["mass_kda"] for one in species])

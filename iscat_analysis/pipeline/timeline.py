@@ -20,7 +20,7 @@ from iscat_analysis.diagnosis.stretches import Stretches
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.field_map import changes_at, terms_of, when
-from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.records import FloatArray, Status, is_event
 from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
 
 _PLACES, _TOGETHER = 48, 6  # where some frames are looked at, and how many
@@ -157,10 +157,9 @@ def _intervals(stretches: Stretches, found: DetectionResult) -> Iterator[dict[st
 def _events(table: pd.DataFrame, first: int, last: int) -> dict[str, Any]:
     """Count events in equal parts of the movie, those that are ok and others."""
     edges = np.unique(np.linspace(first, last, _BINS + 1).astype(int))
-    status = table["status"].astype(str)
     frame = table["frame"].to_numpy(float)
-    ok = (status == Status.OK.value).to_numpy()
-    others = ~ok & (status != Status.SIDELOBE.value).to_numpy()
+    ok = (table["status"] == Status.OK.value).to_numpy()
+    others = ~ok & is_event(table)
     return {
         "edges": edges.tolist(),
         "ok": np.histogram(frame[ok], edges)[0].tolist(),

@@ -48,8 +48,18 @@ from iscat_analysis.records.frames import (
     StackMetadata,
     Windows,
 )
-from iscat_analysis.records.rows import flagged, has_flag, has_only, make_rows, with_diameters
-from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus, verdict
+from iscat_analysis.records.rows import (
+    Tally,
+    counted,
+    flagged,
+    has_flag,
+    has_only,
+    is_event,
+    make_rows,
+    tally,
+    with_diameters,
+)
+from iscat_analysis.records.verdicts import NO_EVENT, SEVERITY, Status, TrackStatus, verdict
 
 __all__ = [
     "BUDGET_COLUMNS",
@@ -58,6 +68,7 @@ __all__ = [
     "EVENT_COLUMNS",
     "FRAME_COLUMN",
     "FREE_PARAMETERS",
+    "NO_EVENT",
     "NO_MODEL",
     "PARAMETERS",
     "REPEAT_COLUMNS",
@@ -85,15 +96,19 @@ __all__ = [
     "Provenance",
     "StackMetadata",
     "Status",
+    "Tally",
     "Trace",
     "TrackStatus",
     "Windows",
+    "counted",
     "flagged",
     "free_parameters",
     "has_flag",
     "has_only",
+    "is_event",
     "make_rows",
     "silent",
+    "tally",
     "track_numbers",
     "verdict",
     "with_diameters",

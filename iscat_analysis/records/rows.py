@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
-from iscat_analysis.records.verdicts import SEVERITY, Status, TrackStatus
-from iscat_analysis.units import sphere_diameter_nm
+from iscat_analysis.records.verdicts import NO_EVENT, SEVERITY, Status, TrackStatus
+from iscat_analysis.units import count, sphere_diameter_nm
 
 
 def make_rows(
@@ -53,6 +53,57 @@ def with_diameters(table: pd.DataFrame, density_kg_m3: float) -> pd.DataFrame:
         if f"{kind}_mass_kda" in table
     }
     return make_rows(table, columns)
+
+
+def is_event(table: pd.DataFrame) -> BoolArray:
+    """Tell which rows are events, and so are counted: not the side lobes of others, nor noise.
+
+    Shapes: result (rows,).
+    """
+    return np.asarray(~table["status"].isin([*map(str, NO_EVENT)]), dtype=bool)
+
+
+def counted(table: pd.DataFrame) -> pd.DataFrame:
+    """Leave out rows that are no events."""
+    return table[is_event(table)]
+
+
+class Tally(NamedTuple):
+    """Numbers of events, or tracks, by status, the commonest first, and of rows that are none."""
+
+    number: int
+    status: dict[str, int]
+    left_out: dict[str, int]
+
+    @property
+    def ok(self) -> int:
+        """How many are ok."""
+        return self.status.get(Status.OK.value, 0)
+
+    @property
+    def flagged(self) -> int:
+        """How many are not."""
+        return self.number - self.ok
+
+    def text(self, noun: str = "event") -> str:
+        """Say all of it."""
+        by_status = ", ".join(f"{n} {status}" for status, n in self.status.items())
+        text = count(self.number, noun) + (f": {by_status}" if by_status else "")
+        if self.left_out:
+            rows = ", ".join(f"{n} {status}" for status, n in self.left_out.items())
+            text += f"; further rows, which are no {noun}s: {rows}"
+        return text
+
+
+def tally(table: pd.DataFrame) -> Tally:
+    """Count the events, or tracks, of a table: every total comes from here."""
+    events = is_event(table)
+    status = table["status"].astype(str)
+    by_status, left_out = (
+        {str(name): int(n) for name, n in status[part].value_counts().items()}
+        for part in (events, ~events)
+    )
+    return Tally(int(events.sum()), by_status, left_out)
 
 
 def has_only(table: pd.DataFrame, known: frozenset[str]) -> BoolArray:

@@ -96,6 +96,10 @@ neighbour; pixels left out; a mass on the scale of other optics; counts that are
 to the light; frames that were processed."""
 
 
+NO_EVENT = frozenset({Status.SIDELOBE, Status.NOT_DETECTED})
+"""Verdicts on rows that are no particles: they are in no count, histogram or species."""
+
+
 def verdict(flags: Iterable[Status]) -> tuple[Status, tuple[Status, ...]]:
     """Sort the flags of a fit; the status is the worst one."""
     ordered = tuple(sorted(set(flags) - {Status.OK}, key=SEVERITY.index))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from datetime import datetime
 from pathlib import PurePath
 from typing import Any
@@ -20,23 +21,20 @@ from iscat_analysis.records import (
     EventView,
     Status,
     free_parameters,
+    tally,
+)
+from iscat_analysis.report.answer import (
+    answers,
+    caution,
+    is_uncalibrated,
+    main_quantity,
 )
 from iscat_analysis.report.budget import COLUMNS as BUDGET_HEADINGS
 from iscat_analysis.report.budget import budget_rows
 from iscat_analysis.report.event_figures import event_details
-from iscat_analysis.report.headline import (
-    caution,
-    headline,
-    is_uncalibrated,
-    label_of,
-    main_quantity,
-    precision_of,
-    precision_rows,
-    quantiles,
-    sizes,
-)
+from iscat_analysis.report.headline import headline, label_of, precision_of, precision_rows
 from iscat_analysis.report.numbers import LABELS, UNITS, decimals_for, fixed, number, percent
-from iscat_analysis.report.spread import counted, species_widths
+from iscat_analysis.report.spread import species_widths
 from iscat_analysis.units import count
 
 _MODES = {
@@ -75,6 +73,7 @@ def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
         "headline": [text for text in said if not text.startswith("Not calibrated")],
         "flagged": caution(table) is not None,
         "tiles": _tiles(analysis, table),
+        "totals": f"{tally(table).text()}.",
         "has_common": any(math.isfinite(p.systematic) for p in precision),
         "has_measured": any(p.is_measured for p in precision),
         "single_frames": analysis.mode == "track",
@@ -90,7 +89,7 @@ def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
         "has_traces": any(detail.trace for detail in images.values()),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": f"To keep this page small it holds the images of the first {len(images)} "
-        f"of {len(table)} events."
+        f"of {len(table)} rows."
         if 0 < len(images) < len(table)
         else None,
         "posterior_rows": list(_posterior_rows(sampled, table)),
@@ -115,27 +114,17 @@ def report_context(analysis: Analysis, table: pd.DataFrame) -> dict[str, Any]:
 
 def _tiles(analysis: Analysis, table: pd.DataFrame) -> list[dict[str, str]]:
     """Make the large numbers at the top: counts and precision."""
-    table = counted(table)
-    flagged = int((table["status"] != Status.OK.value).sum())
+    rows, found = tally(table), answers(analysis, table)
     tiles = [
         {
             "label": "Events",
-            "value": str(len(table)),
-            "note": f"{len(table) - flagged} ok, {flagged} flagged",
+            "value": str(rows.number),
+            "note": f"{rows.ok} ok, {rows.flagged} flagged",
         }
     ]
-    values, main = sizes(analysis, table), main_quantity(analysis)
-    if caution(table) is not None or not values.size:
+    if not found:
         return tiles
-    low, middle, high = quantiles(values)
-    tiles.append(
-        {
-            "label": f"Median {main.label}" if values.size > 1 else main.label.capitalize(),
-            "value": number(middle),
-            "unit": main.unit,
-            "note": f"middle half {number(low)} to {number(high)}" if values.size > 1 else "",
-        }
-    )
+    tiles += [asdict(answer) for answer in found]
     heights = analysis.summary.get("heights")
     if heights is not None and not heights["held"]:
         tiles.append(
@@ -254,7 +243,7 @@ def _posterior_rows(views: Sequence[EventView], table: pd.DataFrame) -> Iterator
 
 def _statuses(table: pd.DataFrame) -> list[list[str]]:
     """Count the verdicts and the other flags, with what each means."""
-    counts = table["status"].value_counts()
+    counts = tally(table).status | tally(table).left_out
     rows = [[s.value, str(counts[s.value]), s.advice] for s in Status if s.value in counts]
     flags = table["flags"].str.split(";").explode()
     others = flags[~flags.isin([*Status, ""])].value_counts()

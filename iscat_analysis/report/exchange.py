@@ -17,7 +17,7 @@ from iscat_analysis.files import whole_file
 from iscat_analysis.inference.checks import truth_in
 from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.reading import first_line, is_file, open_regular, read_json
-from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, track_numbers
+from iscat_analysis.records import EVENT_COLUMNS, FloatArray, Status, is_event, track_numbers
 from iscat_analysis.report.tables import CSV_DIGITS
 from iscat_analysis.units import count
 
@@ -347,6 +347,6 @@ def _tracked(fits: pd.DataFrame) -> pd.DataFrame:
     """Rows that belong to a track and have a place, by track and frame."""
     fits = _checked(fits)
     numbers = track_numbers(fits)
-    known = numbers.notna() & fits["x_px"].notna() & (fits["status"] != Status.SIDELOBE)
+    known = numbers.notna() & fits["x_px"].notna() & is_event(fits)
     rows = _with_frames(fits[known]).assign(particle=numbers[known].astype("int64"))
     return rows.sort_values(["particle", "frame"], kind="stable")

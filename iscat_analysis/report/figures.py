@@ -17,16 +17,17 @@ from iscat_analysis.records import (
     BoolArray,
     FloatArray,
     Status,
+    counted,
     free_parameters,
 )
+from iscat_analysis.report.answer import main_quantity
 from iscat_analysis.report.budget import budget_figure
 from iscat_analysis.report.event_figures import HALO, scale_bar
 from iscat_analysis.report.field import field_axes
-from iscat_analysis.report.headline import as_contrasts, label_of, main_quantity
+from iscat_analysis.report.headline import as_contrasts, label_of
 from iscat_analysis.report.movie_figure import movie_figure
 from iscat_analysis.report.numbers import UNITS
 from iscat_analysis.report.scales import display_range
-from iscat_analysis.report.spread import counted
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, VERMILLION, Sketch, new_figure
 from iscat_analysis.report.track_figures import track_figures
 
@@ -316,8 +317,7 @@ def spread_figure(analysis: Analysis, label_of: Callable[[Analysis, str], str]) 
     }
     if not found:
         return None
-    good = analysis.table["status"] != Status.SIDELOBE.value
-    window = float(np.median(analysis.table.loc[good, "n_after"]))
+    window = float(np.median(counted(analysis.table)["n_after"]))
     figure = new_figure(3.0 * len(found), 3.0)
     for column, (name, part) in enumerate(found.items()):
         axes = figure.add_subplot(1, len(found), column + 1)

@@ -1,8 +1,7 @@
 """What an analysis says in a few words: the same on the page, on stdout and in a notebook.
 
-Every number here is taken over the rows whose status is ok.  Where more than a fifth of the rows
-is flagged, the rest is a selection rather than a sample, and no number is given.  Without a
-calibration the headline is the contrast, because the model's absolute scale is not a mass.
+Every number here is taken over the rows whose status is ok.  Without a calibration the headline is
+the contrast, because the model's absolute scale is not a mass.
 """
 
 from __future__ import annotations
@@ -15,13 +14,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.records import FREE_PARAMETERS, Analysis, FloatArray, Status
+from iscat_analysis.records import FREE_PARAMETERS, Analysis, Status, counted, tally
+from iscat_analysis.report.answer import answers, caution, is_uncalibrated, quantiles
 from iscat_analysis.report.numbers import LABELS, UNITS, fixed, number, percent
-from iscat_analysis.report.spread import counted, rejection, species_widths
+from iscat_analysis.report.spread import rejection, species_widths
 from iscat_analysis.units import count
-
-MOST_FLAGGED = 0.2
-"""Share of flagged rows above which no headline is given."""
 
 NOT_A_MASS = (
     "Not calibrated: mass_kda is on the model's own absolute scale, and an uncalibrated absolute "
@@ -29,15 +26,6 @@ NOT_A_MASS = (
     "them."
 )
 """What is said of masses without ``[calibration]``."""
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """The main quantity of an analysis: a column, its name and unit."""
-
-    column: str
-    label: str
-    unit: str
 
 
 @dataclass(frozen=True)
@@ -75,28 +63,6 @@ class Precision:
         return f", common to all events {number(self.systematic)}" if known else ""
 
 
-def is_uncalibrated(analysis: Analysis) -> bool:
-    """Tell whether masses were fitted on the model's own scale."""
-    fitted = "mass_kda" in FREE_PARAMETERS[analysis.mode]
-    return fitted and analysis.summary.get("mass_scale") not in (
-        "calibration",
-        "volume and density",
-    )
-
-
-def main_quantity(analysis: Analysis) -> Quantity:
-    """Choose the main quantity."""
-    if "mass_kda" not in FREE_PARAMETERS[analysis.mode]:
-        return Quantity("z_nm", "height", "nm")
-    if analysis.mode == "size":
-        return Quantity("diameter_nm", "diameter", "nm")
-    if not is_uncalibrated(analysis):
-        return Quantity("mass_kda", "mass", "kDa")
-    if analysis.scheme == "darkfield":
-        return Quantity("n_scattered", "number of scattered photons", "")
-    return Quantity("contrast", "contrast", "")
-
-
 def as_contrasts(table: pd.DataFrame) -> pd.DataFrame:
     """Convert masses to contrasts, for a scale that is proportional to the mass."""
     per_kda = (table["contrast"] / table["mass_kda"]).abs()
@@ -121,21 +87,6 @@ def as_diameters(table: pd.DataFrame) -> pd.DataFrame:
 def label_of(analysis: Analysis, name: str) -> str:
     """Name a parameter in tables and figures."""
     return "mass, model scale" if name == "mass_kda" and is_uncalibrated(analysis) else LABELS[name]
-
-
-def caution(table: pd.DataFrame) -> str | None:
-    """Say that too many rows are flagged for a headline."""
-    table = counted(table)
-    flagged = table["status"][table["status"] != Status.OK.value]
-    if len(flagged) <= MOST_FLAGGED * len(table):
-        return None
-    commonest = Status(flagged.mode().iloc[0])
-    which = "The only row is" if len(table) == 1 else f"{len(flagged)} of {len(table)} rows are"
-    rest = ": the rest is no fair sample" if len(flagged) < len(table) else ""
-    return (
-        f"{which} flagged, so no median is given{rest}. The commonest reason is "
-        f"{commonest.value}. {commonest.advice}"
-    )
 
 
 def precision_of(analysis: Analysis, table: pd.DataFrame, name: str) -> Precision:
@@ -175,25 +126,6 @@ def _shared(good: pd.DataFrame, name: str) -> tuple[float, float, float]:
     return quantiles(good[column].to_numpy(float) if column in good else np.empty(0))
 
 
-def quantiles(values: FloatArray) -> tuple[float, float, float]:
-    """Give the quartiles of what is finite."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return math.nan, math.nan, math.nan
-    low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
-    return float(low), float(middle), float(high)
-
-
-def sizes(analysis: Analysis, table: pd.DataFrame) -> FloatArray:
-    """Give the magnitudes of the main quantity over the rows that are ok.
-
-    Shapes: result (n,).
-    """
-    good = table["status"] == Status.OK.value
-    values = np.abs(table[main_quantity(analysis).column][good].to_numpy(float))
-    return np.asarray(values[np.isfinite(values)])
-
-
 def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     """Summarise the result in two or three sentences."""
     table = counted(table)
@@ -206,23 +138,13 @@ def headline(analysis: Analysis, table: pd.DataFrame) -> list[str]:
     warned = [NOT_A_MASS] if is_uncalibrated(analysis) else []
     if (flagged := caution(table)) is not None:
         return [flagged, *spread_lines(analysis, table), *warned]
-    good = int((table["status"] == Status.OK.value).sum())
-    text = f"{count(len(table), 'event')}, {good if good < len(table) else 'all'} of them ok."
-    if len(table) == 1:
+    rows = tally(table)
+    text = f"{count(rows.number, 'event')}, {rows.ok if rows.flagged else 'all'} of them ok."
+    if rows.number == 1:
         text = "One event, and it is ok."
-    main, values = main_quantity(analysis), sizes(analysis, table)
-    if values.size > 1:
-        low, middle, high = quantiles(values)
-        text += (
-            f" Median {main.label} {_with_unit(middle, main)}, middle half {number(low)} to "
-            f"{_with_unit(high, main)}."
-        )
+    text += "".join(f" {answer.text}." for answer in answers(analysis, table) if rows.number > 1)
     spread = _spread(analysis, table)
     return [text, *spread, *spread_lines(analysis, table), *warned]
-
-
-def _with_unit(value: float, main: Quantity) -> str:
-    return f"{number(value)} {main.unit}".rstrip()
 
 
 def _spread(analysis: Analysis, table: pd.DataFrame) -> list[str]:

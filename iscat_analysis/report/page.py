@@ -14,11 +14,11 @@ import pandas as pd
 from markupsafe import Markup
 
 from iscat_analysis.records import Analysis
+from iscat_analysis.report.answer import caution, is_uncalibrated
 from iscat_analysis.report.context import report_context
 from iscat_analysis.report.distribution import distribution_section, species_figure
 from iscat_analysis.report.event_figures import corner_figures, event_figures
 from iscat_analysis.report.figures import page_figures
-from iscat_analysis.report.headline import caution, is_uncalibrated
 from iscat_analysis.report.size_distribution import sizes_figure, sizes_section
 from iscat_analysis.report.style import Sketch, drawn, publish
 from iscat_analysis.report.tables import event_table

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import Analysis, EventView, PosteriorResult, Status
 from iscat_analysis.report import event_figures, figures, track_figures
-from iscat_analysis.report.headline import main_quantity
+from iscat_analysis.report.answer import main_quantity
 from iscat_analysis.report.style import STYLE
 from iscat_analysis.report.tables import event_table
 

@@ -16,8 +16,8 @@ from iscat_analysis.config import parse_config
 from iscat_analysis.optics.materials import material
 from iscat_analysis.optics.spheres import Sphere, scattering_length_nm, sphere_of
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus
+from iscat_analysis.report.answer import tracks_of
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, new_figure
-from iscat_analysis.report.tracks import tracks_of
 from iscat_analysis.units import sphere_mass_kda
 
 INDICES = (1.36, 1.40, 1.46, 1.52, 1.60)

@@ -10,15 +10,11 @@ import numpy as np
 import pandas as pd
 from scipy.special import bdtrc
 
+from iscat_analysis.records import counted
 from iscat_analysis.report.numbers import decimals_for, fixed, number
 
 _POOR = 0.01  # p-value that a good fit has in 1 of 100
 _CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
-
-
-def counted(table: pd.DataFrame) -> pd.DataFrame:
-    """Leave out rows that are not events: side lobes of others."""
-    return table[table["status"] != "sidelobe"]
 
 
 def rejection(table: pd.DataFrame) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -9,23 +10,19 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup, escape
 
-from iscat_analysis.records import TRACKS, Analysis, TrackStatus
-from iscat_analysis.report.event_figures import event_details
-from iscat_analysis.report.films import films_shown
-from iscat_analysis.report.headline import (
-    NOT_A_MASS,
-    as_contrasts,
+from iscat_analysis.records import TRACKS, Analysis, TrackStatus, tally
+from iscat_analysis.report.answer import (
+    answers,
     is_uncalibrated,
     main_quantity,
-)
-from iscat_analysis.report.numbers import decimals_for, fixed
-from iscat_analysis.report.tracks import (
-    medians,
-    track_lines,
     tracks_caution,
-    tracks_headline,
     tracks_of,
 )
+from iscat_analysis.report.event_figures import event_details
+from iscat_analysis.report.films import films_shown
+from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts
+from iscat_analysis.report.numbers import decimals_for, fixed
+from iscat_analysis.report.tracks import track_lines, tracks_headline
 
 _SHOWN = (
     "n_frames", "x_nm", "y_nm", "z_nm", "mass_kda", "sigma_mass_kda", "crb_mass_kda",
@@ -58,6 +55,7 @@ def tracks_context(
         "flagged": bool(len(tracks)) and tracks_caution(tracks) is not None,
         "cautions": [text for text in headlines if text == NOT_A_MASS],
         "tiles": _tiles(analysis, fits),
+        "totals": f"{tally(tracks).text('track')}.",
         "events": track_rows(analysis),
         "images": {str(row): list(packed) for row, packed in images.items()},
         "embedding_note": None,
@@ -70,17 +68,13 @@ def tracks_context(
 def _tiles(analysis: Analysis, fits: pd.DataFrame) -> list[dict[str, str]]:
     """Give the large numbers at the top."""
     tracks = tracks_of(analysis)
-    good = int((tracks["status"] == TrackStatus.OK).sum())
-    tiles = [
-        {"label": "Tracks", "value": str(len(tracks)), "note": f"{good} ok, {len(tracks) - good} "
-         f"flagged; {len(fits)} fitted positions"}
+    rows = tally(tracks)
+    note = f"{rows.ok} ok, {rows.flagged} flagged; {len(fits)} fitted positions"
+    return [
+        {"label": "Tracks", "value": str(rows.number), "note": note},
+        *(asdict(replace(answer, note="over tracks that are ok"))
+          for answer in answers(analysis, fits, tracks)),
     ]  # fmt: skip
-    if tracks_caution(tracks) is None:
-        for label, text in medians(analysis):
-            value, _, unit = text.partition(" ")
-            tiles.append({"label": f"Median {label}", "value": value, "unit": unit,
-                          "note": "over tracks that are ok"})  # fmt: skip
-    return tiles
 
 
 def track_rows(analysis: Analysis) -> dict[str, Any]:

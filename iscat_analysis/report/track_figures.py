@@ -17,13 +17,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from iscat_analysis.records import Analysis, BoolArray, FloatArray, TrackStatus, track_numbers
+from iscat_analysis.report.answer import main_quantity, tracks_of
 from iscat_analysis.report.event_figures import scale_bar
 from iscat_analysis.report.field import field_axes
-from iscat_analysis.report.headline import main_quantity
 from iscat_analysis.report.scales import display_range
 from iscat_analysis.report.size_plane import has_plane, size_plane
 from iscat_analysis.report.style import BLUE, GREY, INK, PURPLE, Sketch, new_figure
-from iscat_analysis.report.tracks import tracks_of
 
 MOST_TRACKS = 400
 """Tracks whose points tell their row when the pointer is over them; more become an image."""

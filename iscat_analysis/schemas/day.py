@@ -29,6 +29,7 @@ class DayMovie(Document):
     leavings: Count | None = maybe("Leavings")
     species: Count | None = maybe("Species, without outliers")
     main_mass_kda: Number = maybe("Mass of the species with most events [kDa]")
+    answer: Text = maybe("What the movie says in a line: its species, or a median of one")
     rate_per_s: Number = maybe("Landings per second")
     rate_low: Number = maybe("End of its 95 % Poisson interval")
     rate_high: Number = maybe("The other end")

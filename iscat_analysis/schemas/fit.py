@@ -405,7 +405,7 @@ class Scale(Closed):
 class Summary(Document):
     """What iscat fit writes into its output folder as summary.json."""
 
-    events: Count = key("How many events there are, side lobes left out")
+    events: Count = key("How many events there are")
     mode: Mode = key("Mode: which parameters were free")
     scheme: Scheme = key("Optical scheme")
     emission: Emission = key("Emission model")
@@ -416,6 +416,7 @@ class Summary(Document):
     )
     scale: Scale = maybe("With a calibration: its conversion to the optics of the movie")
     status: dict[str, Count] = key("Events by status")
+    no_events: dict[str, Count] = maybe("Rows of fits.csv that are no events, by status")
     frames_before: tuple[Count, Count] | None = key("Background frames [start, stop)")
     frames_after: tuple[Count, Count] | None = key("Fitted frames [start, stop)")
     power_ratio: Number = key("Total laser power after over before")

@@ -14,6 +14,7 @@ import tifffile
 from app_results import standards_result
 
 import iscat_analysis as ia
+from iscat_analysis.report.answer import answer_in
 
 pytest.importorskip("panel", reason="needs the Python package panel")
 
@@ -22,7 +23,7 @@ from iscat_app.calibrations import beside, take
 from iscat_app.chosen import Chosen, table_of
 from iscat_app.compare import Compare
 from iscat_app.export import Export
-from iscat_app.files import Files, listed
+from iscat_app.files import Files, listed, result_facts
 from iscat_app.form import FIRST, Form, fields
 from iscat_app.rejections import Rejections
 from iscat_app.results import Results
@@ -169,6 +170,12 @@ def test_peaks_have_masses_by_the_keyboard_too(standards: Path) -> None:
     calibrate._give(calibrate._peak.value)
     assert calibrate.assigned == {0: 66.0, 2: 264.0}
     assert next(iter(calibrate._peak.options)).endswith(", 66 kDa")
+
+
+def test_a_result_says_its_answer(standards: Path) -> None:
+    answer = answer_in(standards)
+    assert answer
+    assert dict(result_facts(standards))["answer"] == answer
 
 
 @pytest.mark.parametrize("rejects", [False, True])

@@ -128,7 +128,7 @@ def test_the_table_is_short_and_plain(library, capsys) -> None:
     assert main_fit(["movie.tif"]) == 0
     captured = capsys.readouterr()
     warned, heading, first, second, last = captured.out.splitlines()
-    assert warned.startswith("1 of 2 rows are flagged, so no median is given")
+    assert warned.startswith("1 of 2 events are flagged, so no median is given")
     assert "\x1b" not in captured.out
     assert all(word in heading for word in ("event", "x ± σ", "CRB mass", "QCRB mass", "status"))
     for cell in ("3456.8 ± 1.2", "480 ± 12", "11.5", "5.1", "ok"):
@@ -153,7 +153,10 @@ def test_what_is_remarked_on_side_lobes_is_not_counted_among_the_events(library,
     library(_returning(_analysis(_row(0, "poor_fit", "poor_fit"), lobe)))
     assert main_fit(["movie.tif"]) == 0
     captured = capsys.readouterr()
-    assert "1 event: 1 poor_fit, 1 sidelobe" in captured.out
+    told = captured.out.splitlines()
+    assert told[0].startswith("The only event is flagged")
+    assert len(told) == 4  # with a heading and one row
+    assert told[-1].startswith("1 event: 1 poor_fit; further rows, which are no events: 1 sidelobe")
     assert f"1 poor_fit: {Status.POOR_FIT.advice}" in captured.err
     assert f"1 sidelobe: {Status.SIDELOBE.advice}" in captured.err
 
@@ -163,11 +166,12 @@ def test_without_calibration_contrasts_are_printed(library, capsys) -> None:
     row = _row(0) | {"contrast": -0.0149}
     library(_returning(_analysis(row, mass_scale="absolute model")))
     assert main_fit(["movie.tif"]) == 0
-    warned, heading, first, last = capsys.readouterr().out.splitlines()
+    warned, heading, first, answer, last = capsys.readouterr().out.splitlines()
     assert "iscat calibrate mass" in warned
     assert "contrast ± σ" in heading
     assert "kDa" not in heading
     assert "-0.01490 ± 0.00037" in first
+    assert answer == "Contrast 0.0149"
     assert last == "1 event: 1 ok; results in movie.iscat"
 
 
@@ -181,8 +185,20 @@ def test_a_long_table_is_cut(library, capsys) -> None:
     library(_returning(_analysis(*(_row(n) for n in range(300)))))
     main_fit(["movie.tif"])
     out = capsys.readouterr().out.splitlines()
-    assert len(out) == 23
-    assert out[-2] == "… and 280 more in movie.iscat/fits.csv"
+    assert len(out) == 24
+    assert out[-3] == "… and 280 more in movie.iscat/fits.csv"
+    assert out[-2] == "Median mass 480 kDa, middle half 480 to 480 kDa"
+
+
+def test_several_species_are_printed_in_place_of_a_median(library, capsys) -> None:
+    found = _analysis(_row(0), _row(1))
+    species = [{"mass_kda": m, "outlier": m == 9.0} for m in (9.0, 66.0, 146.0)]
+    found.summary["distribution"] = {"species": species}
+    library(_returning(found))
+    main_fit(["movie.tif"])
+    told = capsys.readouterr().out
+    assert told.splitlines()[-2] == "Species of mass 66.0 · 146 kDa"
+    assert "edian" not in told
 
 
 def test_no_events_is_a_result(library, capsys) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -26,7 +27,7 @@ from iscat_analysis.inference.split_frames import (
 )
 from iscat_analysis.landing.split_frame_estimates import most_windows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.pipeline.summary import species_width
+from iscat_analysis.pipeline.summary import species_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report import render_report
 from iscat_analysis.report.headline import headline
@@ -408,12 +409,22 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
     mass = 150.0 + np.hypot(7.5, 2.0) * norm.ppf((np.arange(120) + 0.5) / 120)
     poor = {"status": "poor_fit", "flags": "poor_fit", "p_value": 1e-9}
     table = table.assign(mass_kda=mass, sigma_mass_kda=2.0, **poor)
-    context = SimpleNamespace(config=SimpleNamespace(compute=SimpleNamespace(seed=1)))
-    (one,) = species_width(context, table, {"species": []})  # type: ignore[arg-type]
+    context: Any = SimpleNamespace(
+        config=SimpleNamespace(compute=SimpleNamespace(seed=1), fits_sizes=False),
+        templates=SimpleNamespace(threshold=5.0), mode="mass",
+    )  # fmt: skip
+    found = species_of(context, table)
+    (one,), (species,) = found["across_particles"], found["distribution"]["species"]
+    assert (one["mass_kda"], one["count"]) == (species["mass_kda"], species["count"])
+    assert species["count"] == pytest.approx(120)
+    assert "poor fits are counted too" in found["distribution"]["notes"][-1]
     assert one["width_low"] < 7.5 < one["width_high"]
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
-    fine = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
-    assert species_width(context, fine, {"species": []}) == []  # type: ignore[arg-type]
+    fair = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
+    fair.loc[fair.index[:6], "status"] = "poor_fit"
+    found = species_of(context, fair)
+    assert found["distribution"]["events"] == 114
+    assert not any("poor fits" in note for note in found["distribution"]["notes"])
 
 
 def test_a_long_movie_is_looked_at_in_as_many_windows_as_tell_its_noise() -> None:

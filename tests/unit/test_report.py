@@ -19,8 +19,10 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.config import load_config, parse_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status
+from iscat_analysis.pipeline.stored import open_result
+from iscat_analysis.records import EVENT_COLUMNS, Analysis, Status, tally
 from iscat_analysis.report import check_output, figures, render_page, render_report, write_report
+from iscat_analysis.report.answer import answer_in, answers
 from iscat_analysis.report.context import measured_lines
 from iscat_analysis.report.event_figures import CREDIBLE_LEVELS, credible_shades
 from iscat_analysis.report.headline import NOT_A_MASS, headline, precision_of
@@ -297,7 +299,7 @@ def test_the_page_of_5000_events_stays_below_5_mb_and_says_what_it_leaves_out() 
     assert page.count('<tr id="row-') == 5000
     held = payload(page)
     assert len(held) > 100
-    assert f"the images of the first {len(held)} of 5000 events" in page
+    assert f"the images of the first {len(held)} of 5000 rows" in page
     assert "the step as a clip" in page
 
 
@@ -310,7 +312,7 @@ def with_flagged(analysis: Analysis, flagged: int) -> Analysis:
 
 def test_the_only_row_is_one() -> None:
     analysis = with_flagged(make_analysis(1), 1)
-    assert headline(analysis, event_table(analysis))[0].startswith("The only row is flagged, so")
+    assert headline(analysis, event_table(analysis))[0].startswith("The only event is flagged, so")
 
 
 @pytest.mark.usefixtures("sketched")
@@ -318,7 +320,7 @@ def test_the_only_row_is_one() -> None:
 def test_no_headline_when_more_than_a_fifth_is_flagged(flagged: int, silent: bool) -> None:
     analysis = with_flagged(make_analysis(40), flagged)
     first = headline(analysis, event_table(analysis))[0]
-    assert first.startswith(f"{flagged} of 40 rows are flagged") == silent
+    assert first.startswith(f"{flagged} of 40 events are flagged") == silent
     assert ("the rest is no fair sample" in first) == (silent and flagged < 40)
     assert ("Median" in first) != silent
     page = render_report(analysis)
@@ -341,6 +343,40 @@ def test_species_are_shown_for_fair_samples_only() -> None:
         assert ("On the model&#39;s own scale" in page) == (scale == "absolute model")
 
 
+@pytest.mark.parametrize("scale", ["calibration", "absolute model"])
+@pytest.mark.usefixtures("sketched")
+def test_several_species_are_one_answer_everywhere_and_have_no_median(
+    tmp_path: Path, scale: str
+) -> None:
+    analysis = with_flagged(make_analysis(60), 0)
+    found = describe(
+        *(analysis.table[name].to_numpy() for name in ("mass_kda", "sigma_mass_kda")), seed=1
+    ).to_dict()
+    masses = [s["mass_kda"] for s in found["species"] if not s["outlier"]]
+    assert len(masses) == 3
+    summary = {**analysis.summary, "distribution": found, "mass_scale": scale}
+    analysis = replace(analysis, summary=summary)
+    out = write_report(analysis, tmp_path / "result.iscat")
+    factor, quantity, unit = 1.0, "mass", " kDa"
+    if scale != "calibration":
+        factor, quantity, unit = 3.1e-5, "contrast", ""
+    values = " · ".join(number(factor * mass) for mass in masses)
+    answer = f"Species of {quantity} {values}{unit}"
+    page = (out / "report.html").read_text(encoding="utf-8")
+    said = {
+        "page": page, "repr": " ".join(repr(Result(analysis)).split()), "folder": answer_in(out),
+        "stored": repr(open_result(out)), "headline": headline(analysis, analysis.table)[0],
+    }  # fmt: skip
+    for name, text in said.items():
+        assert answer in text, name
+        assert "Median mass" not in text, name
+        assert "Median contrast" not in text, name
+    one = {**found, "species": found["species"][:1]}
+    alone = replace(analysis, summary={**summary, "distribution": one})
+    (only,) = answers(alone, alone.table)
+    assert only.label == f"Median {quantity}"
+
+
 def test_side_lobes_are_no_events() -> None:
     """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
     analysis = with_flagged(make_analysis(40), 30)
@@ -348,7 +384,10 @@ def test_side_lobes_are_no_events() -> None:
     assert headline(analysis, table)[0].startswith("10 events, all of them ok. Median mass")
     assert "×10⁹" not in headline(analysis, table)[0]
     sides = analysis.table.replace({"status": {"poor_fit": "sidelobe"}})
-    assert repr(Result(replace(analysis, table=sides))).startswith("Result: 10 events in ")
+    shown = repr(Result(replace(analysis, table=sides)))
+    assert shown.startswith("Result: 10 events in ")
+    assert "status 10 events: 10 ok; further rows, which are no events: 30 sidelobe" in shown
+    assert tally(sides) == (10, {"ok": 10}, {"sidelobe": 30})
 
 
 @pytest.mark.usefixtures("sketched")

@@ -96,13 +96,13 @@ def test_a_headline_of_tracks_that_are_flagged_has_no_median() -> None:
     assert analysis.tracks is not None
     tracks = analysis.tracks.assign(status="ok", flags="")
     said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
-    assert "Medians over tracks: mass" in said[0]
+    assert "Over tracks: median mass" in said[0]
     tracks.loc[:4, ["status", "flags"]] = "not_free"
     said = tracks_headline(replace(analysis, tracks=tracks), analysis.table)
     assert "5 of 20 that are long enough are flagged" in said[0]
-    assert "Medians" not in said[0]
+    assert "median mass" not in said[0]
     tracks.loc[:4, ["status", "flags"]] = "few_frames"
-    assert "Medians" in tracks_headline(replace(analysis, tracks=tracks), analysis.table)[0]
+    assert "median mass" in tracks_headline(replace(analysis, tracks=tracks), analysis.table)[0]
     bare = replace(analysis, tracks=tracks, summary={**analysis.summary, "mass_scale": "absolute"})
     said = tracks_headline(bare, analysis.table)
     assert NOT_A_MASS in said
