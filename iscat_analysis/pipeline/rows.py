@@ -104,7 +104,7 @@ def reported_rows(
         from iscat_analysis.tracking.tracked_optics import mass_error
 
         unfit = mass_error(optics)
-    else:
+    if mode != "track" or not optics:  # the optics were not tested
         unfit = misfit_error(fits, found.context.roi_px**2)
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
     doubt = None if learned else optics.get("doubt")

@@ -133,8 +133,9 @@ _TRACK_ADVICE = {
     TrackStatus.FEW_FRAMES: "Fewer of its positions than track.min_frames can be used (those at "
     "the border of the field, too close to another particle or not converged cannot): no "
     "diffusion coefficient.",
-    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that its mass comes from a "
-    "selection of frames: see the status of its rows in fits.csv.",
+    TrackStatus.POOR_FITS: "Fewer than half of its frames are ok, so that poor fits are used too; "
+    "its errors are enlarged by the factor by which the masses of its frames scatter beyond theirs "
+    "(mass_scatter): see the status of its rows in fits.csv.",
     TrackStatus.AMBIGUOUS_SIZE: "Another diameter explains all its frames almost as well: "
     "optical_probability says how likely this one is.",
     TrackStatus.OTHER_PARTICLE: "Its images and its motion are those of a homogeneous sphere of "

@@ -44,6 +44,11 @@ class CommonMass:
     p_value: float
     frames: int
 
+    @property
+    def enlargement(self) -> float:
+        """Factor by which frames scatter beyond their errors (Birge, Phys. Rev. 40, 207, 1932)."""
+        return max(self.scatter, 1.0) if self.frames > 1 else 1.0
+
 
 def combine_masses(
     mass_kda: FloatArray,

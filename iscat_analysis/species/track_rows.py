@@ -39,10 +39,26 @@ class TrackRows:
         """Select some of the rows."""
         return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
 
+    @property
+    def rejected(self) -> bool:
+        """Whether fewer than half of the rows are ok."""
+        return bool(np.mean(self.status == Status.OK) < 1 / 2)
+
     def massive(self) -> TrackRows:
-        """Select rows whose mass can be used."""
+        """Select rows whose mass can be used: poor fits too if the model is rejected.
+
+        The few that are ok would be a selection of the rows that are rejected like all others.
+        """
         known = np.isfinite(self.sigma_mass_kda) & np.isfinite(self.crb_mass_kda)
-        return self.only(known & (self.mass_kda != 0) & (self.status == Status.OK))
+        judged = self.status == Status.OK
+        if self.rejected:
+            judged |= self.status == Status.POOR_FIT
+        return self.only(known & (self.mass_kda != 0) & judged)
+
+    def enlarged(self, factor: float) -> TrackRows:
+        """Multiply the errors by a factor."""
+        names = ("sigma_x_nm", "sigma_y_nm", "sigma_mass_kda")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
 
     def placed(self) -> TrackRows:
         """Select rows whose position can be used.

@@ -78,6 +78,8 @@ _LEAST_KNOWN_SHARE = 0.05  # of the information on a mass is left by the backgro
 _LEAST_SEEN_SHARE = 0.9  # of all frames, in which a particle that hardly moves is seen at least
 # Relative error of a mass beyond which the error of D that it makes is reported.
 _LARGEST_SCALE_ERROR = 0.02
+# Errors of images alone, which are enlarged where the fits of a track are rejected.
+_OF_IMAGES = ("sigma_mass_kda", "sigma_optical_diameter_nm", "sigma_refractive_index")
 _FREE = ("p_confinement", "p_anomalous", "p_steady")
 _STEPS = 3.0  # standard deviations of a displacement within which it may end beyond the border
 _DISPLACEMENT_PASSES = 3  # at D, on which it depends which displacements tell it
@@ -128,14 +130,24 @@ def describe_tracks(
     )
     nearest = nearest_nm(groups)
     exact = {} if masses is None else masses.to_dict("index")
-    places = {track: rows.placed().timed(setup.ticks) for track, rows in groups.items()}
+    common = {
+        track: _mass(good, power, correlation) for track, good in massive.items() if len(good.frame)
+    }
+    wider = {
+        track: common[track].enlargement if rows.rejected and track in common else 1.0
+        for track, rows in groups.items()
+    }
+    places = {
+        track: rows.placed().timed(setup.ticks).enlarged(wider[track])
+        for track, rows in groups.items()
+    }
     motions = _motions(places, setup, seed, workers, progress)
     records = []
     for track, rows in groups.items():
         motion, tests = motions[track]
         record = _record(
-            track, rows, massive[track], places[track], motion, setup, power, correlation,
-            exact.get(track, {}),
+            track, rows, common.get(track), places[track], motion, setup, exact.get(track, {}),
+            wider[track],
         )  # fmt: skip
         record |= {"nearest_nm": nearest.get(track, np.inf), **tests}
         records.append(record)
@@ -155,29 +167,31 @@ def changes_together(fits: pd.DataFrame, frames: tuple[int, int]) -> float:
 def _record(
     track: int,
     rows: TrackRows,
-    good: TrackRows,
+    mass: CommonMass | None,
     placed: TrackRows,
     found: Diffusion | None,
     setup: TrackSetup,
-    power: float,
-    correlation: Correlation | None,
     exact: Mapping[str, float],
+    wider: float,
 ) -> dict[str, Any]:
-    """Make the row of one track, without the tests of its motion."""
+    """Make the row of one track, without the tests of its motion.
+
+    The errors of the mass are multiplied by `wider`; those of the places are already.
+    """
     record: dict[str, Any] = dict.fromkeys(TRACK_COLUMNS, np.nan)
     record |= {
         "track": track,
         "first_frame": int(rows.frame[0]),
         "last_frame": int(rows.frame[-1]),
         "n_frames": len(rows.frame),
-        "n_mass_frames": len(good.frame),
+        "n_mass_frames": 0 if mass is None else mass.frames,
+        "rejected": rows.rejected,
         "n_d_frames": len(placed.frame),
         "x_nm": of_known(np.mean, rows.x_nm),
         "y_nm": of_known(np.mean, rows.y_nm),
         "z_nm": of_known(np.mean, rows.z_nm),
     }
-    if len(good.frame):
-        mass = _mass(good, power, correlation)
+    if mass is not None:
         record |= {
             "mass_kda": mass.mass_kda,
             "sigma_mass_kda": mass.sigma_mass_kda,
@@ -189,6 +203,7 @@ def _record(
     record |= {
         name: value for name, value in exact.items() if name != "told" and np.isfinite(value)
     }
+    record |= {name: wider * record[name] for name in record if name in _OF_IMAGES}
     scale = _scale_error(record, known_share)
     record["short_way"] = known_share < _LEAST_KNOWN_SHARE and scale > 2 * _LARGEST_SCALE_ERROR
     massive = rows.only(rows.mass_kda != 0)  # a fit may end at nothing, and so is its contrast
@@ -342,7 +357,7 @@ def _remarks(record: Mapping[str, Any], setup: TrackSetup) -> list[TrackStatus]:
     """List the flags of a track, the worst first."""
     seen = {
         TrackStatus.FEW_FRAMES: record["n_d_frames"] < max(LEAST_POSITIONS, setup.min_frames),
-        TrackStatus.POOR_FITS: record["n_mass_frames"] < record["n_frames"] / 2,
+        TrackStatus.POOR_FITS: record["rejected"],
         TrackStatus.AMBIGUOUS_SIZE: record.get("optical_probability", 1.0) < SURE_SIZE,
         TrackStatus.OTHER_PARTICLE: record.get("log_odds_particle", 0.0) < -float(logit(SURE_SIZE)),
         TrackStatus.MASS_VARIES: record["p_mass"] < SURPRISING / 10

@@ -315,6 +315,36 @@ def test_frames_that_are_flagged_do_not_make_the_mass_but_the_path() -> None:
     assert describe_tracks(fits, SETUP).iloc[0]["status"] == TrackStatus.POOR_FITS
 
 
+@pytest.mark.parametrize(("understated", "rejected"), [(1.0, True), (2.5, True), (2.5, False)])
+def test_a_track_whose_fits_are_rejected_states_the_errors_that_its_frames_show(
+    understated: float, rejected: bool
+) -> None:
+    """Without the factor masses of 100 tracks scatter by 2.5 times their errors."""
+    rng, tracks = np.random.default_rng(14), 100
+    fits = fits_of([walk(rng, 30, 0.05) for _ in range(tracks)], rng, sigma_nm=40.0)
+    columns = [
+        f"{kind}_{name}" for kind in ("sigma", "crb") for name in ("x_nm", "y_nm", "mass_kda")
+    ]
+    fits[columns] /= understated
+    if rejected:  # three of four, whatever they are wrong by
+        fits.loc[rng.uniform(size=len(fits)) < 0.75, "status"] = "poor_fit"
+    exact = pd.DataFrame(
+        {"mass_kda": 400.0, "sigma_mass_kda": 2.0, "crb_mass_kda": 1.9}, index=range(1)
+    )
+    found = describe_tracks(fits, SETUP, masses=exact)
+    widened = found["mass_scatter"].clip(lower=1.0) if rejected else 0 * found["mass_scatter"] + 1.0
+    assert found["sigma_mass_kda"].iloc[0] == pytest.approx(2.0 * widened.iloc[0])
+    rest = found.iloc[1:]
+    assert ((rest["status"] == TrackStatus.POOR_FITS) == rejected).all()
+    assert (rest["n_mass_frames"] == 30).all()
+    pulls = (rest["mass_kda"] - 400.0) / rest["sigma_mass_kda"]
+    right = understated == 1 or rejected
+    assert (abs(pulls.std() - 1) < SIGMAS / np.sqrt(2 * len(rest))) == right
+    assert rest["mass_scatter"].median() == pytest.approx(understated, rel=0.05)
+    d = rest["d_um2_s"] / 0.05 - 1  # which errors of places that are too small make too large
+    assert (abs(d.mean()) < SIGMAS * d.std() / np.sqrt(len(rest))) == right
+
+
 def test_masses_of_the_exact_likelihood_take_the_place_of_means() -> None:
     rng = np.random.default_rng(15)
     fits = fits_of([walk(rng, 30, 0.3), walk(rng, 30, 0.3, start_nm=(9e3, 9e3))], rng)
