@@ -57,11 +57,12 @@ def measure_windows(
     median: bool = False,
     level_e: float | None = None,
     power_normalization: bool = True,
+    overlap: bool = False,
     check: Check = _unchecked,
     progress: Progress = silent,
 ) -> Windows:
-    """Sum the frames before and after landing."""
-    _check_ranges(stack, before, after)
+    """Sum the frames before and after landing; `overlap` lets them be the same."""
+    _check_ranges(stack, before, after, overlap=overlap)
     n_after = after[1] - after[0]
     total = n_after + (before[1] - before[0] if before else 0)
     shape = stack.shape[1:]
@@ -168,7 +169,7 @@ def smooth_background(
 
 
 def _check_ranges(
-    stack: FrameSource, before: tuple[int, int] | None, after: tuple[int, int]
+    stack: FrameSource, before: tuple[int, int] | None, after: tuple[int, int], *, overlap: bool
 ) -> None:
     frames = stack.shape[0]
     for name, key, span in (
@@ -185,7 +186,7 @@ def _check_ranges(
             f"{stack.name}: no frame is left after the background; they end "
             f"at {frames}; set background.frames or fit.frames"
         )
-    if before is not None and before[0] < after[1] and after[0] < before[1]:
+    if not overlap and before is not None and before[0] < after[1] and after[0] < before[1]:
         raise DataError(
             f"{stack.name}: background frames {before[0]}:{before[1]} overlap the fitted frames "
             f"{after[0]}:{after[1]}; change background.frames or fit.frames"

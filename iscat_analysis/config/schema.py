@@ -49,9 +49,10 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _explicit_method(self) -> Config:
-        known = self.background.frames is not None or self.optics.scheme == "darkfield"
+        known, tracked = self.background.frames is not None, self.fit.mode == "track"
         if self.background.method is None:
-            method = "tracks" if self.fit.mode == "track" else "sliding"
+            method = "fixed" if self.optics.scheme == "darkfield" else "sliding"
+            method = "tracks" if tracked else method
             method = "fixed" if known else method
             method = "median" if self.background.frames == ALL else method
             # The model is frozen for its users; here it is still being made.
@@ -71,11 +72,6 @@ class Config(Section):
                 'background.method = "tracks" is made of what fit.mode = "track" finds, and '
                 f'fit.mode is "{self.fit.mode}": use "sliding" for particles that land, or '
                 '"fixed" with background.frames'
-            )
-        elif self.background.method == "tracks" and self.optics.scheme == "darkfield":
-            raise ValueError(
-                'background.method = "tracks" needs an interferometric scheme: dark field needs '
-                "background.frames"
             )
         return self
 

@@ -21,6 +21,9 @@ from iscat_analysis.units import count
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:
     """Give the ranges of frames that are background, and that are fitted."""
     before = config.background.recorded
+    if config.background.method == "tracks":  # in dark field: all frames are both
+        before = fitted_frames(movie, config)
+        return before, before
     if config.background.method == "known":
         before = None
     elif before is None:
@@ -43,7 +46,8 @@ def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, 
 def _without_frames_before(config: Config) -> str:
     """Name the backgrounds that need no frames before the particles."""
     if config.optics.scheme == "darkfield":
-        return ""
+        learnt = '; without such frames background.method = "tracks" learns it with the tracks'
+        return learnt if config.fit.mode == "track" else ""
     if config.fit.mode == "track":
         return (
             '; without such frames background.method = "tracks" learns the background with the '
@@ -99,7 +103,8 @@ def measured_windows(
 
     return measure_windows(
         movie, camera, before, after,
-        median=background.method == "median", level_e=background.level_e,
+        median=background.method in ("median", "tracks"), level_e=background.level_e,
+        overlap=background.method == "tracks",
         power_normalization=background.power_normalization,
         check=refuse if config.optics.scheme == "darkfield" else check, progress=progress,
     )  # fmt: skip

@@ -186,12 +186,12 @@ def gather(
 
 def _require(**given: ArrayLike | None) -> None:
     """Refuse a choice of arguments that does not describe regions."""
-    counts, contrasts = ("before", "after", "n_before", "n_after"), ("contrast", "sigma")
-    wanted = counts
+    light: tuple[str, ...] = ("before", "n_before", "n_after")
+    wanted = (*light, "after")
     if given["contrast"] is not None:
-        wanted = contrasts if given["sigma"] is not None else ("contrast", "before", *counts[2:])
-    missing = [name for name in wanted if given[name] is None]
-    allowed = {*wanted, *(() if wanted == contrasts else ("power_ratio",))}
+        wanted = ("contrast", *(light if given["sigma"] is None else ("sigma",)))
+    allowed = {*wanted, *(("power_ratio",) if "before" in wanted else ())}
+    missing = [name for name in given if name in wanted and given[name] is None]
     needless = [name for name, value in given.items() if value is not None and name not in allowed]
     if missing or needless:
         what = "missing" if missing else "not needed"

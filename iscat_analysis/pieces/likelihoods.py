@@ -255,8 +255,8 @@ def log_likelihood(
     amplitude = model.scale.amplitude(model.material.mass_kda)
     likelihood = counts.likelihood(0)
     fixed = np.array([0.0, 0.0, particle.nominal_height_nm, amplitude, 0.0])
-    level = np.array([False] * LEVEL + [counts.level])
-    around = Box(level, fixed - level * LARGEST_LEVEL, fixed + level * LARGEST_LEVEL)
+    alone = np.array([False] * LEVEL + [counts.level])
+    around = Box(alone, fixed - alone * LARGEST_LEVEL, fixed + alone * LARGEST_LEVEL)
     nothing = without_particle(likelihood, fixed, around)
     return LogLikelihood(
         names=names,

@@ -86,7 +86,8 @@ class Preview:
         self.config = self.prepared.over_all_stretches().config
         self.notes = tuple(notes)
         self.camera, self.steady = self.prepared.known, self.prepared.steady
-        self._search = _SEARCHES[self.prepared.background_mode](self.prepared)
+        dark = self.config.optics.scheme == "darkfield"  # each frame by itself
+        self._search = _SEARCHES["fixed" if dark else self.prepared.background_mode](self.prepared)
         self._lock = threading.Lock()  # a viewer may ask from several threads
 
     @property

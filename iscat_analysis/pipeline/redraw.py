@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import refine_power
+from iscat_analysis.camera.background import add_frames, refine_power
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.field_sample import LARGEST_PX, CutFrames
 from iscat_analysis.camera.lines import Lines
@@ -52,6 +52,7 @@ from iscat_analysis.search.sliding.chunks import Reader, reader_of
 from iscat_analysis.search.sliding.planning import HALO, halo_px
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import row_view
+from iscat_analysis.tracking.dark_field import beside_particles
 from iscat_analysis.tracking.joint.likelihood import MovingField
 from iscat_analysis.tracking.joint.localizations import BackgroundEstimate, Localizations
 from iscat_analysis.tracking.moving import blurred_rows
@@ -84,10 +85,10 @@ def redraw(
             window = int(summary["landing"]["window_frames"])
             stretches = summary.get("left_out", {}).get("analysed") or ()
             return _landings(steady, config, camera, lines, table, window, stretches)
-        case "tracks":
+        case "tracks" if config.optics.scheme != "darkfield":
             blocks = int(summary["blocks"]["number"])
             return _moving(steady, config, camera, lines, table, tracks, blocks)
-        case "fixed":
+        case _:
             return _before_after(steady, config, camera, lines, table)
 
 
@@ -184,12 +185,18 @@ def _step(neighbours: Neighbours, row: pd.Series[Any], corner: tuple[int, int]) 
 def _before_after(
     movie: Stack, config: Config, camera: Camera, lines: Lines | None, table: pd.DataFrame
 ) -> Redraw:
-    """Draw rows over a recorded background; in mode ``track`` each in its frame."""
+    """Draw rows over a background of other frames; in mode ``track`` each in its frame."""
     before, after = frame_ranges(movie, config)
     tracked = config.fit.mode == "track"
     shape = (movie.shape[1], movie.shape[2])
-    context = make_context(config, shape, lines=lines)
+    learnt = config.background.method == "tracks"  # in dark field, beside the particles
     whole = Region((0, shape[0]), (0, shape[1]))
+    if learnt:
+        context = tracking_context(config, shape, after[1] - after[0], lines)
+        sums = measured_windows(movie, config, camera, before, after)
+        sums = replace(sums, before_e=beside_particles(context, sums, table))
+    else:
+        context = make_context(config, shape, lines=lines)
 
     def drawn(region: Region, rows: Sequence[int]) -> FloatArray:
         """Draw the signal of some rows in a region."""
@@ -201,7 +208,10 @@ def _before_after(
     @lru_cache(1)
     def seen(span: tuple[int, int]) -> tuple[Windows, list[int]]:
         """Give the sums, with the light that the particles leave, and the rows in them."""
-        windows = measured_windows(movie, config, camera, before, span)
+        if learnt:
+            windows = add_frames(sums, camera, movie.read(*span), span[0])
+        else:
+            windows = measured_windows(movie, config, camera, before, span)
         rows = table.index[table["mass_kda"].notna() & is_event(table)]
         here = [int(i) for i in rows if not tracked or int(table["frame"].iloc[i]) == span[0]]
         if config.background.power_normalization:

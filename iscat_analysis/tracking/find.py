@@ -32,10 +32,11 @@ from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, saying
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.ranges import checked, fitted_frames
+from iscat_analysis.fitting.ranges import checked, fitted_frames, measured_windows
 from iscat_analysis.fitting.regions import contrast_image
 from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
 from iscat_analysis.fitting.run import Run
+from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
     CountSource,
@@ -51,11 +52,12 @@ from iscat_analysis.search.sliding import DARK, well_lit
 from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.tracking.blocks import Plan, plan_blocks
+from iscat_analysis.tracking.dark_field import in_turns
 from iscat_analysis.tracking.frame_search import link
 from iscat_analysis.tracking.frame_subset import keep_frames
 from iscat_analysis.tracking.held_height import held_height_warning
 from iscat_analysis.tracking.joining import join_blocks
-from iscat_analysis.tracking.moving_field import tracking_context
+from iscat_analysis.tracking.moving_field import refuse_few_frames, tracking_context
 from iscat_analysis.tracking.sizes import sphere_track, table_of_sizes
 from iscat_analysis.tracking.tracked_optics import TrialTracks, learn_from_tracks
 from iscat_analysis.tracking.tracks import mass_correlation
@@ -77,6 +79,8 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         run.warn(kept.message)
     run.clock.lap("model")
     check = checked(movie, camera)
+    if additive:
+        return kept.put_back(_find_in_dark_field(ready, run, movie, (first, last)))
     jitter_future = start_in_thread(pattern_jitter_warning, movie, camera, (first, last))
     with threads(config.compute.workers) as pool:
         plan = plan_blocks(movie, config, camera, check=check, span=kept.span, mapper=pool.map)
@@ -141,6 +145,32 @@ def find_moving(ready: Prepared, run: Run) -> DetectionResult:
         interrupted=interrupted,
     )
     return kept.put_back(found)
+
+
+def _find_in_dark_field(
+    ready: Prepared, run: Run, movie: Stack, span: tuple[int, int]
+) -> DetectionResult:
+    """Track particles that add their light to a background that is learnt with them."""
+    config, camera, frames = ready.config, ready.camera, span[1] - span[0]
+    refuse_few_frames(movie.name, frames)
+    windows = measured_windows(movie, config, camera, span, span, progress=run.progress)
+    run.clock.lap("background")
+    said: list[str] = []
+    with threads(config.compute.workers) as pool:
+
+        def track(context: AnalysisContext, windows: Windows) -> DetectionResult:
+            said.clear()  # only the last turn has the background
+            return track_frames(
+                context, movie, camera, windows, {},
+                check=checked(movie, camera), pool=pool, progress=run.progress, warn=said.append,
+            )  # fmt: skip
+
+        context = tracking_context(config, ready.shape, frames, ready.lines)
+        found = in_turns(config, context, windows, track)
+    for text in said:
+        run.warn(text)
+    run.clock.lap("track")
+    return found
 
 
 @contextmanager

@@ -78,12 +78,7 @@ def load_field(
     """Read the frames; they stay integers where that takes less memory."""
     first, last = span
     frames, shape = last - first, (movie.shape[1], movie.shape[2])
-    if frames < LEAST_FRAMES:
-        raise DataError(
-            f"{movie.name}: has {count(frames, 'frame')}, too few to tell particles that "
-            f"move from what they move over; {LEAST_FRAMES} are needed, or background.frames "
-            "without particles"
-        )
+    refuse_few_frames(movie.name, frames)
     exposures = _room_for((frames, *shape), movie.dtype, camera)
     counts = exposures.counts
     saturated, total, light = np.zeros(shape, dtype=bool), np.zeros(shape), np.empty(frames)
@@ -114,6 +109,16 @@ def load_field(
         z_range_nm=context.config.fit.z_range_nm if free_z else None,
         largest=100 * nominal, pool=pool, saturated=saturated,
     )  # fmt: skip
+
+
+def refuse_few_frames(name: str, frames: int) -> None:
+    """Refuse a movie whose background cannot be learnt."""
+    if frames < LEAST_FRAMES:
+        raise DataError(
+            f"{name}: has {count(frames, 'frame')}, too few to tell particles that "
+            f"move from what they move over; {LEAST_FRAMES} are needed, or background.frames "
+            "without particles"
+        )
 
 
 def restore_particle_light(

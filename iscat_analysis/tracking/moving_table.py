@@ -143,19 +143,22 @@ def losses_to_blur(context: AnalysisContext, moving: TrackedRows) -> FloatArray:
 
     Shapes: result (groups,).
     """
+    upwards = bool(moving.field.free[2])
+    each = [loss_to_blur(context, float(q), upwards=upwards) for q in moving.variances_nm2]
+    return np.array(each, dtype=np.float64)
+
+
+def loss_to_blur(context: AnalysisContext, variance_nm2: float, *, upwards: bool) -> float:
+    """Share of the mass that a blur takes, to first order."""
     model, grid = context.model, PixelGrid.centred(context.roi_px | 1, context.pixel_nm)
     z, amplitude = model.height_nm, model.scale.amplitude(model.material.mass_kda)
-    out = []
-    for q in moving.variances_nm2:
-        upwards = bool(moving.field.free[2])
-        low, mid, high = (
-            blurred(model, float(q) * factor, upwards=upwards).amplitude_image(
-                grid, 0.0, 0.0, z, amplitude
-            )
-            for factor in (1 - _APART, 1.0, 1 + _APART)
+    low, mid, high = (
+        blurred(model, variance_nm2 * factor, upwards=upwards).amplitude_image(
+            grid, 0.0, 0.0, z, amplitude
         )
-        out.append(float(np.sum(mid * (low - high)) / (2 * _APART * np.sum(mid**2))))
-    return np.abs(np.array(out, dtype=np.float64))
+        for factor in (1 - _APART, 1.0, 1 + _APART)
+    )
+    return abs(float(np.sum(mid * (low - high)) / (2 * _APART * np.sum(mid**2))))
 
 
 def _path_errors(context: AnalysisContext, moving: TrackedRows, losses: FloatArray) -> FloatArray:

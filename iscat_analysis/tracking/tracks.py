@@ -167,14 +167,12 @@ def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlatio
     K = Σ h(u) h(u − r)/Σ h² in common.  With n frames before, the noise of their mean (f = 1) or
     median is s = f/(f + n) of a frame's variance: (1 − s) I + s K.  Where the height is fitted as
     well, h is what of the picture its derivative along z does not explain.
+    Of a background that is learnt from the same n frames, the masses have the information I − s K.
     """
     config = context.config
     before = fits["n_before"].median() if len(fits) else 0
-    known = (
-        config.background.method == "known"
-        or context.additive
-        or background_mode(config) == "tracks"
-    )
+    learnt = background_mode(config) == "tracks"
+    known = config.background.method == "known" or context.additive != learnt
     if known or not before > 0:
         return None
     share = context.background_variance / (context.background_variance + before)
@@ -195,6 +193,8 @@ def mass_correlation(context: AnalysisContext, fits: pd.DataFrame) -> Correlatio
         apart = (places_nm[:, None] - places_nm) / context.pixel_nm + (side - 1)
         shared = map_coordinates(common, [apart[..., 1], apart[..., 0]], order=1)
         both = (shared + shared.T) / 2
+        if learnt:  # with the background of the same frames
+            return np.asarray(np.linalg.inv(np.eye(len(both)) - share * both))
         return np.asarray((1 - share) * np.eye(len(both)) + share * both)
 
     return correlation

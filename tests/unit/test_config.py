@@ -112,10 +112,6 @@ IMPOSSIBLE = [
     (["background.method=sliding", "background.frames=[0, 9]"], "leave frames out"),
     (["background.method=tracks"], 'is made of what fit.mode = "track" finds'),
     (["fit.mode=track", "background.method=tracks", "background.frames=[0,9]"], "leave frames out"),
-    (
-        ["fit.mode=track", "background.method=tracks", "optics.scheme=darkfield"],
-        "needs an interferometric scheme",
-    ),
     (["track.free=all"], "track.free"),
     (["optics.focus_nm=-300000"], "the magnitude of -300000 nm is not between 0 and 100000 nm"),
     (["track.max_step_nm=0.6"], "0.6 nm is not between 1 and 100000 nm"),
