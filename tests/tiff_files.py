@@ -117,6 +117,40 @@ def write_micro_manager(
     return write_tiff(path, pages_of(data), data.shape[1:], page_tags=page_tags)
 
 
+def write_stk(
+    path: Path,
+    data: NDArray,
+    *,
+    times_ms: Sequence[int] | None = None,
+    um_per_px: float | None = None,
+    tags: Tags | None = None,
+) -> Path:
+    """Write what MetaMorph writes: one image, whose UIC2Tag counts the planes that follow it."""
+    times = [divmod(t, 86_400_000) for t in times_ms or range(0, 5 * len(data), 5)]
+    numbers = [n for day, ms in times for n in (0, 1, 2_459_000 + day, ms, 2_459_000 + day, ms)]
+    fields: dict[int, tuple[int, Sequence[int] | str]] = {33629: (RATIONAL, numbers)}
+    if um_per_px is not None:  # XCalibration, YCalibration, CalibrationUnits: places of the values
+        place = 65536
+        fields[33628] = (LONG, [4, place, 5, place, 6, place + 8])
+    fields |= dict(tags or {})
+    raw = data.astype(data.dtype.newbyteorder("<")).tobytes()
+    write_tiff(path, [raw], data.shape[1:], tags={279: (LONG, [data[0].nbytes]), **fields})
+    content = path.read_bytes()
+    # MetaMorph counts planes and pairs, not the numbers that they take.
+    for code, kind, counted, count in (
+        (33629, RATIONAL, 3 * len(data), len(data)),
+        (33628, LONG, 6, 3),
+    ):
+        content = content.replace(
+            struct.pack("<HHI", code, kind, counted), struct.pack("<HHI", code, kind, count)
+        )
+    if um_per_px is not None:
+        scale = struct.pack("<II", round(um_per_px * 1e6), 10**6)
+        content = content.ljust(place, b"\0") + scale + struct.pack("<I", 3) + b"um\0"
+    path.write_bytes(content)
+    return path
+
+
 OME = '<?xml version="1.0" encoding="UTF-8"?><OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06">{}</OME>'
 
 

@@ -52,6 +52,12 @@ def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, t
                 f"{read:g} {unit} in the movie's {metadata.source} metadata; "
                 "the configuration is used"
             )
+    shown_hz = metadata.displayed_hz
+    if config.fit.mode == "track" and shown_hz is not None and metadata.frame_rate_hz is None:
+        notes.append(
+            f"the {shown_hz:g} frames per second in the file are the speed at which ImageJ shows "
+            "the movie, which tells nothing of the camera, and are not used"
+        )
     if metadata.ticks is not None:
         missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
         notes.append(

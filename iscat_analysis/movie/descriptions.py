@@ -13,9 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.movie.driver_names import told_by
+from iscat_analysis.movie.tiff_checks import Image
 from iscat_analysis.records import StackMetadata
 
 TIME_FROM_HEIGHTS = (
@@ -26,17 +29,25 @@ TIME_FROM_HEIGHTS = (
 
 LENGTH_NM = {
     "pm": 1e-3, "å": 0.1, "angstrom": 0.1, "nm": 1.0, "nanometer": 1.0, "nanometers": 1.0,
-    "µm": 1e3, "μm": 1e3, "um": 1e3, "\\u00b5m": 1e3, "micron": 1e3, "microns": 1e3,
+    "µm": 1e3, "μm": 1e3, "um": 1e3, "micron": 1e3, "microns": 1e3,
     "micrometer": 1e3, "micrometers": 1e3, "mm": 1e6, "cm": 1e7, "inch": 2.54e7, "in": 2.54e7,
     "m": 1e9,
 }  # fmt: skip
 """Nanometres in one unit of length, by its lower-case name (both Unicode micro signs)."""
 
 TIME_S = {
-    "ns": 1e-9, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "microsecond": 1e-6, "ms": 1e-3, "msec": 1e-3,
-    "millisecond": 1e-3, "s": 1.0, "sec": 1.0, "second": 1.0, "min": 60.0, "h": 3600.0,
-}  # fmt: skip
-"""Seconds in one unit of time, by its lower-case name."""
+    name: seconds
+    for names, seconds in (
+        ("ns nsec nanosecond nanoseconds", 1e-9),
+        ("µs μs us µsec μsec usec microsecond microseconds", 1e-6),
+        ("ms msec millisecond milliseconds", 1e-3),
+        ("s sec second seconds", 1.0),
+        ("min minute minutes", 60.0),
+        ("h hour hours", 3600.0),
+    )
+    for name in names.split()
+}
+"""Seconds in one unit of time, by its lower-case name (both Unicode micro signs)."""
 
 _TIME_LIKE = "TZQI"
 _MOST_CHANNELS = 7  # of an ImageJ composite
@@ -44,8 +55,12 @@ _AXES = {"T": "time", "Z": "height", "C": "channel", "S": "sample", "P": "positi
 _IMAGEJ_AXES = {"channels": "C", "slices": "Z", "frames": "T"}
 _MICRO_MANAGER_AXES = {"Frames": "T", "Slices": "Z", "Channels": "C", "Positions": "P"}
 _SHAPED = re.compile(r'^\{\s*"shape"\s*:')
+_LARGEST_INDEX = 2**62
+_DAY_S = 86_400.0
 _STRAIGHT_LINE = "0"  # number of ImageJ's calibration function c0 + c1·stored
 _ELECTRONS = {"e", "e-", "electron", "electrons", "photoelectron", "photoelectrons"}
+_ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
+_RATE_TOLERANCE = 0.01  # relative, between the interval that was set and the times of frames
 _COUNTS = {"", "gray value", "gray values", "count", "counts", "adu", "dn"}
 _MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
 _RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
@@ -60,7 +75,8 @@ Resolution = tuple[float, float, int]
 class Hints:
     """Values from one kind of metadata: lengths in nm, exposure in ms, frame rate in Hz.
 
-    None where a value is missing; `ticks` and `source` are as in `StackMetadata`.
+    None where a value is missing; `ticks`, `displayed_hz` and `source` are as in `StackMetadata`,
+    `notes` as in `Frames`.
     """
 
     source: str
@@ -75,6 +91,8 @@ class Hints:
     na: float | None = None
     magnification: float | None = None
     binning: float | None = None
+    displayed_hz: float | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -158,9 +176,11 @@ def imagej_hints(text: str, resolution: Resolution | None) -> Hints:
             x_nm = y_nm = None
     seconds = TIME_S.get(fields.get("tunit", "s").lower())
     interval = positive(fields.get("finterval"), seconds) if seconds else None
-    rate = inverse(interval) or positive(fields.get("fps"))
     gain, offset = _imagej_counts(fields)
-    return Hints("imagej", x_nm, y_nm, frame_rate_hz=rate, gain_e_per_adu=gain, offset_adu=offset)
+    return Hints(
+        "imagej", x_nm, y_nm, frame_rate_hz=inverse(interval), gain_e_per_adu=gain,
+        offset_adu=offset, displayed_hz=positive(fields.get("fps")),
+    )  # fmt: skip
 
 
 def _imagej_counts(fields: Mapping[str, str]) -> tuple[float | None, float | None]:
@@ -194,6 +214,49 @@ def elapsed_ms(frame: object) -> float | None:
     return 0.0 if value in (0, 0.0) else positive(value)
 
 
+def frame_index(frame: object) -> int | None:
+    """Read the number that Micro-Manager gave a frame; None where its metadata are silent."""
+    value = _mm_value(frame.get("FrameIndex")) if isinstance(frame, dict) else None
+    return value if type(value) is int and 0 <= value < _LARGEST_INDEX else None
+
+
+def order_by_time(images: Sequence[Image]) -> list[int] | None:
+    """Sort images by their times, and by their numbers where those are the same or not all known.
+
+    Returns None where they are in order, or nothing tells it.
+    """
+    known = [(image.elapsed_ms, image.index) for image in images]
+    keys = [values for values in zip(*known, strict=True) if None not in values]
+    order = np.lexsort(keys[::-1]) if keys else np.arange(len(images))
+    found: list[int] = order.tolist()
+    return None if found == [*range(len(images))] else found
+
+
+def out_of_order(order: Sequence[int]) -> str:
+    """Say that frames were sorted."""
+    moved = sum(page != frame for frame, page in enumerate(order))
+    return (
+        f"{moved} of the file's {len(order)} images are not where their times (ElapsedTime-ms, or "
+        "else FrameIndex) say; the frames are read in the order of these times"
+    )
+
+
+def chosen_rate(
+    own: float | None, nominal: float | None, names: str
+) -> tuple[float | None, tuple[str, ...]]:
+    """Prefer the rate [Hz] by the times of frames to that by an interval that was set.
+
+    Returns the rate, and what a user should know of a disagreement.
+    """
+    if own is None or nominal is None or abs(own / nominal - 1) <= _RATE_TOLERANCE:
+        return own or nominal, ()
+    interval, times = names.split(" and ")
+    return own, (
+        f"the frame rate is {own:.4g} Hz, by the times of the frames ({times}) in the file, and "
+        f"not {nominal:.4g} Hz, by its {interval}; if that is wrong, set camera.frame_rate_hz",
+    )
+
+
 def micro_manager_hints(
     first: object, times_ms: Sequence[float | None], summary: Mapping[str, Any]
 ) -> Hints:
@@ -205,16 +268,30 @@ def micro_manager_hints(
 
     pixel = positive(find("PixelSizeUm"), 1e3)
     exposure = find("Exposure-ms")
-    rate, ticks = measure_clock({k: t / 1e3 for k, t in enumerate(times_ms) if t is not None})
+    own, ticks = measure_clock({k: t / 1e3 for k, t in enumerate(times_ms) if t is not None})
     interval = find("Interval_ms")
-    if interval is not None and (exposure is None or interval >= exposure) and ticks is None:
-        rate = positive(1e3 / interval)
+    if interval is not None and exposure is not None and interval < exposure:  # as fast as can be
+        interval = None
+    nominal = None if interval is None else positive(1e3 / interval)
+    rate, notes = chosen_rate(own, nominal, "Interval_ms and ElapsedTime-ms")
     told = told_by(begin)
     return Hints(
         "micromanager", pixel, pixel, exposure_ms=exposure,
         frame_rate_hz=rate or told.frame_rate_hz, ticks=ticks,
         gain_e_per_adu=told.gain_e_per_adu, offset_adu=told.offset_adu, binning=told.binning,
+        notes=notes,
     )  # fmt: skip
+
+
+def metamorph_hints(settings: object, planes: object) -> Hints:
+    """Read pixel size and times of a MetaMorph stack: its UIC1Tag and UIC2Tag."""
+    said = settings if isinstance(settings, dict) else {}
+    times = planes if isinstance(planes, dict) else {}
+    unit = LENGTH_NM.get(str(said.get("CalibrationUnits", "")).lower())
+    x_nm, y_nm = (positive(said.get(f"{axis}Calibration"), unit) if unit else None for axis in "XY")
+    days, ms = (np.asarray(times.get(name, ()), float) for name in ("DateCreated", "TimeCreated"))
+    rate, ticks = measure_clock(dict(enumerate((_DAY_S * (days - days[:1]) + ms / 1e3).tolist())))
+    return Hints("metamorph", x_nm, y_nm, frame_rate_hz=rate, ticks=ticks)
 
 
 def plain_hints(resolution: Resolution | None) -> Hints:
@@ -258,6 +335,7 @@ def merge(hints: Sequence[Hints], path: Path) -> StackMetadata:
             "na": hint.na,
             "magnification": hint.magnification,
             "binning": hint.binning,
+            "displayed_hz": hint.displayed_hz,
         }
         fresh = {key: n for key, n in given.items() if n is not None and key not in found}
         if "pixel_size_nm" in fresh and x and y and abs(y / x - 1) > _SQUARE_TOLERANCE:
@@ -277,7 +355,8 @@ def _plausible(*sizes_nm: float | None) -> bool:
 
 
 def _imagej_fields(text: str) -> dict[str, str]:
-    pairs = (line.partition("=") for line in text.splitlines())
+    plain = _ESCAPED.sub(lambda found: chr(int(found[1], 16)), text)  # as in \\u00B5m
+    pairs = (line.partition("=") for line in plain.splitlines())
     return {key.strip(): value.strip() for key, equals, value in pairs if equals}
 
 

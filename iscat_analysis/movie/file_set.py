@@ -20,20 +20,19 @@ from iscat_analysis.records import InPlace, PlacedSource, StackMetadata
 class FileSet:
     """The frames of a set of files."""
 
-    notes = ()
-
     def __init__(
         self,
         members: Sequence[Frames],
         files: Sequence[Path],
         where: NDArray[np.int64],
         metadata: StackMetadata,
+        notes: tuple[str, ...] = (),
     ) -> None:
         self._members, self._where = members, where
         self.files = tuple(files)
         self.shape = (len(where), *members[0].shape[1:])
         self.dtype = members[0].dtype
-        self.metadata = metadata
+        self.metadata, self.notes = metadata, notes
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
@@ -83,4 +82,5 @@ def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames
                     f"{needed}; the recording or the copy was interrupted: export it again"
                 )
         opened.pop_all()
-    return FileSet(members, files, described.where, merge([described.hints], path))
+    hints = described.hints
+    return FileSet(members, files, described.where, merge([hints], path), hints.notes)

@@ -18,7 +18,7 @@ from iscat_analysis.movie.stack import Frames
 from iscat_analysis.movie.tiff import first_texts, open_tiff
 from iscat_analysis.reading import is_file
 
-_TIFF = (".tif", ".tiff", ".btf", ".tf8")
+_TIFF = (".tif", ".tiff", ".btf", ".tf8", ".stk")
 _HDF5 = (".h5", ".hdf5")
 _ZARR = ".zarr"
 _REFEYN = ".mp"

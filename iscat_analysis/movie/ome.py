@@ -23,6 +23,7 @@ from iscat_analysis.movie.descriptions import (
     LENGTH_NM,
     TIME_S,
     Hints,
+    chosen_rate,
     inverse,
     positive,
     time_axis,
@@ -263,9 +264,8 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
     )
     increment_unit = _factor(pixels, "TimeIncrementUnit", "s", TIME_S)
     increment = positive(pixels.get("TimeIncrement"), increment_unit) if increment_unit else None
-    rate, ticks = measure_clock(_times_s(planes, f"The{axis}"))
-    if ticks is None:
-        rate = inverse(increment) or rate
+    own, ticks = measure_clock(_times_s(planes, f"The{axis}"))
+    rate, notes = chosen_rate(own, inverse(increment), "TimeIncrement and DeltaT")
     told = told_by(_annotations(root))  # what other programs knew, and the schema has no place for
     exposure = next((value for value in exposures if value is not None), None)
     objective = _objective(root, pixels)
@@ -285,6 +285,7 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
         if objective is None
         else positive(objective.get("NominalMagnification")),
         binning=_binning(pixels) or told.binning,
+        notes=notes,
     )
 
 

@@ -27,12 +27,17 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.descriptions import (
     TIME_FROM_HEIGHTS,
+    Described,
     described_frames,
     elapsed_ms,
+    frame_index,
     imagej_hints,
     merge,
+    metamorph_hints,
     micro_manager_axes,
     micro_manager_hints,
+    order_by_time,
+    out_of_order,
     plain_hints,
     time_axis,
 )
@@ -66,9 +71,10 @@ from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
 from iscat_analysis.records import InPlace, StackMetadata
 
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
+_METAMORPH, _METAMORPH_PLANES = 33628, 33629  # UIC1Tag and UIC2Tag
 _ESSENTIAL = {
     256, 257, 258, 259, 266, _DESCRIPTION, STRIP_OFFSETS, 277, 278, STRIP_SIZES, 317, 322, 323,
-    TILE_OFFSETS, TILE_SIZES, 339, 32997,
+    TILE_OFFSETS, TILE_SIZES, 339, 32997, _METAMORPH_PLANES,
 }  # fmt: skip
 """Tags without which an image would be taken for another: size, type, encoding, place, text."""
 
@@ -121,7 +127,8 @@ class TiffFrames:
                 self.shape[1:], self._stored_dtype, buffer=self._data, offset=int(first)
             )
         if start < stop:
-            release(self._data, int(self._starts[start]), int(self._starts[stop - 1]))
+            used = self._starts[start:stop]
+            release(self._data, int(used.min()), int(used.max()))
         return block
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
@@ -220,6 +227,9 @@ def _open(
         hints = []
         notes = (TIME_FROM_HEIGHTS,) if heights else ()
     frames = [images[k] for k in order]
+    if not member and (found := order_by_time(frames)) is not None:
+        frames, order = [frames[k] for k in found], [order[k] for k in found]
+        notes = (*notes, out_of_order(found))
     first = file.pages[order[0]]
     dtype = pixel_type(first, path).newbyteorder(file.byteorder)
     refuse_differences(frames, path)
@@ -240,6 +250,8 @@ def _open(
             time_axis(micro_manager_axes(summary), path)
         times_ms = [image.elapsed_ms for image in frames]
         hints.append(micro_manager_hints(first.tags.valueof(_MICRO_MANAGER), times_ms, summary))
+    if first.tags.valueof(_METAMORPH_PLANES) is not None:
+        hints.append(metamorph_hints(*map(first.tags.valueof, (_METAMORPH, _METAMORPH_PLANES))))
     resolution = _resolution(file.pages[0])
     hints += [imagej_hints(text, resolution) for text in texts if text.startswith("ImageJ=")]
     hints.append(plain_hints(resolution))
@@ -250,7 +262,7 @@ def _open(
         images=frames,
         n_frames=n_frames,
         metadata=merge(hints, path),
-        notes=notes,
+        notes=(*notes, *(note for hint in hints for note in hint.notes)),
         decode=first.decode,
     )
 
@@ -296,8 +308,10 @@ def _images(file: tifffile.TiffFile, data: mmap.mmap, path: Path) -> Iterator[Im
             tuple(_text(tag.value) for tag in page.tags.getall(_DESCRIPTION, ())),
             page.dataoffsets,
             page.databytecounts,
-            page.dataoffsets[0] if page.is_final else None,
-            elapsed_ms(page.tags.valueof(_MICRO_MANAGER)),
+            _start(page),
+            _planes(page),
+            elapsed_ms(recorded := page.tags.valueof(_MICRO_MANAGER)),
+            frame_index(recorded),
         )
         pattern = repetition_of(file.tiff, data, page.offset, sum(image.sizes))
         yield image
@@ -332,18 +346,17 @@ def _text(value: str | bytes) -> str:
 def _count_frames(images: Sequence[Image], path: Path) -> tuple[int, bool]:
     """Set what the file holds against every description in it; the larger number must be true.
 
+    Where images one after the other carry the same description, it is one of all of them.
+
     Returns the number of frames, and whether they lie along an axis of heights.
     """
     announced = 0
     one_image = heights = False
-    for image in images:
-        for text in image.texts:
-            found = described_frames(text, image.shape, path)
-            if found is not None:
-                announced += found.frames
-                one_image |= found.one_image
-                heights |= found.axis == "Z"
-                break
+    for found, repeats in itertools.groupby(_described(image, path) for image in images):
+        if found is not None:
+            announced += found.frames * math.ceil(len(list(repeats)) / found.frames)
+            one_image |= found.one_image
+            heights |= found.axis == "Z"
     if announced <= len(images):
         return len(images), heights
     if len(images) == 1 and one_image and images[0].start is not None:
@@ -352,6 +365,28 @@ def _count_frames(images: Sequence[Image], path: Path) -> tuple[int, bool]:
         f"{path}: describes {announced} frames but holds {len(images)}; "
         "the recording or the copy was interrupted: export it again"
     )
+
+
+def _described(image: Image, path: Path) -> Described | None:
+    """Read what an image says of the frames that begin with it."""
+    if image.planes > 1:
+        return Described(image.planes, "T", one_image=True)
+    all_texts = (described_frames(text, image.shape, path) for text in image.texts)
+    return next((found for found in all_texts if found is not None), None)
+
+
+def _start(page: tifffile.TiffPage) -> int | None:
+    """First byte of pixels that lie in the file as they are."""
+    strips = itertools.pairwise(zip(page.dataoffsets, page.databytecounts, strict=True))
+    if page.is_final and all(start + size == after for (start, size), (after, _) in strips):
+        return int(page.dataoffsets[0])
+    return None
+
+
+def _planes(page: tifffile.TiffPage) -> int:
+    """Count the frames that MetaMorph keeps behind one image."""
+    tag = page.tags.get(_METAMORPH_PLANES)
+    return 1 if tag is None else max(int(tag.count), 1)
 
 
 def _micro_manager_summary(path: Path) -> dict[str, Any]:

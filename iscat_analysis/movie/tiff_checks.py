@@ -44,7 +44,11 @@ class Image:
     offsets: tuple[int, ...]
     sizes: tuple[int, ...]
     start: int | None
+    planes: int
+    """Frames whose pixels follow one another from here, as MetaMorph counts them."""
     elapsed_ms: float | None
+    index: int | None
+    """Time and number of the frame, as Micro-Manager wrote them beside its pixels."""
 
     def __str__(self) -> str:
         return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"

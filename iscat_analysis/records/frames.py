@@ -39,6 +39,8 @@ class StackMetadata:
         Of the objective, as engraved.
     binning : float or None
         Pixels of the sensor along a side of one of the movie.
+    displayed_hz : float or None
+        Frames per second at which ImageJ shows the movie [Hz]; the camera may have been faster.
     source : str
         Source of the metadata: ``"ome"``, ``"imagej"``, ``"micromanager"``, ``"tiff"``, the name
         of a file beside it, ``"none"``…
@@ -54,6 +56,7 @@ class StackMetadata:
     na: float | None = None
     magnification: float | None = None
     binning: float | None = None
+    displayed_hz: float | None = None
     source: str = "none"
 
 

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import tifffile
-from tiff_files import ASCII, LONG, RATIONAL, SHORT, movie, pages_of, write_tiff
+from tiff_files import ASCII, LONG, RATIONAL, SHORT, movie, pages_of, write_stk, write_tiff
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
@@ -347,6 +347,78 @@ def test_reads_the_imagej_convention_for_large_files(tmp_path: Path) -> None:
     assert_whole(path, data)
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(DataError, match=r"truncated \(its 7 frames"):
+        open_stack(path)
+
+
+IMAGEJ = "ImageJ=1.53t\nimages={0}\nframes={0}\nunit=nm\nloop=false\n"
+
+
+def _described_pages(path: Path, pages: int, images: int, every: int = 1) -> Path:
+    """Write pages of which every so many describe so many images, as Fiji does."""
+    data = movie(pages)
+    tags: dict = {k: {270: (ASCII, IMAGEJ.format(images))} for k in range(0, pages, every)}
+    return write_tiff(path, pages_of(data), data.shape[1:], page_tags=tags)
+
+
+def test_a_description_on_every_page_counts_once(tmp_path: Path) -> None:
+    assert_whole(_described_pages(tmp_path / "m.tif", 12, 12), movie(12))
+    assert_whole(_described_pages(tmp_path / "m.tif", 12, 6), movie(12))  # two stacks joined
+    assert_whole(_described_pages(tmp_path / "m.tif", 12, 6, every=6), movie(12))
+    assert_whole(_described_pages(tmp_path / "m.tif", 12, 1), movie(12))
+
+
+@pytest.mark.parametrize(
+    ("pages", "images", "every", "described"),
+    [(9, 12, 1, 12), (9, 6, 1, 12), (9, 6, 6, 12), (11, 12, 12, 12)],
+)
+def test_a_description_on_every_page_hides_no_missing_frame(
+    tmp_path: Path, pages: int, images: int, every: int, described: int
+) -> None:
+    path = _described_pages(tmp_path / "m.tif", pages, images, every)
+    with pytest.raises(DataError, match=f"describes {described} frames but holds {pages}"):
+        open_stack(path)
+
+
+def test_a_hyperstack_described_on_every_page_is_refused_by_its_axes(tmp_path: Path) -> None:
+    data = movie(12)
+    text = "ImageJ=1.53t\nimages=12\nchannels=2\nframes=6\nhyperstack=true\n"
+    tags: dict = {270: (ASCII, text)}
+    path = write_tiff(tmp_path / "m.tif", pages_of(data), data.shape[1:], tags=tags)
+    with pytest.raises(DataError, match=r"C \(channel\) of length 2 and T \(time\) of length 6"):
+        open_stack(path)
+
+
+# --- MetaMorph ---------------------------------------------------------------------------------
+
+
+def test_reads_the_planes_of_metamorph_with_their_times(tmp_path: Path) -> None:
+    expected = movie(8)
+    path = write_stk(tmp_path / "m.stk", expected, um_per_px=0.0844)
+    assert_whole(path, expected)
+    with open_stack(path) as stack:
+        assert stack.in_place(2, 5) is not None
+        found = stack.metadata
+    assert (found.pixel_size_nm, found.source) == (pytest.approx(84.4), "metamorph")
+    assert found.frame_rate_hz == pytest.approx(200, rel=1e-3)
+    times = [86_399_990 + 5 * k for k in (0, 1, 2, 3, 6, 7, 8, 9)]  # over midnight, two dropped
+    with open_stack(write_stk(path, expected, times_ms=times)) as stack:
+        assert stack.metadata.ticks == (0, 1, 2, 3, 6, 7, 8, 9)
+        assert stack.metadata.pixel_size_nm is None
+
+
+def test_metamorph_that_is_cut_short_or_alone_is_refused(tmp_path: Path) -> None:
+    path = write_stk(tmp_path / "m.stk", movie(8))
+    whole = path.read_bytes()
+    for lost in (1, 280, 281, 8 * 280 - 1):
+        path.write_bytes(whole[:-lost])
+        with pytest.raises(DataError, match="truncated"):
+            open_stack(path)
+    with pytest.raises(DataError, match="single frame"):
+        open_stack(write_stk(path, movie(1)))
+    with pytest.raises(DataError, match="describes 8 frames but holds 1"):
+        open_stack(write_stk(path, movie(8), tags={259: (SHORT, [8])}))
+    path.write_bytes(whole[:8] + whole[8:].replace(struct.pack("<HHI", 33629, 5, 8), b"\xff" * 8))
+    with pytest.raises(DataError, match="single frame"):
         open_stack(path)
 
 

@@ -101,8 +101,23 @@ def test_ome_timing(path: Path) -> None:
     found = metadata(ome(path, body=body))
     assert found.frame_rate_hz == pytest.approx(200)
     assert found.exposure_ms == pytest.approx(4)
-    found = metadata(ome(path, 'TimeIncrement="10" TimeIncrementUnit="ms"', body))
-    assert found.frame_rate_hz == pytest.approx(100)
+    assert found.displayed_hz is None
+
+
+@pytest.mark.parametrize(("increment", "said"), [("10", True), ("5.01", False)])
+def test_times_of_ome_planes_are_preferred_to_the_interval_that_was_set(
+    path: Path, increment: str, said: bool
+) -> None:
+    body = "".join(
+        f'<Plane TheT="{t}" TheZ="0" TheC="0" DeltaT="{t * 5.0}" DeltaTUnit="ms"/>'
+        for t in range(5)
+    )
+    with open_stack(ome(path, f'TimeIncrement="{increment}" TimeIncrementUnit="ms"', body)) as m:
+        assert m.metadata.frame_rate_hz == pytest.approx(200)
+        assert [("100 Hz" in note, "DeltaT" in note) for note in m.notes] == [(True, True)] * said
+    with open_stack(ome(path, f'TimeIncrement="{increment}" TimeIncrementUnit="ms"')) as m:
+        assert m.metadata.frame_rate_hz == pytest.approx(1e3 / float(increment))
+        assert not m.notes
 
 
 def test_pixels_must_be_square(path: Path) -> None:
@@ -288,11 +303,39 @@ def test_imagej(path: Path, unit: str) -> None:
 
 @pytest.mark.parametrize(
     ("lines", "rate"),
-    [("fps=50.0", 50), ("finterval=5\ntunit=ms", 200), ("finterval=0\nfps=0", None)],
+    [
+        ("finterval=5\ntunit=ms", 200),
+        ("finterval=0.005", 200),
+        ("finterval=5000\ntunit=\\u00B5s", 200),
+        ("finterval=5000\ntunit=\\u00b5sec", 200),
+        ("finterval=5000\ntunit=us\nfps=7", 200),
+        ("finterval=0.5\ntunit=min", 1 / 30),
+        ("finterval=5\ntunit=fortnights", None),
+        ("finterval=0\nfps=0", None),
+        ("fps=7.0", None),
+    ],
 )
 def test_imagej_timing(path: Path, lines: str, rate: float | None) -> None:
     found = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
     assert found.frame_rate_hz == (rate if rate is None else pytest.approx(rate))
+
+
+@pytest.mark.parametrize(
+    ("lines", "settings", "said"),
+    [
+        ("fps=7.0", {"fit.mode": "track"}, True),
+        ("fps=7.0\nfinterval=0.005", {"fit.mode": "track"}, False),
+        ("fps=7.0", {"fit.mode": "mass"}, False),
+    ],
+)
+def test_the_speed_of_display_is_never_the_frame_rate(
+    path: Path, lines: str, settings: dict[str, str], said: bool
+) -> None:
+    read = metadata(described(path, f"ImageJ=1.53t\nimages=5\n{lines}\n"))
+    config = configure({"camera.pixel_size_nm": 84.4, **settings})
+    used, notes = resolve_metadata(config, read)
+    assert used.camera.frame_rate_hz == read.frame_rate_hz
+    assert ["7 frames per second" in note for note in notes] == [True] * said
 
 
 @pytest.mark.parametrize("unit", ["pixel", "inch", "", "cm"])
@@ -357,11 +400,42 @@ def frame_metadata(**fields: object) -> list[dict[str, object]]:
 
 def test_micro_manager(path: Path) -> None:
     fields = {"PixelSizeUm": 0.0844, "Exposure-ms": 10, "Interval_ms": 20}
-    found = metadata(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields)))
+    with open_stack(write_micro_manager(path, movie(FRAMES), frame_metadata(**fields))) as stack:
+        found, notes = stack.metadata, stack.notes
     assert found.pixel_size_nm == pytest.approx(84.4)
     assert found.exposure_ms == 10
-    assert found.frame_rate_hz == pytest.approx(50)
+    assert found.frame_rate_hz == pytest.approx(80)  # frames came every 12.5 ms
     assert found.source == "micromanager"
+    assert "not 50 Hz, by its Interval_ms" in notes[0]
+
+
+@pytest.mark.parametrize("told", ["ElapsedTime-ms", "FrameIndex", "both"])
+@pytest.mark.parametrize("how", ["pairs", "reversed", "late"])
+def test_pages_are_sorted_by_their_times(path: Path, how: str, told: str) -> None:
+    data, n = movie(12), np.arange(12)
+    order = {"pairs": n.reshape(-1, 2)[:, ::-1].ravel(), "reversed": n[::-1], "late": (n + 6) % 12}
+    kept = np.delete(n, 4) if told == "ElapsedTime-ms" else n  # frame 4 was dropped
+    pages = [int(k) for k in order[how] if k in kept]
+    fields = [{"ElapsedTime-ms": 40 + 5.0 * k, "FrameIndex": k} for k in pages]
+    if told != "both":
+        fields = [{told: page[told]} for page in fields]
+    with open_stack(write_micro_manager(path, data[pages], fields)) as stack:
+        np.testing.assert_array_equal(stack.read(0, len(kept)), data[kept])
+        np.testing.assert_array_equal(stack.read(3, 8), data[kept[3:8]])
+        assert stack.metadata.ticks == (tuple(kept.tolist()) if len(kept) < 12 else None)
+        if told != "FrameIndex":
+            assert stack.metadata.frame_rate_hz == pytest.approx(200, rel=1e-3)
+        assert sum(f"of the file's {len(kept)} images" in note for note in stack.notes) == 1
+    with open_stack(
+        write_micro_manager(path, data[kept], sorted(fields, key=lambda page: [*page.values()]))
+    ) as stack:
+        assert not stack.notes
+
+
+def test_times_that_two_pages_share_leave_them_in_the_order_of_their_numbers(path: Path) -> None:
+    fields = [{"ElapsedTime-ms": 5 * (k // 2), "FrameIndex": k ^ 1} for k in range(6)]
+    with open_stack(write_micro_manager(path, movie(6), fields)) as stack:
+        np.testing.assert_array_equal(stack.read(0, 6), movie(6)[[1, 0, 3, 2, 5, 4]])
 
 
 @pytest.mark.parametrize("cameras", [1, 2])
