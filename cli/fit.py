@@ -77,8 +77,9 @@ def fit(
         typer.Option(
             metavar="SHAPE,TYPE",
             help=(
-                "Shape and type of a raw file of numbers, as in 1500x128x128,uint16; also "
-                "STACK::SHAPE,TYPE."
+                "Shape and type of a raw file of numbers, as in 1500x128x128,uint16 (>u2 for big "
+                "endian; behind a header 128x128,uint16,header=344; as MATLAB writes them "
+                "128x96,uint16,order=columns); also STACK::SHAPE,TYPE."
             ),
         ),
     ] = None,

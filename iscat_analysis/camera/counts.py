@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
+from iscat_analysis.movie.disorder import bytes_are_swapped
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.reading import is_file
 from iscat_analysis.records import BoolArray, FloatArray
@@ -33,6 +34,7 @@ _RATIO_TOLERANCE = 0.1  # of a mean of 1; a power that was not divided out is wi
 _RATIO_MOST_E = 10.0  # photoelectrons in a pixel, of which no interferometric image is made
 _OVERFLOW_JUMP = 0.75  # of the largest number, from one frame to the next
 _BRIGHT_QUANTILE = 0.99  # quantile of a frame, below which too few pixels lie for light to be on
+_FRAMES_TELL_BYTES = 8
 _LARGEST_OVERFLOW_SHARE = 1e-4  # of a frame's pixels that leap; more than blink
 _NEGATIVE_SIGMAS = 6.0  # 1e-9 of pixels in the dark
 _NEGATIVE_FRACTION = 0.01  # more pixels below the offset than a sensor has dead ones
@@ -305,12 +307,20 @@ def refuse_ratio(frame: NDArray[Any], where: str, camera: Camera) -> None:
 def refuse_overflow(counts: NDArray[Any], name: str) -> None:
     """Refuse a movie whose counts went beyond the largest number of their type and began at zero.
 
+    So does one whose numbers were read with their bytes the other way round.
+
     A pixel there leaps over nearly the whole range of the type from one frame to the next, as no
     light does in some pixels of a frame and not in the others.  One that is saturated is at the
     very end of the range, where one that overflowed hardly ever is.
 
     Shapes: `counts` (t, y, x).
     """
+    if len(counts) > 1 and bytes_are_swapped(counts[:_FRAMES_TELL_BYTES]):
+        raise DataError(
+            f"{name}: the bytes of its numbers are the other way round: pixels leap over the range "
+            f"of {counts.dtype} from one frame to the next, and do not with the bytes of each "
+            "number exchanged; read or export them with the other byte order"
+        )
     if not np.issubdtype(counts.dtype, np.unsignedinteger) or counts.dtype.itemsize > 2:
         return
     largest = int(np.iinfo(counts.dtype).max)

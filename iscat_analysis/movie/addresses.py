@@ -1,13 +1,16 @@
 """Where a movie is: a file, or a part of one, as in ``day.h5::/run 3/movie``.
 
 What stands behind the two colons is the path of a dataset in an HDF5 file or a Zarr folder, or
-shape and type of the numbers of a file that says nothing of itself: ``movie.bin::128x128,uint16``.
+shape and type of the numbers of a file that says nothing of itself: ``movie.bin::128x128,uint16``,
+with ``,header=344`` where so many bytes come first, and ``,order=columns`` where a frame is stored
+column by column, as MATLAB does.
 """
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.reading import is_file, is_folder
@@ -16,7 +19,28 @@ MARK = "::"
 SETUP = "iscat.toml"
 """Name of the configuration of the movies in a folder."""
 
-_SHAPE = re.compile(r"(?:(\d{1,12})x)?(\d{1,9})x(\d{1,9}),\s*(\S+)", flags=re.ASCII)
+_SHAPE = re.compile(
+    r"(?:(\d{1,12})x)?(\d{1,9})x(\d{1,9}),\s*([^\s,]+)"
+    r"(?:,\s*header=(\d{1,12}))?(?:,\s*order=(rows|columns))?",
+    flags=re.ASCII,
+)
+
+
+class Layout(NamedTuple):
+    """How plain numbers lie in a file."""
+
+    frames: int | None
+    rows: int
+    columns: int
+    type_name: str
+    header_bytes: int = 0
+    by_columns: bool = False
+
+    def __str__(self) -> str:
+        shape = [n for n in (self.frames, self.rows, self.columns) if n is not None]
+        header = f",header={self.header_bytes}" if self.header_bytes else ""
+        order = ",order=columns" if self.by_columns else ""
+        return f"{'x'.join(map(str, shape))},{self.type_name}{header}{order}"
 
 
 def split_address(address: Path) -> tuple[Path, str]:
@@ -27,13 +51,16 @@ def split_address(address: Path) -> tuple[Path, str]:
     return address, ""
 
 
-def layout(part: str) -> tuple[int | None, int, int, str] | None:
-    """Read shape and type of plain numbers."""
+def layout(part: str) -> Layout | None:
+    """Read shape, type and place of plain numbers."""
     match = _SHAPE.fullmatch(part.strip())
     if match is None:
         return None
-    frames = int(match[1]) if match[1] else None
-    return frames, int(match[2]), int(match[3]), match[4]
+    frames, rows, columns, name, header, order = match.groups()
+    return Layout(
+        int(frames) if frames else None, int(rows), int(columns), name, int(header or 0),
+        order == "columns",
+    )  # fmt: skip
 
 
 def setup_beside(address: Path) -> Path:

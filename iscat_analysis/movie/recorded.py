@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.addresses import MARK
+from iscat_analysis.movie.addresses import MARK, Layout
 from iscat_analysis.movie.file_set import FileSet
-from iscat_analysis.movie.mapped_frames import MappedFrames
+from iscat_analysis.movie.mapped_frames import MappedFrames, refuse_disorder
 from iscat_analysis.reading import is_file, read_text
 from iscat_analysis.records import StackMetadata
 
@@ -86,6 +86,8 @@ def open_recorded(path: Path) -> FileSet:
                 shape = (count, rows, columns)
                 members.append(MappedFrames(each, shape, stored, offset=0, member=True))
                 opened.callback(members[-1].close)
+        if named is not None:
+            refuse_disorder(members[0], Layout(*named[:3], stored.str), path)
         opened.pop_all()
     where = [(m, image) for m, member in enumerate(members) for image in range(member.shape[0])]
     return FileSet(members, files, np.array(where, dtype=np.int64), StackMetadata())

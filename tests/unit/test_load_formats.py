@@ -12,6 +12,7 @@ import tifffile
 import zarr
 from tiff_files import write_ome_set
 
+from iscat_analysis.camera.counts import refuse_overflow
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack, path_beside
 from iscat_analysis.movie.addresses import split_address
@@ -119,6 +120,76 @@ def test_plain_numbers_of_another_size_are_refused(tmp_path: Path, part: str, sa
     path = tmp_path / "movie.bin"
     path.write_bytes(COUNTS.tobytes())
     refused(f"{path}::{part}", "movie.bin", said)
+
+
+def smooth(rows: int = 32, columns: int = 48) -> np.ndarray:
+    """Make a movie as a camera sees it: light that varies over the field, with its noise."""
+    rng, y, x = np.random.default_rng(3), *np.indices((rows, columns))
+    light = 3000 + 400 * np.sin(y / 3 + x / 5) + 300 * np.cos(x / 4)
+    return rng.poisson(light, (9, rows, columns)).astype("<u2")
+
+
+@pytest.mark.parametrize("stored", ["<u2", ">u2", "<i4", ">i4", "<f4", ">f4", ">f8"])
+def test_the_byte_order_of_plain_numbers_is_told_by_their_smoothness(
+    tmp_path: Path, stored: str
+) -> None:
+    counts = smooth().astype(stored)
+    path = tmp_path / "movie.raw"
+    path.write_bytes(counts.tobytes())
+    assert_whole(f"{path}::32x48,{stored}", counts)
+    wrong = counts.dtype.newbyteorder("S").str
+    refused(f"{path}::32x48,{wrong}", "bytes", "the other way round", f"9x32x48,{stored}")
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [
+        smooth() // 16 << 8,  # eight bits in the upper half of sixteen
+        smooth() << 3,
+        np.random.default_rng(5).integers(0, 65536, (9, 32, 48)).astype("<u2"),
+        np.where(np.arange(9)[:, None, None] % 2, smooth(), smooth() // 300).astype("<u2"),
+        np.full((9, 32, 48), 258, "<u2"),
+        smooth()[:, ::-1, ::-1] % 256,
+    ],
+    ids=["8 bits", "13 bits", "noise", "flashes", "constant", "wrapped"],
+)
+def test_plain_numbers_that_are_right_are_not_taken_for_swapped(
+    tmp_path: Path, counts: np.ndarray
+) -> None:
+    path = tmp_path / "movie.raw"
+    path.write_bytes(counts.astype("<u2").tobytes())
+    assert_whole(f"{path}::32x48,uint16", counts.astype("<u2"))
+
+
+def test_arrays_with_swapped_bytes_are_named_before_they_seem_to_overflow() -> None:
+    refuse_overflow(smooth(), "movie")
+    with pytest.raises(DataError, match="movie: the bytes of its numbers are the other way round"):
+        refuse_overflow(smooth().byteswap(), "movie")
+
+
+def test_frames_that_are_stored_column_by_column(tmp_path: Path) -> None:
+    counts = smooth()
+    path = tmp_path / "movie.raw"
+    path.write_bytes(counts.transpose(0, 2, 1).tobytes())
+    assert_whole(f"{path}::32x48,uint16,order=columns", counts)
+    assert_whole(f"{path}::48x32,uint16", counts.transpose(0, 2, 1))
+    refused(f"{path}::32x48,uint16", "9x32x48,uint16,order=columns", "9x48x32,uint16")
+    refused(f"{path}::48x32,uint16,order=columns", '::9x48x32,uint16"')
+    with open_stack(f"{path}::32x48,uint16,order=columns") as stack:
+        assert stack.in_place(0, 3) is None
+
+
+def test_plain_numbers_behind_a_header(tmp_path: Path) -> None:
+    path = tmp_path / "movie.raw"
+    path.write_bytes(bytes(344) + COUNTS.tobytes() + b"")
+    assert_whole(f"{path}::6x5,uint16,header=344")
+    assert_whole(f"{path}::7x6x5,uint16, header=344,order=rows")
+    refused(f"{path}::6x5,uint16,header=340", "header of 344", "::6x5,uint16,header=344")
+    refused(f"{path}::7x6x5,uint16", '::7x6x5,uint16,header=344"')
+    refused(f"{path}::8x6x5,uint16,header=344", "needs 480 behind a header of 344")
+    refused(f"{path}::6x5,uint16,header=9999", "check the shape")
+    refused(f"{path}::6x5,uint16,head=344", "header=344")
+    assert path_beside(Path(f"{path}::6x5,uint16,header=344"), ".iscat") == tmp_path / "movie.iscat"
 
 
 def test_a_file_of_unknown_numbers_says_how_to_name_them(tmp_path: Path) -> None:
