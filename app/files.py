@@ -11,14 +11,13 @@ import panel as pn
 
 import iscat_analysis as ia
 from iscat_analysis.movie.addresses import path_beside
+from iscat_analysis.movie.folders import SUFFIXES
+from iscat_analysis.movie.frame_files import holds_single_frames
 from iscat_analysis.reading import read_json
 from iscat_analysis.report.answer import answer_in
 from iscat_app.chosen import Chosen, Notice, in_line, table_of
 
 Kind = Literal["folder", "movie", "result"]
-
-MOVIES = (".tif", ".tiff", ".btf", ".mp", ".h5", ".hdf5", ".npy", ".zarr")
-"""Endings of files and folders that may be movies; what is inside is seen when one is opened."""
 
 LARGEST_UPLOAD_MB = 200
 """Of a file that is dropped on the page; larger ones are opened where they lie."""
@@ -45,7 +44,7 @@ def listed(folder: Path) -> list[Entry]:
         ending = path.suffix.lower()
         if path.is_dir() and ending == ".iscat":
             continue  # shown with its movie, or below
-        if ending in MOVIES:
+        if ending in SUFFIXES or (path.is_dir() and holds_single_frames(path)):
             done = (path_beside(path, ".iscat") / "summary.json").is_file()
             entries.append(Entry(path, "movie", f"{'●' if done else '○'} {path.name}"))
         elif path.is_dir():

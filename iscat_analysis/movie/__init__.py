@@ -8,7 +8,7 @@ short, or whose description announces more than it holds, is refused and never a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 
@@ -16,8 +16,8 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.hashing import refuse_changed, states_of
 from iscat_analysis.movie.addresses import MARK, path_beside, split_address
 from iscat_analysis.movie.file_set import FileSet
-from iscat_analysis.movie.folders import FORMATS, files_of
-from iscat_analysis.movie.mapped import HDF5_SIGNATURE
+from iscat_analysis.movie.folders import FORMATS, Format, files_of
+from iscat_analysis.movie.frame_files import FrameFiles, holds_single_frames
 from iscat_analysis.movie.mapped_frames import open_raw
 from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
 from iscat_analysis.movie.recorded import description_of, open_recorded
@@ -28,24 +28,20 @@ from iscat_analysis.records import StackMetadata
 
 __all__ = ["ArrayLike", "Frames", "Stack", "open_stack", "path_beside"]
 
-READERS: Mapping[bytes, Callable[[Path], Frames]] = {
-    signature: kind.open for kind in FORMATS for signature in kind.signatures
+READERS: Mapping[bytes, Format] = {
+    signature: kind for kind in FORMATS for signature in kind.signatures
 }
-"""The first bytes of a file and what opens it."""
+"""The first four bytes of a file, and what it is."""
 
 _LOSSY = "which keeps no counts: its compression leaves out what the eye does not see"
 _EXPORT = "export the movie as TIFF"
-_LAZY = "export it as OME-TIFF, or give the array that a reader makes of it to fit_movie"
 _FOREIGN: Mapping[bytes, str] = {
     b"\x89PNG": f"a PNG picture; {_EXPORT}",
     b"\xff\xd8\xff": f"a JPEG picture; {_EXPORT}",
-    b"PK\x03\x04": "a ZIP archive; unpack it",
     b"\x1f\x8b": "a gzip archive; unpack it",
     b"RIFF": f"an AVI film, {_LOSSY}; {_EXPORT}",
     b"\x1aE\xdf\xa3": f"a Matroska film, {_LOSSY}; {_EXPORT}",
     b"SIMPLE": f"a FITS file; {_EXPORT}",
-    b"\xda\xce\xbe\x0a": f"a Nikon ND2 file; {_LAZY}",
-    b"ZISRAWFI": f"a Zeiss CZI file; {_LAZY}",
 }
 _FILM = b"ftyp"  # of MP4 and QuickTime, behind four bytes
 _SIGNATURE_BYTES = 8
@@ -144,13 +140,15 @@ def _open_file(address: Path) -> Stack:
 def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
     """Open a file or folder by what is in it."""
     if is_folder:
-        if not is_zarr(path):
-            raise DataError(
-                f"{path}: is a folder; give the path of one movie file: frames that were saved one "
-                "by one are joined first (in Fiji: File > Import > Image Sequence, then Save As > "
-                "Tiff), and all movies of a folder are analysed by `iscat batch`"
-            )
-        return _stack(path, open_zarr(path, part), part, files_of(path))
+        if is_zarr(path):
+            return _stack(path, open_zarr(path, part), part, files_of(path))
+        if holds_single_frames(path, fewest=2):
+            frames = FrameFiles(path)
+            return _stack(path, frames, files=frames.files)
+        raise DataError(
+            f"{path}: is a folder, but not one of TIFF files with a frame each, nor of Zarr; give "
+            "the path of one movie file; all movies of a folder are analysed by `iscat batch`"
+        )
     if is_pipe:  # which would keep whoever opens it waiting
         raise DataError(
             f"{path}: is a pipe or a device, and a movie is read more than once: save it as a "
@@ -165,20 +163,16 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
         raise DataError(f"{path}: cannot be read ({error.strerror})") from None
     if not signature:
         raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
-    if signature == HDF5_SIGNATURE:
-        from iscat_analysis.movie.datasets import open_hdf5  # h5py takes long
-
-        return _stack(path, open_hdf5(path, part), part)
-    if part:
+    kind = READERS.get(signature[:4])
+    if part and (kind is None or kind.holds_one is None):
         return _stack(path, open_raw(path, part), part)
     if description_of(path) is not None:
         recorded = open_recorded(path)
         return _stack(path, recorded, files=recorded.files)
-    reader = READERS.get(signature[:4])
-    if reader is None:
+    if kind is None:
         raise DataError(f"{path}: {_refusal(path, signature)}")
-    frames = reader(path)
-    return _stack(path, frames, files=frames.files if isinstance(frames, FileSet) else None)
+    found = kind.open(path, part)
+    return _stack(path, found, part, found.files if isinstance(found, FileSet) else None)
 
 
 def _stack(
@@ -193,7 +187,7 @@ def _refusal(path: Path, signature: bytes) -> str:
     """Say what kind of file is not read, and what to do."""
     known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
     found = f"a film, {_LOSSY}; {_EXPORT}" if signature[4:] == _FILM else next(known, "")
-    needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr or a NumPy array"
+    needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr, NumPy, MATLAB, ND2 or CZI"
     if found:
         return f"{needed} but is {found}"
     return (

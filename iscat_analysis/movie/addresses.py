@@ -16,6 +16,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.reading import is_file, is_folder
 
 MARK = "::"
+_FOLDERS = (".zarr", ".iscat")  # endings of folders that say what they are
 SETUP = "iscat.toml"
 """Name of the configuration of the movies in a folder."""
 
@@ -79,5 +80,6 @@ def path_beside(address: Path, suffix: str) -> Path:
     if not path.name:
         raise DataError(f"{path}: is not a movie or a table; give the path of one")
     if not part or layout(part) is not None:
-        return path.with_suffix(suffix)
+        whole = is_folder(path) and path.suffix.lower() not in _FOLDERS  # a dot of "3.5 nM"
+        return path.with_name(path.name + suffix) if whole else path.with_suffix(suffix)
     return path.with_name(".".join([path.stem, *part.strip("/").split("/")]) + suffix)

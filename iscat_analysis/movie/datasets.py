@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
+from iscat_analysis.movie.containers import SHOWN_NAMES, name_one
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
 from iscat_analysis.movie.mapped import Writer
 from iscat_analysis.movie.refeyn import is_refeyn, open_refeyn
@@ -20,7 +21,7 @@ from iscat_analysis.records import StackMetadata
 
 _MOST_NAMES = 1000  # that are looked at
 _MOST_GROUPS = 8  # one inside the other, in which movies are looked for; named, they may be deeper
-_SHOWN = 5  # in a message
+_OF_CELLS = "#"  # begins the names of groups in which MATLAB keeps what cells refer to
 
 
 class DatasetFrames:
@@ -28,35 +29,45 @@ class DatasetFrames:
 
     metadata = StackMetadata()
 
-    def __init__(self, stored: StoredArray, reader: Hdf5Reader, notes: tuple[str, ...]) -> None:
-        self._stored, self._data = stored, reader.data
-        self.shape = (stored.shape[0], stored.shape[-2], stored.shape[-1])
+    def __init__(
+        self, stored: StoredArray, reader: Hdf5Reader, notes: tuple[str, ...], *, by_columns: bool
+    ) -> None:
+        self._stored, self._data, self._by_columns = stored, reader.data, by_columns
+        y, x = stored.shape[:-3:-1] if by_columns else stored.shape[-2:]
+        self.shape = (stored.shape[0], y, x)
         self.dtype = stored.dtype
         self.notes = notes
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
-        return np.ascontiguousarray(self._stored.read(start, stop)).reshape(-1, *self.shape[1:])
+        counts = self._stored.read(start, stop)
+        counts = counts.reshape(len(counts), *counts.shape[-2:])
+        return np.ascontiguousarray(counts.transpose(0, 2, 1) if self._by_columns else counts)
 
     def close(self) -> None:
         """Release the file."""
         self._data.close()
 
 
-def open_hdf5(path: Path, part: str) -> Frames:
-    """Open a movie in an HDF5 file."""
+def open_hdf5(path: Path, part: str, *, by_columns: bool = False) -> Frames:
+    """Open a movie in an HDF5 file, with the axes (t, y, x) or, of MATLAB, (t, x, y)."""
     with closing(Hdf5Reader(path)) as reader:
         try:
             if not part and is_refeyn(reader):
                 reader.data.close()
                 return open_refeyn(path)
             names = [part.strip("/")] if part else list(_movies(reader))
-            if len(names) != 1:
-                raise DataError(f"{path}: {_which(path, names)}")
+            if not names:
+                raise DataError(
+                    f"{path}: is an HDF5 file that holds no frames (t, y, x) and is no Refeyn "
+                    "movie; export the movie as TIFF"
+                )
+            if len(names) > 1:
+                raise name_one(path, [f"/{name}" for name in names], "datasets")
             stored = reader.array(names[0])
             if stored is None or not _is_movie(stored.shape):
                 held = "is not there" if stored is None else f"has the shape {stored.shape}"
-                others = ", ".join(f"/{name}" for name in list(_movies(reader))[:_SHOWN])
+                others = ", ".join(f"/{name}" for name in list(_movies(reader))[:SHOWN_NAMES])
                 raise DataError(
                     f"{path}{MARK}{part}: {held}; frames (t, y, x) are in: {others or 'none'}"
                 )
@@ -66,7 +77,7 @@ def open_hdf5(path: Path, part: str) -> Frames:
                     f"a program has it open to write, or ended without closing it: the "
                     f"{stored.shape[0]} frames are those that were written until now"
                 )
-            return DatasetFrames(stored, reader, tuple(notes))
+            return DatasetFrames(stored, reader, tuple(notes), by_columns=by_columns)
         except BaseException:
             reader.data.close()
             raise
@@ -81,20 +92,6 @@ def is_one_movie(path: Path) -> bool:
         return True
 
 
-def _which(path: Path, names: list[str]) -> str:
-    if not names:
-        return (
-            "is an HDF5 file that holds no frames (t, y, x) and is no Refeyn movie; export the "
-            "movie as TIFF"
-        )
-    shown = ", ".join(f"/{name}" for name in names[:_SHOWN])
-    more = ", …" if len(names) > _SHOWN else ""
-    return (
-        f"holds {len(names)} datasets of frames ({shown}{more}); name one, as in "
-        f'"{path}{MARK}/{names[0]}"'
-    )
-
-
 def _is_movie(shape: tuple[int, ...]) -> bool:
     return len(shape) >= 3 and shape[0] > 1 and 0 not in shape and set(shape[1:-2]) <= {1}
 
@@ -105,6 +102,8 @@ def _movies(reader: Hdf5Reader) -> Iterator[str]:
     while waiting and seen < _MOST_NAMES:
         group = waiting.pop(0)
         for name in reader.names(group):
+            if name.startswith(_OF_CELLS):
+                continue
             seen += 1
             whole = f"{group}/{name}" if group else name
             try:

@@ -3,43 +3,92 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import split_address
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, Writer, writer_of
+from iscat_analysis.movie.containers import holds_one, open_member
+from iscat_analysis.movie.frame_files import frames_in, holds_single_frames
+from iscat_analysis.movie.mapped import HDF5_SIGNATURE, WHAT_LIBRARIES_RAISE, Writer, writer_of
 from iscat_analysis.movie.mapped_frames import NPY_SIGNATURE, open_npy
+from iscat_analysis.movie.matlab import arrays_of_mat, is_matlab_hdf5
+from iscat_analysis.movie.microscopes import open_czi, open_nd2
+from iscat_analysis.movie.npz import arrays_of_npz
 from iscat_analysis.movie.ome import files_of_set, is_ome
+from iscat_analysis.movie.ome_zarr import is_zarr
 from iscat_analysis.movie.recorded import SUFFIXES as RECORDED
 from iscat_analysis.movie.recorded import description_of, recorded_files
 from iscat_analysis.movie.stack import Frames
-from iscat_analysis.movie.tiff import first_texts, open_tiff
+from iscat_analysis.movie.tiff import TIFF_SUFFIXES, first_texts, open_tiff
 from iscat_analysis.reading import is_file
-
-_TIFF = (".tif", ".tiff", ".btf", ".tf8", ".stk")
-_HDF5 = (".h5", ".hdf5")
-_ZARR = ".zarr"
-_REFEYN = ".mp"
 
 
 class Format(NamedTuple):
-    """A file format: its first bytes, its suffixes and the function that opens it."""
+    """A file format: its first four bytes, its suffixes, and the function that opens it.
+
+    `holds_one` tells whether a file is one movie, of a format that has room for several; `open` is
+    then given the name of one, else an empty text.
+    """
 
     signatures: tuple[bytes, ...]
     suffixes: tuple[str, ...]
-    open: Callable[[Path], Frames]
+    open: Callable[[Path, str], Frames]
+    holds_one: Callable[[Path], bool] | None = None
+
+
+def _tiff(path: Path, _: str) -> Frames:
+    return open_tiff(path)
+
+
+def _npy(path: Path, _: str) -> Frames:
+    return open_npy(path)
+
+
+def _hdf5(path: Path, part: str) -> Frames:
+    from iscat_analysis.movie.datasets import open_hdf5  # h5py takes long
+
+    return open_hdf5(path, part)
+
+
+def _one_dataset(path: Path) -> bool:
+    from iscat_analysis.movie.datasets import is_one_movie
+
+    return is_one_movie(path)
+
+
+def _matlab(path: Path, part: str) -> Frames:
+    if not is_matlab_hdf5(path):
+        return open_member(path, part, read=arrays_of_mat, kind="a MATLAB file")
+    from iscat_analysis.movie.datasets import open_hdf5
+
+    return open_hdf5(path, part, by_columns=True)
+
+
+def _one_variable(path: Path) -> bool:
+    return _one_dataset(path) if is_matlab_hdf5(path) else holds_one(path, read=arrays_of_mat)
 
 
 FORMATS = (
-    Format((b"II\x2a\x00", b"MM\x00\x2a", b"II\x2b\x00", b"MM\x00\x2b"), _TIFF, open_tiff),
-    Format((NPY_SIGNATURE[:4],), (".npy",), open_npy),
-)
-
-SUFFIXES = (
-    *(suffix for kind in FORMATS for suffix in kind.suffixes), _REFEYN, *_HDF5, _ZARR, *RECORDED,
+    Format((b"II\x2a\x00", b"MM\x00\x2a", b"II\x2b\x00", b"MM\x00\x2b"), TIFF_SUFFIXES, _tiff),
+    Format((NPY_SIGNATURE[:4],), (".npy",), _npy),
+    Format(
+        (b"PK\x03\x04",), (".npz",),
+        partial(open_member, read=arrays_of_npz, kind="a ZIP archive"),
+        partial(holds_one, read=arrays_of_npz),
+    ),
+    Format((HDF5_SIGNATURE[:4],), (".mp", ".h5", ".hdf5"), _hdf5, _one_dataset),
+    Format((b"MATL",), (".mat",), _matlab, _one_variable),
+    Format((b"\xda\xce\xbe\x0a",), (".nd2",), open_nd2),
+    Format((b"ZISR",), (".czi",), open_czi),
 )  # fmt: skip
+"""Files that are told by how they begin.  Folders, and numbers that something else describes, are
+told by `_opened` of `iscat_analysis.movie`."""
+
+_OF_SUFFIX = {suffix: kind for kind in FORMATS for suffix in kind.suffixes}
+_ZARR = ".zarr"
+SUFFIXES = (*_OF_SUFFIX, _ZARR, *RECORDED)
 """Files and folders that are taken for movies where a folder is searched for them; files of plain
 numbers only where something describes them."""
 
@@ -51,7 +100,8 @@ def files_of(address: Path) -> tuple[Path, ...]:
     """Give the files that hold a movie, without opening it."""
     path, _ = split_address(address)
     if path.is_dir():
-        return tuple(sorted(file for file in path.rglob("*") if file.is_file()))
+        inside = sorted(file for file in path.rglob("*") if file.is_file())
+        return tuple(inside) if is_zarr(path) else frames_in(path) or tuple(inside)
     return members_of(address)
 
 
@@ -63,7 +113,7 @@ def is_open_to_write(address: Path) -> bool:
 def members_of(address: Path) -> tuple[Path, ...]:
     """Give the files of a set, or the file or folder itself, which tell one movie from another."""
     path, part = split_address(address)
-    if path.suffix.lower() in _TIFF and is_file(path):
+    if path.suffix.lower() in TIFF_SUFFIXES and is_file(path):
         names = _described(path, *_state(path))
         if len(names) > 1:
             members = dict.fromkeys(path.with_name(name) if name else path for name in names)
@@ -94,16 +144,15 @@ def _described(path: Path, size: int, changed_ns: int) -> tuple[str, ...]:
 @lru_cache(maxsize=_REMEMBERED)
 def _holds_one(path: Path, size: int, changed_ns: int) -> bool:
     del size, changed_ns
-    from iscat_analysis.movie.datasets import is_one_movie  # h5py takes long
-
-    return is_one_movie(path)
+    kind = _OF_SUFFIX.get(path.suffix.lower())
+    return kind is None or kind.holds_one is None or kind.holds_one(path)
 
 
 def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
     """List the movies of a folder by their names.
 
-    A set of files is one movie, under the name of the first file that describes it, and an HDF5
-    file is one if it holds a single dataset of frames.
+    A set of files is one movie, under the name of the first file that describes it; a folder is
+    one if it holds frames in a file each; and a file with room for several if it holds only one.
     """
     found = [path for path in sorted(folder.iterdir()) if path not in but and _is_movie(path)]
     return list(_once(found))
@@ -122,13 +171,13 @@ def is_movie(address: Path) -> bool:
 
 def _is_movie(path: Path) -> bool:
     suffix = path.suffix.lower()
-    if path.name.startswith(".") or suffix not in SUFFIXES:
+    if path.name.startswith("."):
         return False
-    if suffix == _ZARR:
-        return path.is_dir()
+    if path.is_dir():
+        return suffix == _ZARR or holds_single_frames(path)
     if suffix in RECORDED:
         return description_of(path) is not None and not path.stem.endswith(_SNAPSHOT)
-    return path.is_file() and (suffix not in _HDF5 or _holds_one(path, *_state(path)))
+    return suffix in SUFFIXES and path.is_file() and _holds_one(path, *_state(path))
 
 
 def _once(paths: Sequence[Path]) -> list[Path]:

@@ -14,6 +14,7 @@ import mmap
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -142,8 +143,7 @@ class Hdf5Reader:
             self._file = h5py.File(path, "r", locking=False, swmr=swmr)
         try:
             with self._believing_nothing():
-                if self._file.userblock_size:
-                    raise DataError(f"{path}: does not begin as HDF5 does; export it again")
+                self._block = self._file.userblock_size
                 self.data = map_file(path)
         except BaseException:
             self._file.close()
@@ -312,6 +312,7 @@ class Hdf5Reader:
         if expected > len(self.data):  # a chunk is a byte at least
             raise self._incomplete(name, f"it needs {expected} chunks")
         where = np.zeros((expected, 3), np.int64)
+        shift = self._block if self._block and _chunks_count_from_user_block() else 0
         count = 0
 
         def note(info: Any) -> bool | None:
@@ -321,7 +322,7 @@ class Hdf5Reader:
             if count > expected or any(p >= g for p, g in zip(place, grid, strict=True)):
                 return True
             number = int(np.ravel_multi_index(place, grid))
-            where[number] = info.byte_offset or 0, info.size, info.filter_mask
+            where[number] = (info.byte_offset or 0) + shift, info.size, info.filter_mask
             return None
 
         dataset.id.chunk_iter(note)
@@ -340,6 +341,23 @@ class Hdf5Reader:
             f"{self._path}: {name} is incomplete ({how}); "
             "the recording or the copy was interrupted: export it again"
         )
+
+
+@lru_cache(maxsize=1)
+def _chunks_count_from_user_block() -> bool:
+    """Tell whether libhdf5 counts the places of chunks from the end of a user block.
+
+    Until version 1.14 it does, and the others not; of contiguous data none of them does.
+    """
+    mark, block = b"a chunk of bytes", 512
+    options = {"driver": "core", "backing_store": False, "userblock_size": block}
+    with h5py.File("never written", "w", **options) as file:
+        marked = np.frombuffer(mark, np.uint8)
+        file.create_dataset("a", data=marked, chunks=marked.shape)
+        file.flush()
+        place = file["a"].id.get_chunk_info(0).byte_offset
+        image = file.id.get_file_image()
+    return bool(image.find(mark) == place)  # the image begins behind the block
 
 
 def _single(dataset: h5py.Dataset) -> bool:

@@ -6,7 +6,7 @@ import math
 import tokenize
 import warnings
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
@@ -28,6 +28,7 @@ from iscat_analysis.records import InPlace, StackMetadata
 
 NPY_SIGNATURE = b"\x93NUMPY"
 
+Axes = tuple[int, int, int]
 ROWS_TOGETHER, COLUMNS_TOGETHER, FRAMES_TOGETHER = (0, 1, 2), (0, 2, 1), (2, 1, 0)
 """Which of the axes (t, y, x) is stored slowest, and which fastest: as C, MATLAB and Fortran do."""
 
@@ -38,7 +39,6 @@ class MappedFrames:
     """Frames of a file that holds only numbers, after a header."""
 
     metadata = StackMetadata()
-    notes = ()
 
     def __init__(
         self,
@@ -47,8 +47,9 @@ class MappedFrames:
         stored: np.dtype[Any],
         *,
         offset: int,
-        axes: tuple[int, int, int] = ROWS_TOGETHER,
+        axes: Axes = ROWS_TOGETHER,
         member: bool = False,
+        notes: tuple[str, ...] = (),
     ) -> None:
         if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
             raise DataError(
@@ -72,15 +73,14 @@ class MappedFrames:
         self.shape = (shape[0], shape[1], shape[2])
         self.dtype: np.dtype[Any] = stored.newbyteorder("=")
         self._stored, self._offset, self._axes = stored, offset, axes
+        self.notes = notes
 
     def read(self, start: int, stop: int) -> NDArray[Any]:
         """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
         refuse_changed(self._path, self._data)
-        lying = tuple(self.shape[axis] for axis in self._axes)
-        whole = np.ndarray(lying, self._stored, buffer=self._data, offset=self._offset)
-        frames = whole.transpose(np.argsort(self._axes))[start:stop]
-        block = np.array(frames, dtype=self.dtype, order="C")
-        del whole, frames
+        frames = as_frames(self._data, self.shape, self._stored, self._axes, self._offset)
+        block = np.array(frames[start:stop], dtype=self.dtype, order="C")
+        del frames
         if self._axes[0] == 0:
             release(self._data, self._begin(start), self._begin(stop))
         return block
@@ -103,11 +103,21 @@ class MappedFrames:
 def open_npy(path: Path) -> MappedFrames:
     """Open an array that NumPy saved."""
     with open_regular(path) as file:
-        return mapped_array(file, path)
+        header = read_header(file, path)
+    return MappedFrames(path, *header[:2], offset=header.offset, axes=header.axes)
 
 
-def mapped_array(file: BinaryIO, path: Path) -> MappedFrames:
-    """Map an array whose header begins where a file stands."""
+class Header(NamedTuple):
+    """What comes before the numbers of an array that NumPy saved."""
+
+    shape: tuple[int, ...]
+    stored: np.dtype[Any]
+    axes: Axes
+    offset: int
+
+
+def read_header(file: IO[bytes], path: Path) -> Header:
+    """Read what comes before the numbers of an array, and not more."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
@@ -118,8 +128,15 @@ def mapped_array(file: BinaryIO, path: Path) -> MappedFrames:
         raise DataError(
             f"{path}: begins like a NumPy array but is damaged ({first_line(error)}); save it again"
         ) from None
-    axes = FRAMES_TOGETHER if last_first else ROWS_TOGETHER
-    return MappedFrames(path, shape, stored, offset=offset, axes=axes)
+    return Header(shape, stored, FRAMES_TOGETHER if last_first else ROWS_TOGETHER, offset)
+
+
+def as_frames(
+    data: Any, shape: tuple[int, ...], stored: np.dtype[Any], axes: Axes, offset: int = 0
+) -> NDArray[Any]:
+    """Take bytes for frames (t, y, x)."""
+    lying = tuple(shape[axis] for axis in axes)
+    return np.ndarray(lying, stored, buffer=data, offset=offset).transpose(np.argsort(axes))
 
 
 def open_raw(path: Path, part: str) -> MappedFrames:

@@ -21,6 +21,7 @@ from iscat_analysis.movie.descriptions import (
     positive,
 )
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.microscopes import needed_package
 from iscat_analysis.movie.stack import ArrayFrames
 from iscat_analysis.reading import first_line, is_file
 from iscat_analysis.records import StackMetadata
@@ -35,13 +36,7 @@ def is_zarr(folder: Path) -> bool:
 
 def open_zarr(folder: Path, part: str) -> ArrayFrames:
     """Open a movie in a Zarr folder."""
-    try:
-        import zarr
-    except ImportError:
-        raise DataError(
-            f"{folder}: reading Zarr takes the package zarr, which is not installed; install it "
-            'with: pip install "iscat-analysis[zarr]"'
-        ) from None
+    zarr = needed_package("zarr", "zarr", "Zarr", folder)
     from iscat_analysis.movie.zarr_folder import CheckedArray, CheckedStore
 
     name = f"{folder}{MARK}{part}" if part else str(folder)

@@ -44,6 +44,8 @@ def _beside(movie: Path) -> Iterator[Path]:
     names = [f"{stem}{end}" for stem in stems for end in _ENDS]
     if movie.stem == "frames":  # as PyLabLib calls a movie that has a folder of its own
         names.append("settings.dat")
+    if is_file(movie / "metadata.txt"):  # of a folder of frames, as Micro-Manager writes it
+        yield movie / "metadata.txt"
     for name in dict.fromkeys(names):
         path = movie.with_name(name)
         if name != movie.name and is_file(path):

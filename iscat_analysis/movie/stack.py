@@ -73,9 +73,13 @@ class ArrayLike(Protocol):
 class ArrayFrames:
     """The frames of an array; `iscat_analysis.movie.open_stack` makes it."""
 
-    notes = ()
-
-    def __init__(self, array: ArrayLike, name: str, metadata: StackMetadata) -> None:
+    def __init__(
+        self,
+        array: ArrayLike,
+        name: str,
+        metadata: StackMetadata,
+        notes: tuple[str, ...] = (),
+    ) -> None:
         shape = tuple(int(n) for n in array.shape)
         stored = np.dtype(array.dtype)
         if len(shape) != 3 or 0 in shape or stored.kind not in "uif":
@@ -91,7 +95,7 @@ class ArrayFrames:
         self._array = array
         self.shape = (shape[0], shape[1], shape[2])
         self.dtype = stored.newbyteorder("=")
-        self.metadata = metadata
+        self.metadata, self.notes = metadata, notes
         self._slabs = Slabs(self._decoded, self.shape, self.dtype, getattr(array, "depth", 1))
 
     def read(self, start: int, stop: int) -> NDArray[Any]:

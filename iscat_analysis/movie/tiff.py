@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, overload
 
 import numpy as np
 import tifffile
@@ -70,6 +70,9 @@ from iscat_analysis.movie.tiff_checks import (
 from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
 from iscat_analysis.records import InPlace, StackMetadata
 
+TIFF_SUFFIXES = (".tif", ".tiff", ".btf", ".tf8", ".stk")
+"""Of files that are taken for TIFF movies where a folder is searched for them."""
+
 _DESCRIPTION, _MICRO_MANAGER = 270, 51123
 _METAMORPH, _METAMORPH_PLANES = 33628, 33629  # UIC1Tag and UIC2Tag
 _ESSENTIAL = {
@@ -101,7 +104,7 @@ class TiffFrames:
     ) -> None:
         self._data = data
         self._path = path
-        self._stored_dtype = dtype
+        self.stored = dtype
         self._images = images
         self._decode = decode
         rows, columns = images[0].shape
@@ -124,12 +127,17 @@ class TiffFrames:
             return block
         for number, first in enumerate(self._starts[start:stop]):
             block[number] = np.ndarray(
-                self.shape[1:], self._stored_dtype, buffer=self._data, offset=int(first)
+                self.shape[1:], self.stored, buffer=self._data, offset=int(first)
             )
         if start < stop:
             used = self._starts[start:stop]
             release(self._data, int(used.min()), int(used.max()))
         return block
+
+    @property
+    def place(self) -> int | None:
+        """First byte of the first frame; None where it is compressed."""
+        return None if self._starts is None else int(self._starts[0])
 
     def in_place(self, start: int, stop: int) -> InPlace | None:
         """Give frames where they lie in the file."""
@@ -140,7 +148,7 @@ class TiffFrames:
         if np.any(np.diff(self._starts[start:stop]) != size):
             return None
         first = int(self._starts[start])
-        return frames_in_place(self._path, self._data, first, shape, self._stored_dtype)
+        return frames_in_place(self._path, self._data, first, shape, self.stored)
 
     def close(self) -> None:
         """Release the file."""
@@ -178,6 +186,10 @@ class TiffFrames:
                 ) from None
 
 
+@overload
+def open_tiff(path: Path) -> TiffFrames | FileSet: ...
+@overload
+def open_tiff(path: Path, *, member: Literal[True]) -> TiffFrames: ...
 def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
     """Open a TIFF movie."""
     data = map_file(path)
@@ -194,6 +206,28 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
             f"{path}: is truncated or damaged ({_first_line(error)}; it is {size} bytes long); "
             "copy it again or export it again"
         ) from None
+
+
+@contextmanager
+def open_frame_file(path: Path) -> Iterator[TiffFrames]:
+    """Open a file that may hold a single frame, for a moment."""
+    frames = open_tiff(path, member=True)
+    try:
+        yield frames
+    finally:
+        frames.close()
+
+
+def is_single_image(path: Path) -> bool:
+    """Tell whether a file holds one image, and describes no set of files."""
+    try:
+        with _unheard(), tifffile.TiffFile(path, **_PLAIN) as file:
+            page = file.pages[0]
+            texts = [_text(tag.value) for tag in page.tags.getall(_DESCRIPTION, ())]
+            joined = any(is_ome(text) and "FileName" in text for text in texts)
+            return len(file.pages) == 1 and _planes(page) == 1 and not joined
+    except WHAT_LIBRARIES_RAISE:  # whoever opens it says what is wrong with it
+        return False
 
 
 def first_texts(path: Path) -> tuple[str, ...]:
