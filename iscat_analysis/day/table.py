@@ -19,8 +19,8 @@ from iscat_analysis.calibration.mass import STANDARD_ERROR
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie.addresses import MARK, path_beside, split_address
-from iscat_analysis.movie.folders import SUFFIXES, find_movies, members_of
-from iscat_analysis.movie.ome_zarr import is_zarr
+from iscat_analysis.movie.folders import SUFFIXES, find_movies, is_movie_folder, members_of
+from iscat_analysis.movie.frame_files import holds_single_frames
 from iscat_analysis.movie.text_tables import read_table_text, table_lines
 from iscat_analysis.reading import is_file, is_folder, read_text, toml_of
 from iscat_analysis.text import printable
@@ -78,6 +78,11 @@ class Table:
 def read_table(source: Path) -> Table:
     """Read the table of a day."""
     if is_folder(source):
+        if holds_single_frames(source):
+            raise ConfigError(
+                f"{source}: is one movie, with a frame in each file; analyse it by `iscat fit`, or "
+                "give the folder that it is in"
+            )
         found = find_movies(source)
         if not found:
             raise ConfigError(
@@ -156,7 +161,7 @@ def _address(given: str, root: Path) -> Path:
 
 def _is_there(address: Path) -> bool:
     path, _ = split_address(address)
-    return is_file(path) or (is_folder(path) and (path.suffix.lower() == ".zarr" or is_zarr(path)))
+    return is_file(path) or (is_folder(path) and is_movie_folder(path))
 
 
 def read_standards(text: str | Sequence[float]) -> tuple[tuple[float, float], ...]:

@@ -158,6 +158,12 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
     return list(_once(found))
 
 
+def is_movie_folder(folder: Path) -> bool:
+    """Tell whether a folder is a movie for whoever names it as one."""
+    zarr = folder.suffix.lower() == _ZARR or is_zarr(folder)
+    return zarr or holds_single_frames(folder, fewest=2)
+
+
 def is_movie(address: Path) -> bool:
     """Tell whether an address names a movie, and not a folder that may hold some.
 
@@ -165,8 +171,9 @@ def is_movie(address: Path) -> bool:
     """
     path, part = split_address(address)
     suffix = path.suffix.lower()
-    named = suffix == _ZARR or (suffix in SUFFIXES and not path.is_dir())
-    return bool(part) or named or path.is_file()
+    if path.is_dir():
+        return bool(part) or suffix == _ZARR or holds_single_frames(path)
+    return bool(part) or suffix in SUFFIXES or path.is_file()
 
 
 def _is_movie(path: Path) -> bool:

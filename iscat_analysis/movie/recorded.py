@@ -108,7 +108,7 @@ def _counted(
         )
     try:
         stored = np.dtype(name)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, SyntaxError):
         raise DataError(f"{settings}: save/frame/dtype = {name} is no type of numbers") from None
     rows, columns = int(shape[1]), int(shape[2])
     frame = rows * columns * stored.itemsize

@@ -14,10 +14,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pandas as pd
+import scipy.io
 import tifffile
 import zarr
 from hardening.samples import samples
-from tiff_files import movie
+from tiff_files import movie, write_stk
 
 from iscat_analysis import find_species, fit_kd, open_result
 from iscat_analysis.answers.calibrations import read_contrasts
@@ -44,6 +45,15 @@ def seeds(folder: Path) -> dict[str, list[Seed]]:
     found["zarr"] = [_zarr(folder / f"{k}.zarr", **options) for k, options in enumerate(_LAYOUTS)]
     found["dataset"] = [_dataset(folder / "sample", **options) for options in _DATASETS]
     found["set"] = [_ome_set()]
+    found["tiff"].append({"input": write_stk(folder / "m", _FRAMES, um_per_px=0.08).read_bytes()})
+    found["npy"] += [
+        {"input": _saved(save, movie=array, times=np.arange(3.0))}
+        for save in (np.savez, np.savez_compressed)
+        for array in (_FRAMES, np.asfortranarray(_FRAMES.astype("f4")))
+    ]
+    found["dataset"] += [{"input": _mat(packed)} for packed in (False, True)]
+    found["dataset"] += [{"input": _mat_hdf5(folder / "m", **options)} for options in _DATASETS]
+    found["frames"] = [_frame_files()]
     settings = "save/frame/shape\t(12, 14)\nsave/frame/dtype\t<u2\nsave/saved\t6\n"
     raw = _FRAMES.astype("<u2").tobytes()
     found["raw"] = [{"movie.bin": raw, "movie_settings.dat": settings.encode()}]
@@ -64,6 +74,34 @@ def _npy(array: np.ndarray[Any, Any]) -> bytes:
     out = io.BytesIO()
     np.save(out, array)
     return out.getvalue()
+
+
+def _saved(save: Callable[..., None], **arrays: Any) -> bytes:
+    out = io.BytesIO()
+    save(out, **arrays)
+    return out.getvalue()
+
+
+def _mat(packed: bool) -> bytes:
+    out = io.BytesIO()
+    held = {"movie": _FRAMES.transpose(1, 2, 0), "setup": {"a": 1}, "text": "of Monday"}
+    scipy.io.savemat(out, held, do_compression=packed)
+    return out.getvalue()
+
+
+def _mat_hdf5(path: Path, **options: Any) -> bytes:
+    with h5py.File(path, "w", userblock_size=512) as file:
+        file.create_dataset("movie", data=_FRAMES, **options)
+    return b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM" + path.read_bytes()[128:]
+
+
+def _frame_files() -> Seed:
+    files = {}
+    for number, frame in enumerate(_FRAMES):
+        out = io.BytesIO()
+        tifffile.imwrite(out, frame, compression="zlib" if number % 2 else None)
+        files[f"a/frame{number}.tif"] = out.getvalue()
+    return files
 
 
 _LAYOUTS: tuple[dict[str, Any], ...] = (
@@ -230,6 +268,7 @@ READERS: dict[str, Reader] = {
     "zarr": _zarr_folder,
     "dataset": _frames,
     "set": _frames,
+    "frames": lambda path: _frames(path.parent),
     "raw": _frames,
     "toml": load_config,
     "table": lambda path: find_species(

@@ -70,11 +70,14 @@ def test_a_movie_that_is_replaced_while_it_is_being_opened_is_refused(
     tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
     readers = dict(iscat_analysis.movie.READERS)
 
-    def late(path: Path) -> object:
-        frames = readers[b"II\x2a\x00"](path)
+    tiff = readers[b"II\x2a\x00"]
+
+    def late(path: Path, part: str) -> object:
+        frames = tiff.open(path, part)
         other.replace(path)
         return frames
 
-    monkeypatch.setattr(iscat_analysis.movie, "READERS", {**readers, b"II\x2a\x00": late})
+    slow = {b"II\x2a\x00": tiff._replace(open=late)}
+    monkeypatch.setattr(iscat_analysis.movie, "READERS", {**readers, **slow})
     with pytest.raises(DataError, match="was replaced"):
         ia.open_stack(file)

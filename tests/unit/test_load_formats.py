@@ -374,19 +374,9 @@ def test_films_are_refused_because_they_keep_no_counts(
     refused(tmp_path / "movie.tif", said, "keeps no counts")
 
 
-def test_files_of_microscopes_are_named(tmp_path: Path) -> None:
-    (tmp_path / "a.nd2").write_bytes(b"\xda\xce\xbe\x0a" + bytes(20))
-    refused(tmp_path / "a.nd2", "Nikon ND2", "OME-TIFF", "fit_movie")
-    (tmp_path / "a.czi").write_bytes(b"ZISRAWFILE" + bytes(20))
-    refused(tmp_path / "a.czi", "Zeiss CZI", "OME-TIFF")
-    for name in ("a.nd2", "a.czi"):
-        with pytest.raises(DataError, match=r"to fit_movie$"):  # one remedy, not two
-            open_stack(tmp_path / name)
-
-
-def test_of_a_folder_of_frames_it_is_said_what_to_do(tmp_path: Path) -> None:
+def test_of_a_folder_that_is_no_movie_it_is_said_what_to_do(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "frame_0.tif", COUNTS[0])
-    refused(tmp_path, "is a folder", "Image Sequence", "iscat batch")
+    refused(tmp_path, "is a folder", "a frame each", "iscat batch")
 
 
 # ---- TIFF in several files -------------------------------------------------------------------
