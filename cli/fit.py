@@ -54,7 +54,8 @@ def fit(
         list[Path],
         typer.Argument(
             metavar="STACK",
-            help="The movie: TIFF of any kind, Refeyn .mp, HDF5 (FILE::/DATASET), Zarr, .npy.",
+            help="The movie: TIFF of any kind or a folder of them, Refeyn .mp, HDF5 "
+            "(FILE::/DATASET), Zarr, .npy, .npz, .mat (FILE::NAME), ND2, CZI.",
         ),
     ],
     *,

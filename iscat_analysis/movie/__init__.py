@@ -57,13 +57,16 @@ def open_stack(
 ) -> Stack:
     """Open a movie without reading its pixels.
 
-    TIFF, BigTIFF, OME-TIFF, ImageJ and Micro-Manager stacks are read; strips or tiles;
-    uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA.  So are Refeyn's ``.mp`` movies, of
-    OneMP and TwoMP, compressed or not; datasets of HDF5 files, as ``"day.h5::/run 3/movie"``;
-    images and arrays of Zarr folders, OME-Zarr among them; ``.npy`` files; files of plain numbers
-    with the settings of PyLabLib beside them, with their shape in the name as PiSCAT's have it, or
-    as ``"movie.bin::1500x128x128,uint16"``; and arrays: of NumPy, memory-mapped or not, of Dask,
-    Zarr or h5py, or whatever has a shape and a dtype and can be sliced.
+    TIFF, BigTIFF, OME-TIFF, ImageJ, Micro-Manager and MetaMorph stacks are read; strips or tiles;
+    uncompressed, LZW, Deflate, Zstandard, PackBits or LZMA; also a folder of files with a frame
+    each.  So are Refeyn's ``.mp`` movies, of OneMP and TwoMP, compressed or not; datasets of HDF5
+    files, as ``"day.h5::/run 3/movie"``; images and arrays of Zarr folders, OME-Zarr among them;
+    ``.npy`` files; arrays of ``.npz`` and MATLAB's ``.mat`` files, as ``"day.mat::movie"``; ND2 and
+    CZI, if the packages nd2 and pylibCZIrw are installed; files of plain numbers with the settings
+    of PyLabLib beside them, with their shape in the name as PiSCAT's have it, or as
+    ``"movie.bin::1500x128x128,uint16"``, also ``">u2"``, ``"…,header=344"`` and
+    ``"…,order=columns"``; and arrays: of NumPy, memory-mapped or not, of Dask, Zarr or h5py, or
+    whatever has a shape and a dtype and can be sliced.
 
     Parameters
     ----------

@@ -61,6 +61,7 @@ _STRAIGHT_LINE = "0"  # number of ImageJ's calibration function c0 + c1·stored
 _ELECTRONS = {"e", "e-", "electron", "electrons", "photoelectron", "photoelectrons"}
 _ESCAPED = re.compile(r"\\u([0-9a-fA-F]{4})")
 _RATE_TOLERANCE = 0.01  # relative, between the interval that was set and the times of frames
+_LATE = 0.5  # intervals by which the first or the last frame of a short movie may have come late
 _COUNTS = {"", "gray value", "gray values", "count", "counts", "adu", "dn"}
 _MOST_DIGITS = 20  # any count of more digits is beyond every file, and stays so when cut
 _RESOLUTION_UNIT_NM = {2: LENGTH_NM["inch"], 3: LENGTH_NM["cm"]}
@@ -242,18 +243,25 @@ def out_of_order(order: Sequence[int]) -> str:
 
 
 def chosen_rate(
-    own: float | None, nominal: float | None, names: str
+    clock: tuple[float | None, tuple[int, ...] | None],
+    frames: int,
+    nominal: float | None,
+    names: tuple[str, str],
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Prefer the rate [Hz] by the times of frames to that by an interval that was set.
+    """Choose between the rate [Hz] by an interval that was set and that by the times of frames.
+
+    Where they agree, the interval is more exact; where they do not, it is not that of the frames.
 
     Returns the rate, and what a user should know of a disagreement.
     """
-    if own is None or nominal is None or abs(own / nominal - 1) <= _RATE_TOLERANCE:
-        return own or nominal, ()
-    interval, times = names.split(" and ")
+    own, ticks = clock
+    intervals = (ticks[-1] if ticks else frames - 1) or 1
+    tolerance = max(_RATE_TOLERANCE, _LATE / intervals)
+    if own is None or nominal is None or abs(own / nominal - 1) <= tolerance:
+        return nominal or own, ()
     return own, (
-        f"the frame rate is {own:.4g} Hz, by the times of the frames ({times}) in the file, and "
-        f"not {nominal:.4g} Hz, by its {interval}; if that is wrong, set camera.frame_rate_hz",
+        f"the frame rate is {own:.4g} Hz, by the times of the frames ({names[1]}) in the file, and "
+        f"not {nominal:.4g} Hz, by its {names[0]}; if that is wrong, set camera.frame_rate_hz",
     )
 
 
@@ -268,16 +276,16 @@ def micro_manager_hints(
 
     pixel = positive(find("PixelSizeUm"), 1e3)
     exposure = find("Exposure-ms")
-    own, ticks = measure_clock({k: t / 1e3 for k, t in enumerate(times_ms) if t is not None})
+    clock = measure_clock({k: t / 1e3 for k, t in enumerate(times_ms) if t is not None})
     interval = find("Interval_ms")
     if interval is not None and exposure is not None and interval < exposure:  # as fast as can be
         interval = None
     nominal = None if interval is None else positive(1e3 / interval)
-    rate, notes = chosen_rate(own, nominal, "Interval_ms and ElapsedTime-ms")
+    rate, notes = chosen_rate(clock, len(times_ms), nominal, ("Interval_ms", "ElapsedTime-ms"))
     told = told_by(begin)
     return Hints(
         "micromanager", pixel, pixel, exposure_ms=exposure,
-        frame_rate_hz=rate or told.frame_rate_hz, ticks=ticks,
+        frame_rate_hz=rate or told.frame_rate_hz, ticks=clock[1],
         gain_e_per_adu=told.gain_e_per_adu, offset_adu=told.offset_adu, binning=told.binning,
         notes=notes,
     )  # fmt: skip

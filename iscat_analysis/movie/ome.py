@@ -264,8 +264,10 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
     )
     increment_unit = _factor(pixels, "TimeIncrementUnit", "s", TIME_S)
     increment = positive(pixels.get("TimeIncrement"), increment_unit) if increment_unit else None
-    own, ticks = measure_clock(_times_s(planes, f"The{axis}"))
-    rate, notes = chosen_rate(own, inverse(increment), "TimeIncrement and DeltaT")
+    times = _times_s(planes, f"The{axis}")
+    clock = measure_clock(times)
+    names = "TimeIncrement", "DeltaT"
+    rate, notes = chosen_rate(clock, max(times, default=0) + 1, inverse(increment), names)
     told = told_by(_annotations(root))  # what other programs knew, and the schema has no place for
     exposure = next((value for value in exposures if value is not None), None)
     objective = _objective(root, pixels)
@@ -276,7 +278,7 @@ def _hints(root: ElementTree.Element, pixels: ElementTree.Element, axis: str) ->
         pixel_y_nm=_length(pixels, "PhysicalSizeY"),
         exposure_ms=exposure or told.exposure_ms,
         frame_rate_hz=rate or told.frame_rate_hz,
-        ticks=ticks,
+        ticks=clock[1],
         gain_e_per_adu=told.gain_e_per_adu,
         offset_adu=told.offset_adu,
         wavelength_nm=_wavelength_nm(pixels),

@@ -411,10 +411,13 @@ def _described(image: Image, path: Path) -> Described | None:
 
 def _start(page: tifffile.TiffPage) -> int | None:
     """First byte of pixels that lie in the file as they are."""
-    strips = itertools.pairwise(zip(page.dataoffsets, page.databytecounts, strict=True))
-    if page.is_final and all(start + size == after for (start, size), (after, _) in strips):
-        return int(page.dataoffsets[0])
-    return None
+    if not page.is_final:
+        return None
+    if page.is_stk:  # whose strips tifffile takes for contiguous, whatever the file says
+        strips = itertools.pairwise(zip(page.dataoffsets, page.databytecounts, strict=True))
+        if any(start + size != after for (start, size), (after, _) in strips):
+            return None
+    return int(page.dataoffsets[0])
 
 
 def _planes(page: tifffile.TiffPage) -> int:
