@@ -145,7 +145,7 @@ def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
     if is_folder:
         if is_zarr(path):
             return _stack(path, open_zarr(path, part), part, files_of(path))
-        if holds_single_frames(path, fewest=2):
+        if holds_single_frames(path, named=True):
             frames = FrameFiles(path)
             return _stack(path, frames, files=frames.files)
         raise DataError(

@@ -14,7 +14,7 @@ import numpy as np
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, refuse_growth
 from iscat_analysis.movie.mapped_frames import Axes, MappedFrames, as_frames
 from iscat_analysis.movie.stack import ArrayFrames, Frames
 from iscat_analysis.reading import first_line, open_regular
@@ -23,9 +23,6 @@ from iscat_analysis.scratch import Scratch
 
 SHOWN_NAMES = 5
 """Names of arrays in a message."""
-
-_MOST_UNPACKED_RATIO = 2000  # unpacked over packed; Deflate reaches 1032, on constant images only
-_HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
 
 
 @dataclass(frozen=True)
@@ -136,11 +133,7 @@ def _frames(member: Member, name: str, path: Path, notes: tuple[str, ...]) -> Fr
                 "the file again or save it again"
             )
         return MappedFrames(path, shape, stored, offset=member.place, axes=axes, notes=notes)
-    if member.nbytes > max(_HARMLESS_BYTES, _MOST_UNPACKED_RATIO * member.size):
-        raise DataError(
-            f"{name}: would grow from {member.size} to {member.nbytes} bytes, which no recording "
-            "does; the file is damaged, save it again"
-        )
+    refuse_growth(member.nbytes, member.size, f"{name}: it")
     assert member.unpack is not None
     room = Scratch((member.nbytes,), np.dtype(np.uint8)).array
     with member.unpack() as packed:

@@ -161,7 +161,7 @@ def find_movies(folder: Path, *, but: Collection[Path] = ()) -> list[Path]:
 def is_movie_folder(folder: Path) -> bool:
     """Tell whether a folder is a movie for whoever names it as one."""
     zarr = folder.suffix.lower() == _ZARR or is_zarr(folder)
-    return zarr or holds_single_frames(folder, fewest=2)
+    return zarr or holds_single_frames(folder, named=True)
 
 
 def is_movie(address: Path) -> bool:

@@ -29,12 +29,16 @@ def frames_in(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(shown, key=lambda path: (_numbers(path), path.name)))
 
 
-def holds_single_frames(folder: Path, fewest: int = _FEWEST_FOUND) -> bool:
-    """Tell whether a folder is a movie: TIFF files of one image each, whose numbers alone vary."""
+def holds_single_frames(folder: Path, *, named: bool = False) -> bool:
+    """Tell whether a folder is a movie of TIFF files with one image each.
+
+    Unless somebody names it as a movie, it must have many files, whose numbers alone differ.
+    """
     files = frames_in(folder)
-    if len(files) < fewest or (fewest == _FEWEST_FOUND and len({*map(_pattern, files)}) > 1):
+    if len(files) < (2 if named else _FEWEST_FOUND):
         return False
-    return is_single_image(files[0]) and is_single_image(files[-1])
+    alike = named or len({*map(_pattern, files)}) == 1
+    return alike and is_single_image(files[0]) and is_single_image(files[-1])
 
 
 class FrameFiles:

@@ -29,14 +29,13 @@ from iscat_analysis.movie.mapped import (
     Writer,
     map_file,
     refuse_changed,
+    refuse_growth,
     writer_of,
 )
 from iscat_analysis.movie.slabs import Slabs
 
 _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096
-_MOST_DECODED_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
-_HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
 _HEAP = struct.Struct("<4s4xQ")  # signature, version, size of the whole
 _HEAP_OBJECT = struct.Struct("<H6xQ")  # index, then references and reserved bytes, size
 
@@ -265,11 +264,7 @@ class Hdf5Reader:
         if not (plain and shape and dataset.id.get_type().equal(h5py.h5t.py_create(dtype))):
             raise self._no_numbers(dataset, name)
         total = math.prod(shape) * dtype.itemsize
-        if total > max(_HARMLESS_BYTES, _MOST_DECODED_RATIO * len(self.data)):
-            raise DataError(
-                f"{self._path}: {name} would grow from a file of {len(self.data)} to {total} "
-                "bytes, which no recording does; the file is damaged, export it again"
-            )
+        refuse_growth(total, len(self.data), f"{self._path}: {name}")
         filters: tuple[int, ...] = ()
         chunk = tuple(max(1, n) for n in shape)
         if total == 0:

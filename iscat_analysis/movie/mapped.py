@@ -27,6 +27,8 @@ WHAT_LIBRARIES_RAISE = (
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """How HDF5 files begin."""
 
+_MOST_DECODED_RATIO = 2000  # decoded over stored; Deflate reaches 1032, on constant images only
+_HARMLESS_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
 _MAPPED_ALONG = 2**16
 _WRITE_ACCESS, _READERS_ALLOWED = 1, 4  # bits of the flags in a superblock
 
@@ -107,6 +109,15 @@ def refuse_changed(path: Path, data: mmap.mmap) -> None:
         raise DataError(
             f"{path}: shrank from {len(data)} to {size} bytes while it was open; "
             "wait until it is written, then start again"
+        )
+
+
+def refuse_growth(size: int, stored: int, what: str, *, ratio: int = _MOST_DECODED_RATIO) -> None:
+    """Refuse what decodes to far more than it was stored in."""
+    if size > max(_HARMLESS_BYTES, ratio * stored):
+        raise DataError(
+            f"{what} would grow from {stored} to {size} bytes, which no recording does; the file "
+            "is damaged, export it again"
         )
 
 

@@ -27,7 +27,7 @@ from iscat_analysis.movie.descriptions import (
     positive,
     time_axis,
 )
-from iscat_analysis.movie.tiff_checks import MOST_DECODED_RATIO, refuse_growth
+from iscat_analysis.movie.mapped import refuse_growth
 from iscat_analysis.reading import first_line
 
 _CZI_TYPES = {"Gray8": "u1", "Gray16": "u2", "Gray32": "u4", "Gray32Float": "f4"}
@@ -53,7 +53,7 @@ class ReaderFrames:
                 "frames before and after a particle binds"
             )
         size = math.prod(shape) * dtype.itemsize
-        refuse_growth(size, path.stat().st_size, MOST_DECODED_RATIO, "it", path)
+        refuse_growth(size, path.stat().st_size, f"{path}: it")
         self._path, self._frame, self._close = path, frame, close
         self.shape, self.dtype = shape, dtype.newbyteorder("=")
         self.metadata = merge([hints], path)

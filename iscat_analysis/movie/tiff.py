@@ -47,12 +47,12 @@ from iscat_analysis.movie.mapped import (
     frames_in_place,
     map_file,
     refuse_changed,
+    refuse_growth,
     release,
     unmap,
 )
 from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
 from iscat_analysis.movie.tiff_checks import (
-    MOST_DECODED_RATIO,
     MOST_FRAME_DECODED_RATIO,
     STRIP_OFFSETS,
     STRIP_SIZES,
@@ -62,7 +62,6 @@ from iscat_analysis.movie.tiff_checks import (
     damaged,
     pixel_type,
     refuse_differences,
-    refuse_growth,
     refuse_overlap,
     refuse_unread_pixels,
     refuse_volumes,
@@ -274,9 +273,10 @@ def _open(
     size = math.prod(frames[0].shape) * dtype.itemsize
     for number, image in enumerate(frames):
         if image.start is None:
-            refuse_growth(size, sum(image.sizes), MOST_FRAME_DECODED_RATIO, f"image {number}", path)
+            what, ratio = f"{path}: image {number}", MOST_FRAME_DECODED_RATIO
+            refuse_growth(size, sum(image.sizes), what, ratio=ratio)
     if frames[0].start is None:
-        refuse_growth(n_frames * size, len(data), MOST_DECODED_RATIO, "it", path)
+        refuse_growth(n_frames * size, len(data), f"{path}: it")
 
     if _MICRO_MANAGER in first.tags:
         summary = _micro_manager_summary(path)

@@ -21,13 +21,9 @@ _LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
 """No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
 
 _LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
-MOST_DECODED_RATIO = 2000
-"""Of a movie, decoded over stored; Deflate reaches 1032, on constant images only."""
-
 MOST_FRAME_DECODED_RATIO = 100
-"""The same of one frame, which is held in memory whole."""
+"""Of one frame, which is held in memory whole, decoded over stored."""
 
-_HARMLESS_BYTES = 64_000_000  # smaller than this, anything is harmless whatever its ratio
 _OVERLAP = 2  # values of tags over the size of the file; each lies in it once
 _OVERLAP_BYTES = 1_000_000
 
@@ -135,15 +131,6 @@ def refuse_differences(frames: Sequence[Image], path: Path) -> None:
                 f"{path}: its frames differ: image {number} is {what}; "
                 "export the frames of one movie to a file of their own"
             )
-
-
-def refuse_growth(size: int, stored: int, ratio: int, what: str, path: Path) -> None:
-    """Refuse what decodes to far more than it was stored in."""
-    if size > max(_HARMLESS_BYTES, ratio * stored):
-        raise DataError(
-            f"{path}: {what} would grow from {stored} to {size} bytes, which no recording does; "
-            "the file is damaged, export it again"
-        )
 
 
 def damaged(path: Path, how: str) -> DataError:

@@ -21,13 +21,11 @@ from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import LocalStore
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, refuse_growth
 from iscat_analysis.reading import LARGEST_TEXT_BYTES, first_line
 
 _TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
 _LARGEST_CHUNK_BYTES = 2**28
-_MOST_DECODED_RATIO = 2000  # decoded over stored
-_HARMLESS_BYTES = 64_000_000  # an array smaller than this is harmless whatever its ratio
 _GROWTH = 2  # of a chunk that a codec cannot compress, at most; and room for its header
 _HEADER_BYTES = 65_536
 _NOTHING = 2**64 - 1  # in the index of a shard, of a chunk that was not written
@@ -124,11 +122,7 @@ def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, 
             f"{name}: is stored in chunks of {chunk}, too large to be decoded one at a time; save "
             "it with smaller chunks"
         )
-    if size > max(_HARMLESS_BYTES, _MOST_DECODED_RATIO * held):
-        raise DataError(
-            f"{name}: would grow from {held} to {size} bytes, which no recording does; the file is "
-            "damaged, export it again"
-        )
+    refuse_growth(size, held, f"{name}: it")
     stored = array.shards or chunk
     grid = [-(-n // c) for n, c in zip(shape, stored, strict=True)]
     prefix = f"{array.path}/" if array.path else ""
