@@ -39,17 +39,17 @@ class Member:
         Which of the three axes is stored slowest, and which fastest.
     size : int
         Bytes in the file.
-    place : int or None
-        First byte in the file; None where the array is compressed.
+    place : int
+        First byte in the file, where the array is not compressed.
     unpack : callable or None
-        Opens the compressed bytes at the first number, as a stream with `readinto`.
+        Opens the bytes of a compressed array, as a stream with `readinto`.
     """
 
     shape: tuple[int, ...]
     stored: np.dtype[Any]
     axes: Axes
     size: int
-    place: int | None = None
+    place: int = 0
     unpack: Callable[[], Any] | None = None
 
     @property
@@ -126,7 +126,7 @@ def _chosen(path: Path, part: str, members: Mapping[str, Member | str]) -> tuple
 
 def _frames(member: Member, name: str, path: Path, notes: tuple[str, ...]) -> Frames:
     shape, stored, axes = member.shape, member.stored, member.axes
-    if member.place is not None:
+    if member.unpack is None:
         if member.nbytes > member.size:
             raise DataError(
                 f"{name}: is truncated ({member.size} of {member.nbytes} bytes are there); copy "
@@ -134,7 +134,6 @@ def _frames(member: Member, name: str, path: Path, notes: tuple[str, ...]) -> Fr
             )
         return MappedFrames(path, shape, stored, offset=member.place, axes=axes, notes=notes)
     refuse_growth(member.nbytes, member.size, f"{name}: it")
-    assert member.unpack is not None
     room = Scratch((member.nbytes,), np.dtype(np.uint8)).array
     with member.unpack() as packed:
         filled, view = 0, room.data

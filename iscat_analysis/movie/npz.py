@@ -40,7 +40,6 @@ def _held(
         return "holds Python objects, which are not read"
     if header.stored.kind not in "uif" or not is_movie(header.shape):
         return f"holds {header.stored} of shape {header.shape}"
-    place = None
     if info.compress_type == zipfile.ZIP_STORED:
         file.seek(info.header_offset)
         lengths = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, cast
 
 import numpy as np
 import tifffile
@@ -185,10 +185,6 @@ class TiffFrames:
                 ) from None
 
 
-@overload
-def open_tiff(path: Path) -> TiffFrames | FileSet: ...
-@overload
-def open_tiff(path: Path, *, member: Literal[True]) -> TiffFrames: ...
 def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
     """Open a TIFF movie."""
     data = map_file(path)
@@ -210,7 +206,7 @@ def open_tiff(path: Path, *, member: bool = False) -> TiffFrames | FileSet:
 @contextmanager
 def open_frame_file(path: Path) -> Iterator[TiffFrames]:
     """Open a file that may hold a single frame, for a moment."""
-    frames = open_tiff(path, member=True)
+    frames = cast(TiffFrames, open_tiff(path, member=True))  # a member is no set
     try:
         yield frames
     finally:
