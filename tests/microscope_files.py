@@ -90,9 +90,8 @@ class StandInForNd2(ModuleType):
     def voxel_size(self) -> SimpleNamespace:
         return SimpleNamespace(x=0.0844, y=0.0844)
 
-    def frame_metadata(self, number: int) -> SimpleNamespace:
-        time = SimpleNamespace(relativeTimeMs=self.times_ms[number])
-        return SimpleNamespace(channels=[SimpleNamespace(time=time)])
+    def events(self, *, orient: str) -> dict[str, list[float]]:
+        return {"Time [s]": [t / 1e3 for t in self.times_ms]} if orient == "list" else {}
 
     def read_frame(self, number: int) -> NDArray[Any]:
         return self.counts[number]

@@ -134,8 +134,9 @@ def open_czi(path: Path, _: str = "") -> ReaderFrames:
 
 def _nd2_hints(file: Any, n_frames: int) -> Hints:
     """Read pixel size, lens and the times of all frames."""
-    times = [_of(file.frame_metadata(k), "channels", 0, "time") for k in range(n_frames)]
-    rate, ticks = measure_clock({k: t.relativeTimeMs / 1e3 for k, t in enumerate(times) if t})
+    times = file.events(orient="list").get("Time [s]", ())
+    known = {k: time for k, time in enumerate(times) if math.isfinite(time)}
+    rate, ticks = measure_clock(known if len(times) == n_frames else {})  # of nothing but frames
     voxel, lens = file.voxel_size(), _of(file.metadata, "channels", 0, "microscope")
     return Hints(
         "nd2", positive(voxel.x, 1e3), positive(voxel.y, 1e3), frame_rate_hz=rate, ticks=ticks,

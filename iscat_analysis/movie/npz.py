@@ -5,6 +5,7 @@ An array of Python objects is never read, since that would run what the file say
 
 from __future__ import annotations
 
+import io
 import struct
 import zipfile
 from functools import partial
@@ -18,13 +19,16 @@ from iscat_analysis.movie.mapped_frames import read_header
 _SUFFIX = ".npy"
 _LOCAL_HEADER = struct.Struct("<26xHH")  # lengths of the name, and of what is added to it
 _ENCRYPTED = 1
+_LARGEST_HEADER = 2**16  # of an array, unpacked
+_MOST_ARRAYS = 1000
 
 
 def arrays_of_npz(file: BinaryIO, path: Path) -> dict[str, Member | str]:
     """List the arrays of an archive."""
     archive = zipfile.ZipFile(file)
-    infos = [info for info in archive.infolist() if info.filename.endswith(_SUFFIX)]
-    if archive.infolist() and not infos:
+    listed = archive.infolist()
+    infos = [info for info in listed if info.filename.endswith(_SUFFIX)][:_MOST_ARRAYS]
+    if listed and not infos:
         raise DataError(f"{path}: is a ZIP archive without arrays of NumPy; unpack it")
     return {info.filename.removesuffix(_SUFFIX): _held(archive, info, file, path) for info in infos}
 
@@ -35,7 +39,7 @@ def _held(
     if info.flag_bits & _ENCRYPTED:
         return "is encrypted"
     with archive.open(info) as packed:
-        header = read_header(packed, path)
+        header = read_header(io.BytesIO(packed.read(_LARGEST_HEADER)), path)
     if header.stored.hasobject:
         return "holds Python objects, which are not read"
     if header.stored.kind not in "uif" or not is_movie(header.shape):

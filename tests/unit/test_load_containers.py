@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import struct
+import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -119,6 +121,12 @@ def test_archives_of_other_things_are_refused(tmp_path: Path) -> None:
         header = b"\x93NUMPY\x01\x00\x76\0{'descr':'<u2','fortran_order':False,'shape':(%d,%d,%d)}"
         file.writestr("a.npy", (header % (10**5, 10**4, 10**4)).ljust(127) + b"\n" + bytes(99))
     refused(path, "would grow from", "which no recording does")
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr("a.npy", b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**25) + bytes(2**25))
+    tracemalloc.start()
+    refused(path, "is damaged")
+    assert tracemalloc.get_traced_memory()[1] < 2**22
+    tracemalloc.stop()
     path.write_bytes(b"PK\x03\x04" + bytes(90))
     refused(path, "begins like a ZIP archive but is damaged")
 

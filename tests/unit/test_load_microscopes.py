@@ -123,6 +123,9 @@ def test_nd2_reads_what_nikon_writes(tmp_path: Path) -> None:
         assert (found.na, found.magnification) == (1.42, 60)
         assert found.pixel_size_nm == pytest.approx(84.4)
         assert found.frame_rate_hz == pytest.approx(200)
+    late = [40 + 5.0 * k for k in (0, 1, 2, 5, 6, 7, 8)]
+    with open_stack(write_nd2(tmp_path / "m.nd2", COUNTS, late)) as stack:
+        assert stack.metadata.ticks == (0, 1, 2, 5, 6, 7, 8)
     path = write_nd2(tmp_path / "m.nd2", COUNTS, TIMES_MS, lost=[4])
     with open_stack(path) as stack, pytest.raises(DataError, match="frame 4 holds nothing but"):
         stack.read(0, 7)
