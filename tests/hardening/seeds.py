@@ -35,6 +35,7 @@ Seed = dict[str, bytes]
 Reader = Callable[[Path], Any]
 
 _FRAMES = movie(6, 12, 14)
+_FOLDER = "frames"
 
 
 def seeds(folder: Path) -> dict[str, list[Seed]]:
@@ -53,7 +54,7 @@ def seeds(folder: Path) -> dict[str, list[Seed]]:
     ]
     found["dataset"] += [{"input": _mat(packed)} for packed in (False, True)]
     found["dataset"] += [{"input": _mat_hdf5(folder / "m", **options)} for options in _DATASETS]
-    found["frames"] = [_frame_files()]
+    found["set"].append(_frame_files())
     settings = "save/frame/shape\t(12, 14)\nsave/frame/dtype\t<u2\nsave/saved\t6\n"
     raw = _FRAMES.astype("<u2").tobytes()
     found["raw"] = [{"movie.bin": raw, "movie_settings.dat": settings.encode()}]
@@ -100,7 +101,7 @@ def _frame_files() -> Seed:
     for number, frame in enumerate(_FRAMES):
         out = io.BytesIO()
         tifffile.imwrite(out, frame, compression="zlib" if number % 2 else None)
-        files[f"a/frame{number}.tif"] = out.getvalue()
+        files[f"{_FOLDER}/frame{number}.tif"] = out.getvalue()
     return files
 
 
@@ -267,8 +268,7 @@ READERS: dict[str, Reader] = {
     "npy": _frames,
     "zarr": _zarr_folder,
     "dataset": _frames,
-    "set": _frames,
-    "frames": lambda path: _frames(path.parent),
+    "set": lambda path: _frames(path.parent if path.parent.name == _FOLDER else path),
     "raw": _frames,
     "toml": load_config,
     "table": lambda path: find_species(
