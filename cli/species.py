@@ -121,7 +121,7 @@ def species(
         typer.Option(
             "--widths",
             help=(
-                "With --masses and --ladder: one width for all species (default), or one for each."
+                "With --masses and --ladder: a width for each species (default), or one for all."
             ),
         ),
     ] = None,
@@ -226,7 +226,7 @@ def species(
             steps=rungs,
             offset=offset,
             hold=hold,
-            widths="common" if widths is None else widths.value,
+            widths="free" if widths is None else widths.value,
             background=background,
             branch=side.value,
             kinetics=rates,

@@ -207,9 +207,7 @@ def compare_tables(
 
     def pair(other: EventTable) -> Comparison:
         nonlocal done
-        found = compare(
-            read[0].events, other.events, start=chosen.best, background=chosen.background
-        )
+        found = compare(read[0].events, other.events, start=chosen.best)
         done += 1
         progress("compare", done, len(read) - 1)
         return found
@@ -271,7 +269,8 @@ def _pooled(tables: Sequence[EventTable]) -> Events:
         for step in [-(-table.mass_kda.size // most)]
     ]
     mass, sigma = (np.concatenate(parts) for parts in zip(*taken, strict=True))
-    return Events(mass, sigma, tables[0].efficiency)
+    known = tables[0].edge_kda is None
+    return Events(mass, sigma, tables[0].efficiency if known else None)
 
 
 def _histograms(tables: Sequence[EventTable]) -> list[dict[str, Any]]:

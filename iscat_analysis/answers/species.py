@@ -58,7 +58,7 @@ def find_species(
     steps: Sequence[int] = (),
     offset: bool = False,
     hold: bool = False,
-    widths: Widths = "common",
+    widths: Widths = "free",
     background: bool = True,
     branch: Branch = "magnitude",
     sigma_kda: float | None = None,
@@ -96,8 +96,9 @@ def find_species(
         Fit an offset common to all oligomers.
     hold : bool
         Hold the monomer at the mass given.
-    widths : {"common", "free"}
-        Of given masses and ladders: one width for all, or one for each.
+    widths : {"free", "common"}
+        Of given masses and ladders: a width for each, which grow with the mass about as in other
+        tables, or one for all.
     background : bool
         Of given masses and ladders: whether something else may be there, broad and faint.
     branch : {"magnitude", "landing", "leaving"}
@@ -186,7 +187,6 @@ def find_species(
         window_frames=table.window_frames,
         choice=choice,
         limit_known=table.edge_kda is None,
-        errors_known=table.errors_known,
     )
     if found.events < LEAST_EVENTS:
         kind = "event" if branch == "magnitude" else f"{branch} event"

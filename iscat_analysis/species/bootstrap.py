@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import log_ndtr, ndtri_exp
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.species.choices import Chosen
+from iscat_analysis.species.edges import Possible
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, ascend, height
-from iscat_analysis.species.search import joined_starts, split_starts
-from iscat_analysis.species.structure import Limits, Structure, fit_jointly, polish
+from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.search import ascend, height, joined_starts, peaks, split_starts
+from iscat_analysis.species.structure import fit_jointly, polish
 
 _SUPPORT_DRAWS = 20
 _RIVAL_EVALUATIONS = 150
@@ -26,30 +29,39 @@ class Repeat:
     mixture: Mixture
     count: FloatArray
     corrected: FloatArray
+    mass: FloatArray
 
 
 def bootstrap(
-    events: Events,
-    best: Mixture,
+    possible: Sequence[Possible],
+    found: Chosen,
     *,
     draws: int,
     least: int,
     seed: int,
-    structure: tuple[Structure, Limits] | None = None,
-    searched: bool = True,
 ) -> tuple[list[Repeat], float]:
-    """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers."""
+    """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers.
+
+    Where the limit of detection is not known, each repetition has one of those that are possible.
+    """
     rng = np.random.default_rng(seed)
     repeats, agreed = [], []
+    chance = np.cumsum([one.probability for one in possible])
     for number in range(draws):
+        one = possible[0]
+        if len(possible) > 1:
+            one = possible[int(np.searchsorted(chance[:-1], rng.random(), side="right"))]
+        events, best = one.events, one.mixture
         drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
         # from the estimate, so that species keep their places
-        if structure is None:
-            fit = polish(drawn, best, tolerance=_TOLERANCE)
-        else:
-            fit = fit_jointly(drawn, best, *structure, tolerance=_TOLERANCE)
-        repeats.append(Repeat(fit, fit.shares(drawn).sum(axis=0), fit.weight * fit.arrived(drawn)))
-        if searched and number < _SUPPORT_DRAWS:
+        fit = fit_jointly(drawn, best, found.structure, one.limits, tolerance=_TOLERANCE)
+        repeats.append(
+            Repeat(
+                fit, fit.shares(drawn).sum(axis=0), fit.came * fit.arrived(drawn),
+                peaks(drawn, fit),
+            )
+        )  # fmt: skip
+        if found.searched and number < _SUPPORT_DRAWS:
             n = drawn.x.size
             agreed.append(
                 all(fit.bic(n) <= rival.bic(n) for rival in _rivals(drawn, fit.by_mass()))
@@ -67,20 +79,20 @@ def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generat
     """
     which = rng.integers(events.x.size, size=n)
     sigma, efficiency = events.sigma[which], events.efficiency
-    blank = Events(np.zeros(n), sigma, efficiency)
+    blank = replace(events, x=np.zeros(n), sigma=sigma)
     seen = mixture.weight * mixture.chance(blank)
     steps = np.cumsum(seen, axis=1) / seen.sum(axis=1, keepdims=True)
     species = (rng.random((n, 1)) > steps[:, :-1]).sum(axis=1)
     mean, spread = mixture.mean[species], mixture.variance[species] + blank.variance
     if efficiency is None:
-        return Events(np.abs(rng.normal(mean, np.sqrt(spread))), sigma, None)
+        return replace(events, x=np.abs(rng.normal(mean, np.sqrt(spread))), sigma=sigma)
     total = spread + efficiency.extra_sigma(sigma) ** 2
     reach = np.sqrt(total)
     tail = np.log1p(-rng.random(n)) + log_ndtr((mean - efficiency.threshold_kda) / reach)
     estimate = -reach * ndtri_exp(tail)  # less the mean
     left = np.sqrt(spread * (total - spread) / total)
     x = rng.normal(mean + spread / total * estimate, left)
-    return Events(np.abs(x), sigma, efficiency)
+    return replace(events, x=np.abs(x), sigma=sigma)
 
 
 def _rivals(events: Events, fit: Mixture) -> list[Mixture]:

@@ -9,8 +9,8 @@ reach, the rung with the fewest events goes as long as BIC falls.  Where no mono
 of free species over small numbers are tried.  The heaviest with a BIC within `_BIC_TIE` of the
 least is taken, for half of a monomer's mass explains as much as the monomer.
 
-Given masses and ladders share one width τ unless widths are free, and stand on a background: a
-species of fixed, great width that takes what is none of them.
+Components have widths of their own under the prior of `widths`, or one for all, and stand on the
+background of `background`, which takes what is none of them.
 
 Whether the masses are those of a ladder is asked by a likelihood ratio against the same species
 with every mean free: twice the gain is χ² with as many degrees of freedom as there are means more.
@@ -27,10 +27,25 @@ import numpy as np
 from scipy.special import chdtrc
 
 from iscat_analysis.records import FloatArray
+from iscat_analysis.species.background import broad
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, ascend, height
-from iscat_analysis.species.search import fit_species
-from iscat_analysis.species.structure import LOGIT_REACH, Limits, Structure, fit_jointly, polish
+from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.search import (
+    ascend,
+    by_peaks,
+    fit_species,
+    height,
+    peaks,
+    without_background,
+)
+from iscat_analysis.species.structure import (
+    Limits,
+    Structure,
+    fit_jointly,
+    free_structure,
+    polish,
+    structure_of,
+)
 
 Widths = Literal["common", "free"]
 
@@ -39,6 +54,7 @@ MOST_RUNGS = 12
 
 _BIC_TIE = 6.0  # of BIC
 _MOST_FREE_MULTIPLES = 4  # multiples that a free species may be
+_FIRST_SHARE = 0.05  # of the background
 _REACH = 0.97  # quantile of the masses that the ladder must reach
 _MOST_RELATIVE_WIDTH = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
 _SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
@@ -67,9 +83,9 @@ class Chosen:
 
     tried: tuple[Mixture, ...]
     best: Mixture
-    structure: Structure | None = None
-    limits: Limits | None = None
-    background: bool = False
+    structure: Structure
+    limits: Limits
+    held: bool = False
     steps: tuple[int, ...] = ()
     searched: bool = False
     p_value: float = math.nan
@@ -82,10 +98,13 @@ class Searched:
     most: int = 6
 
     def choose(self, events: Events) -> Chosen:
-        """Fit one number of species after another."""
-        fits = fit_species(events, self.most)
-        bic = [fit.bic(events.x.size) for fit in fits]
-        return Chosen(tuple(fits), fits[int(np.argmin(bic))].by_mass(), searched=True)
+        """Fit one number of components after another; those that make one peak are one species."""
+        fits = fit_species(events, self.most, background=not events.plain)
+        best = fits[int(np.argmin([fit.bic(events.x.size) for fit in fits]))].by_mass()
+        if not events.plain:
+            best = by_peaks(events, without_background(events, best).by_mass())
+            fits.append(best)
+        return Chosen(tuple(fits), best, *free_structure(events, best), searched=True)
 
 
 @dataclass(frozen=True)
@@ -97,7 +116,8 @@ class Number:
     def choose(self, events: Events) -> Chosen:
         """Fit this number of species."""
         fits = fit_species(events, self.k, least=self.k)
-        return Chosen(tuple(fits), fits[-1].by_mass())
+        best = fits[-1].by_mass()
+        return Chosen(tuple(fits), best, *free_structure(events, best))
 
 
 @dataclass(frozen=True)
@@ -109,8 +129,8 @@ class Begun:
     def choose(self, events: Events) -> Chosen:
         """Climb from the given masses to the nearest maximum of the likelihood."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
-        best = polish(events, ascend(events, _near(events, masses)))
-        return Chosen((best,), best.by_mass())
+        best = polish(events, ascend(events, _near(events, masses))).by_mass()
+        return Chosen((best,), best, *free_structure(events, best))
 
 
 @dataclass(frozen=True)
@@ -118,19 +138,19 @@ class Given:
     """Species of known masses with free fractions and widths."""
 
     masses_kda: tuple[float, ...]
-    widths: Widths = "common"
+    widths: Widths = "free"
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
         """Fit fractions and widths."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
-        structure, limits = rungs(
-            events, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
-            widths=self.widths, background=self.background, unit_kda=float(masses[0]),
+        start = _start(events, masses, self.background)
+        structure, limits = _rungs(
+            events, start, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
+            widths=self.widths, unit_kda=float(masses[0]),
         )  # fmt: skip
-        start = _start(events, masses, structure, self.background)
         best = fit_jointly(events, start, structure, limits)
-        return Chosen((best,), best, structure, limits, self.background)
+        return Chosen((best,), best, structure, limits, held=True)
 
 
 @dataclass(frozen=True)
@@ -141,7 +161,7 @@ class Ladder:
     steps: tuple[int, ...] = ()
     offset: bool = False
     held: bool = False
-    widths: Widths = "common"
+    widths: Widths = "free"
     background: bool = True
 
     def choose(self, events: Events) -> Chosen:
@@ -150,7 +170,7 @@ class Ladder:
             return self._from(events, self.monomer_kda)
         free = Searched().choose(events).best
         wanted = sorted(
-            {float(m / n) for m in free.mean for n in range(1, _MOST_FREE_MULTIPLES + 1)}
+            {float(m / n) for m in peaks(events, free) for n in range(1, _MOST_FREE_MULTIPLES + 1)}
         )
         least = 0.5 * float(events.x.min())
         found = [self._from(events, m) for m in wanted if m >= least]
@@ -204,16 +224,16 @@ class Ladder:
             ranges.append((-0.5 * monomer, 0.5 * monomer))
             units.append(float(np.median(events.sigma)))
         slopes = np.array(columns).T.reshape(n.size, len(columns))
-        structure, limits = rungs(
-            events, monomer * n if self.held else np.zeros(n.size), slopes,
-            np.array(ranges).reshape(-1, 2).T, np.array(units),
-            widths=self.widths, background=self.background, unit_kda=monomer,
-        )  # fmt: skip
         begin = [1.0] if self.held else _SEARCH
-        starts = [_start(events, n * monomer * s, structure, self.background) for s in begin]
+        starts = [_start(events, n * monomer * s, self.background) for s in begin]
         start = max(starts, key=lambda one: height(events, one))
+        structure, limits = _rungs(
+            events, start, monomer * n if self.held else np.zeros(n.size), slopes,
+            np.array(ranges).reshape(-1, 2).T, np.array(units),
+            widths=self.widths, unit_kda=monomer,
+        )  # fmt: skip
         best = fit_jointly(events, start, structure, limits)
-        return Chosen((best,), best, structure, limits, self.background, tuple(steps))
+        return Chosen((best,), best, structure, limits, held=True, steps=tuple(steps))
 
     def _against_free(self, events: Events, found: Chosen) -> float:
         """Test whether free masses describe the events better than those of the ladder."""
@@ -224,10 +244,10 @@ class Ladder:
         unit = float(np.median(events.sigma))
         monomer = self.monomer_kda or self.values(found)[0]
         centres = found.best.mean[:k]
-        structure, limits = rungs(
-            events, np.zeros(k), np.eye(k),
+        structure, limits = _rungs(
+            events, found.best, np.zeros(k), np.eye(k),
             np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]), np.full(k, unit),
-            widths=self.widths, background=self.background, unit_kda=monomer,
+            widths=self.widths, unit_kda=monomer,
         )  # fmt: skip
         free = fit_jointly(events, found.best, structure, limits)
         gain = max(2 * (free.log_likelihood - found.best.log_likelihood), 0.0)
@@ -237,51 +257,35 @@ class Ladder:
 Choice = Searched | Number | Begun | Given | Ladder
 
 
-def rungs(
+def _rungs(
     events: Events,
+    start: Mixture,
     origin: FloatArray,
     slopes: FloatArray,
     ranges: FloatArray,
     units: FloatArray,
     *,
     widths: Widths,
-    background: bool,
     unit_kda: float,
 ) -> tuple[Structure, Limits]:
     """Make the structure of a ladder: means that are linear in m₁ and b.
 
     Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,).
     """
-    k, p = slopes.shape
-    q = 1 if widths == "common" else k
-    every = k + int(background)
-    design = np.zeros((3, every, every - 1 + p + q))
-    start = np.zeros((3, every))
-    design[0, 1:, : every - 1] = np.eye(every - 1)
-    design[1, :k, every - 1 : every - 1 + p] = slopes
-    design[2, :k, every - 1 + p :] = 1.0 if widths == "common" else np.eye(k)
-    start[1, :k] = origin
-    if background:
-        low, high = float(events.x.min()), float(events.x.max())
-        start[1, k] = (low + high) / 2
-        start[2, k] = max((high - low) / 2, unit_kda) ** 2
-    sigma = max(float(np.median(events.sigma)), 1e-9)
-    widest = (_MOST_RELATIVE_WIDTH * unit_kda) ** 2
-    return Structure(design, start), Limits(
-        np.concatenate([np.full(every - 1, -LOGIT_REACH), ranges[0], np.zeros(q)]),
-        np.concatenate([np.full(every - 1, LOGIT_REACH), ranges[1], np.full(q, widest)]),
-        np.concatenate([np.ones(every - 1), units, np.full(q, sigma**2)]),
-    )
+    k, common = start.narrow, widths == "common"
+    of_widths = np.ones((k, 1)) if common else np.eye(k)
+    mean = start.mean[:k]
+    widest = _MOST_RELATIVE_WIDTH * unit_kda * np.sqrt(mean / mean.min())
+    return structure_of(
+        events, start, origin, slopes, ranges, units, of_widths,
+        np.full(k, widest[0]) if common else widest, prior=not common,
+    )  # fmt: skip
 
 
-def _start(events: Events, mean: FloatArray, structure: Structure, background: bool) -> Mixture:
+def _start(events: Events, mean: FloatArray, background: bool) -> Mixture:
     """Start from the species near each mass, and a faint background."""
     near = _near(events, mean)
-    if not background:
-        return near
-    weight = np.append(near.weight, 0.05)
-    mean = np.append(mean, structure.origin[1, -1])
-    return Mixture(weight / weight.sum(), mean, np.append(near.variance, structure.origin[2, -1]))
+    return near.on_background(*broad(events), _FIRST_SHARE) if background else near
 
 
 def _near(events: Events, mean: FloatArray) -> Mixture:

@@ -5,7 +5,9 @@ Events of sample s come from species k with the density of `mixture`,
     A:  Σ_k w_k^A N(x; μ_k, τ_k² + σ²) / Z^A,    B:  Σ_k w_k^B N(x; μ_k + δ_k, τ_k² + σ²) / Z^B,
 
 each with the errors and the detector of its own sample, so that samples of different noise can be
-compared, and on a background whose share is its own.  Four hypotheses lie inside one another,
+compared, and on a background whose share is its own.  Components that make one peak are one
+species: they move together, and their parts of it are the same in both samples.  Four hypotheses
+lie inside one another,
 
     same:  δ = 0, w^A = w^B      masses same:  δ = 0      fractions same:  w^A = w^B      all free,
 
@@ -34,7 +36,8 @@ from scipy.special import chdtrc
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.choices import Choice, Searched
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.mixture import BACKGROUND, Mixture
+from iscat_analysis.species.search import peaks
 from iscat_analysis.species.structure import (
     LOGIT_REACH,
     Limits,
@@ -43,6 +46,7 @@ from iscat_analysis.species.structure import (
     information,
     maximise,
 )
+from iscat_analysis.species.widths import width_prior
 
 LEAST_COMPARED = 20
 """Events of a species in each sample, without which its masses are not compared."""
@@ -58,6 +62,8 @@ other's less the first's, intervals are 95 %, fractions are of the particles tha
 
 _TWO_SIDED_95 = 1.959964
 _MOST_RELATIVE_WIDTH = 0.3  # width over mass
+_LEAST_WEIGHT = 1e-6  # of a species that a sample lacks
+_WIDTH_STEP = 0.3  # of ln T
 _TOLERANCE = 1e-9  # of the log-likelihood per event: 2·10⁻⁵ of χ² for 10 000 events
 
 
@@ -116,34 +122,31 @@ class Comparison:
 
 
 def compare(
-    first: Events, other: Events, *, choice: Choice | None = None, start: Mixture | None = None,
-    background: bool = False,
-) -> Comparison:  # fmt: skip
+    first: Events, other: Events, *, choice: Choice | None = None, start: Mixture | None = None
+) -> Comparison:
     """Compare the species of two samples."""
+    pooled = Events(
+        np.concatenate([first.x, other.x]),
+        np.concatenate([first.sigma, other.sigma]),
+        first.efficiency,
+    )
     if start is None:
-        pooled = Events(
-            np.concatenate([first.x, other.x]),
-            np.concatenate([first.sigma, other.sigma]),
-            first.efficiency,
-        )
-        found = (Searched() if choice is None else choice).choose(pooled)
-        start, background = found.best, found.background
-    known = start.weight.size - int(background)
-    samples = (first, other)
+        start = (Searched() if choice is None else choice).choose(pooled).best
+    known, samples = start.species, (first, other)
     seen = np.array([start.shares(events).sum(axis=0)[:known] for events in samples])
-    narrow = np.sqrt(start.variance[:known]) < _MOST_RELATIVE_WIDTH * start.mean[:known]
+    narrow = start.widths()[:known] < _MOST_RELATIVE_WIDTH * start.means()[:known]
     moves = (seen.min(axis=0) >= LEAST_COMPARED) & narrow
-    free = _Hypothesis(samples, start, known, moves, own_fractions=True)
+    noise = pooled.usual_variance
+    free = _Hypothesis(samples, start, moves, noise, own_fractions=True)
     full = free.fit(start)
 
     def against(*, shift: bool, own: bool) -> Test:
-        narrow = _Hypothesis(samples, start, known, moves & shift, own_fractions=own)
+        narrow = _Hypothesis(samples, start, moves & shift, noise, own_fractions=own)
         return free.against(full, narrow)
 
-    a, b = (structure.mixture(full.theta) for structure in free.structures)
     shares = [
-        float(mixture.shares(events).sum(axis=0)[known:].sum() / events.x.size)
-        for mixture, events in zip((a, b), samples, strict=True)
+        float(structure.mixture(full.theta).shares(events)[:, known:].sum() / events.x.size)
+        for structure, events in zip(free.structures, samples, strict=True)
     ]
     return Comparison(
         species=free.table(full, moves),
@@ -161,76 +164,99 @@ class _Hypothesis:
     """What the two samples share.
 
     θ holds the logits of the species of A, of B where they are its own, the logits of both
-    backgrounds, μ, the δ of species that may move, and τ².
+    backgrounds, those of components within their species, μ, the δ of species that may move, and
+    ln T.
     """
 
     def __init__(
         self,
         samples: tuple[Events, Events],
         start: Mixture,
-        known: int,
         moves: BoolArray,
+        noise: float,
         *,
         own_fractions: bool,
     ) -> None:
-        self.samples, self.known, self.moves = samples, known, np.flatnonzero(moves)
-        every = start.weight.size
-        logits = known - 1
+        self.samples, self.known = samples, start.species
+        self.moves = np.flatnonzero(moves)
+        every, k, of = start.weight.size, start.narrow, start.kinds
+        first_of = {int(kind): int(np.flatnonzero(of == kind)[-1]) for kind in np.unique(of)}
+        inner = [i for i in range(k) if first_of[int(of[i])] != i]
+        logits, back = self.known - 1, int(start.background)
         self.own = logits if own_fractions else 0
-        back = every - known
-        self.places = np.cumsum([0, logits, self.own, 2 * back, known, self.moves.size, known])
+        sizes = [logits, self.own, 2 * back, len(inner), k, self.moves.size, k]
+        self.places = np.cumsum([0, *sizes])
         p = int(self.places[-1])
-        at_a, at_b, at_back, at_mean, at_shift, at_width = self.places[:-1]
+        at_a, at_b, at_back, at_inner, at_mean, at_shift, at_width = self.places[:-1]
         structures = []
         for sample in (0, 1):
             design, origin = np.zeros((3, every, p)), np.zeros((3, every))
             begin = at_b if sample and self.own else at_a
-            design[0, 1:known, begin : begin + logits] = np.eye(logits)
+            for species in range(1, self.known):
+                design[0, of == species, begin + species - 1] = 1.0
             if back:
-                design[0, known, at_back + sample] = 1.0
-                origin[1, known], origin[2, known] = start.mean[known], start.variance[known]
-            design[1, :known, at_mean : at_mean + known] = np.eye(known)
+                design[0, of == BACKGROUND, at_back + sample] = 1.0
+            design[0, inner, at_inner + np.arange(len(inner))] = 1.0
+            origin[1, k:] = start.mean[k:]
+            origin[2, k:] = np.log(start.variance[k:] + noise) / 2
+            design[1, :k, at_mean : at_mean + k] = np.eye(k)
             if sample:
-                design[1, self.moves, at_shift + np.arange(self.moves.size)] = 1.0
-            design[2, :known, at_width:] = np.eye(known)
-            structures.append(Structure(design, origin))
+                for number, moved in enumerate(self.moves):
+                    design[1, of == moved, at_shift + number] = 1.0
+            design[2, :k, at_width:] = np.eye(k)
+            structures.append(Structure(design, origin, noise, start.broad, start.kind))
         self.structures = tuple(structures)
-        self.limits = self._limits(start)
+        self.limits = self._limits(start, noise)
 
-    def _limits(self, start: Mixture) -> Limits:
+    def _limits(self, start: Mixture, noise: float) -> Limits:
         """Limits of parameters: a mean may go halfway to its neighbours, a shift as far."""
-        at_mean, at_shift, at_width = (int(place) for place in self.places[3:6])
-        low = np.full(int(self.places[-1]), -LOGIT_REACH)
+        at_mean, at_shift, at_width, p = (int(place) for place in self.places[4:])
+        low = np.full(p, -LOGIT_REACH)
         high, scale = -low, np.ones(low.shape)
-        unit = float(np.median(np.concatenate([events.sigma for events in self.samples])))
-        mean = start.mean[: self.known]
-        gap = np.diff(mean) / 2
-        reach = np.concatenate([[mean[0] / 2], gap, [mean[-1] / 2]])
-        reach = np.maximum(np.minimum(reach[:-1], reach[1:]), unit)
-        low[at_mean:at_shift], high[at_mean:at_shift] = mean - reach, mean + reach
-        low[at_shift:at_width], high[at_shift:at_width] = -reach[self.moves], reach[self.moves]
-        low[at_width:] = 0.0
-        spread = np.sqrt(start.variance[: self.known]) + unit
-        high[at_width:] = (3 * spread) ** 2
-        scale[at_mean:at_width], scale[at_width:] = unit, unit**2
-        return Limits(low, high, scale)
+        unit, k = math.sqrt(noise), start.narrow
+        reach = self._reach(start.mean[:k], unit)
+        low[at_mean:at_shift] = start.mean[:k] - reach
+        high[at_mean:at_shift] = start.mean[:k] + reach
+        shift = self._reach(start.means()[: self.known], unit)[self.moves]
+        low[at_shift:at_width], high[at_shift:at_width] = -shift, shift
+        low[at_width:] = math.log(unit)
+        high[at_width:] = np.log(3 * (np.sqrt(start.variance[:k]) + unit))
+        scale[at_mean:at_width], scale[at_width:] = unit, _WIDTH_STEP
+        rows, middle = width_prior(start.mean[:k])
+        prior = np.zeros((k, p))
+        prior[:, at_width:] = rows
+        return Limits(low, high, scale, prior, middle)
+
+    @staticmethod
+    def _reach(mean: FloatArray, unit: float) -> FloatArray:
+        """Half the distance of each mean to the nearer of its neighbours.
+
+        Shapes: `mean` (k,), result (k,).
+        """
+        order = np.argsort(mean)
+        gap = np.diff(mean[order]) / 2
+        reach = np.concatenate([[mean[order[0]] / 2], gap, [mean[order[-1]] / 2]])
+        found = np.empty(mean.shape)
+        found[order] = np.maximum(np.minimum(reach[:-1], reach[1:]), unit)
+        return found
 
     def theta(self, first: Mixture, other: Mixture) -> FloatArray:
-        """Parameters of a similar hypothesis, converted to this one.
+        """Parameters of species that are nearly this hypothesis's, by least squares.
 
-        Parameters of species that are nearly this hypothesis's.
+        Of what it shares, each sample counts as its number of events.
         """
-        k = self.known
-        logits = [np.log(np.maximum(m.weight, 1e-6)) - math.log(max(m.weight[0], 1e-6))
-                  for m in (first, other)]  # fmt: skip
-        size = np.array([events.x.size for events in self.samples])
-        shared = size @ np.array(logits) / size.sum()
-        own = [logits[0][1:k], logits[1][1:k]] if self.own else [shared[1:k], np.empty(0)]
-        shift = (other.mean - first.mean)[self.moves]
-        back = np.array([one[k] for one in logits]) if first.weight.size > k else np.empty(0)
-        middle = size @ np.array([first.mean, other.mean]) / size.sum()
-        mean = np.where(np.isin(np.arange(k), self.moves), first.mean[:k], middle[:k])
-        return np.concatenate([*own, back, mean, shift, first.variance[:k]])
+        rows, values = [], []
+        for mixture, structure, events in zip(
+            (first, other), self.structures, self.samples, strict=True
+        ):
+            logits = np.log(np.maximum(mixture.weight, _LEAST_WEIGHT))
+            width = np.log(mixture.variance + structure.noise) / 2
+            value = np.array([logits - logits[0], mixture.mean, width]) - structure.origin
+            size = math.sqrt(events.x.size)
+            rows.append(size * structure.design.reshape(value.size, -1))
+            values.append(size * value.ravel())
+        found = np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
+        return np.asarray(found)
 
     def fit(self, first: Mixture, other: Mixture | None = None) -> Optimum:
         """Maximise the likelihood of both samples."""
@@ -253,7 +279,7 @@ class _Hypothesis:
     def table(self, full: Optimum, moves: BoolArray) -> pd.DataFrame:
         """Lay out shifts and differences with their errors."""
         k, theta = self.known, full.theta
-        at_mean, at_shift = (int(place) for place in self.places[3:5])
+        at_mean, at_shift = (int(place) for place in self.places[4:6])
         covariance = self._covariance(theta)
         mixtures = [structure.mixture(theta) for structure in self.structures]
         fractions, slopes = zip(*(self._fractions(i, theta) for i in (0, 1)), strict=True)
@@ -261,15 +287,19 @@ class _Hypothesis:
         error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, covariance, slope), 0.0))
         shift, shift_se = np.full(k, math.nan), np.full(k, math.nan)
         relative_se = np.full(k, math.nan)
-        mean = mixtures[0].mean[:k]
+        first = mixtures[0]
+        mean = peaks(self.samples[0], first)
         for number, i in enumerate(self.moves):
-            place, base = at_shift + number, at_mean + i
+            place = at_shift + number
             shift[i] = theta[place]
             if not covariance[place, place] > 0:  # at an end of its range
                 continue
             shift_se[i] = math.sqrt(covariance[place, place])
             ratio = np.zeros(theta.size)  # of δ/μ
-            ratio[place], ratio[base] = 1 / mean[i], -theta[place] / mean[i] ** 2
+            ratio[place] = 1 / mean[i]
+            own = np.flatnonzero(first.kinds == i)
+            part = first.weight[own] / first.weight[own].sum()
+            ratio[at_mean + own] = -theta[place] / mean[i] ** 2 * part
             relative_se[i] = math.sqrt(max(float(ratio @ covariance @ ratio), 0.0))
         relative = shift / mean
         difference = fractions[1] - fractions[0]
@@ -279,7 +309,7 @@ class _Hypothesis:
         ]
         columns = {
             "mass_kda": mean,
-            "mass_other_kda": np.where(moves, mixtures[1].mean[:k], math.nan),
+            "mass_other_kda": np.where(moves, mean + shift, math.nan),
             **_interval("shift", "shift_kda", shift, shift_se),
             "shift_percent": 100 * relative,
             "shift_percent_low": 100 * (relative - _TWO_SIDED_95 * relative_se),
@@ -294,9 +324,12 @@ class _Hypothesis:
 
     def _fractions(self, sample: int, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Fractions among the species of a sample, and their derivatives."""
-        weight = self.structures[sample].mixture(theta).weight[: self.known]
-        part = weight / weight.sum()
-        logits = self.structures[sample].design[0, : self.known]
+        structure = self.structures[sample]
+        mixture = structure.mixture(theta)
+        belongs = mixture.belongs[:, : self.known] * mixture.weight[:, None]
+        part = belongs.sum(axis=0)
+        logits = (belongs / part).T @ structure.design[0]
+        part = part / part.sum()
         return part, part[:, None] * (logits - part @ logits)
 
     def _covariance(self, theta: FloatArray) -> FloatArray:

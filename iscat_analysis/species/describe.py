@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -21,8 +21,10 @@ from iscat_analysis.species.curves import (
     curves_of,
     histogram_of,
 )
+from iscat_analysis.species.edges import Possible, possible_edges, ratio_of_doubt
 from iscat_analysis.species.events import Efficiency, Events, possible
 from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.search import MOST_RELATIVE_WIDTH, peaks
 from iscat_analysis.units import count
 
 Branch = Literal["magnitude", "landing", "leaving"]
@@ -34,37 +36,38 @@ LEAST_EFFICIENCY = 0.05
 """Of a species that is detected less often it is not determined how many particles came, nor, where
 it is free, what they weigh."""
 
-LEAST_WIDTH = 0.8
-"""Where nobody knows what is detected, and the lightest species is narrower than this part of a
-whole peak, it may be a flank of a lighter one: the product of that peak and of a detector that
-rises over as much as one width is a peak of 0.7 widths."""
+MOST_DOUBT = 3.0
+"""Where nobody knows what is detected, and the share of a species that is detected is not known to
+this factor, how many came is not determined."""
 
 LEAST_EVENTS = 10
 """Fewer are listed, not described."""
 
 SPECIES_COLUMNS = (
-    "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic",
+    "mass_kda", "mass_se", "mass_low", "mass_high", "mass_systematic", "mean_kda",
     "width_kda", "width_low", "width_high",
     "fraction", "fraction_low", "fraction_high", "count", "count_low", "count_high",
     "landing", "leaving", "efficiency", "stay_frames",
     "count_corrected", "corrected_low", "corrected_high", "outlier",
 )  # fmt: skip
-"""Columns of the table of species: `mass_se` is the statistical standard error, `mass_systematic`
-the error of the mass scale, 0 where none is known, and the interval of the mass holds both.
+"""Columns of the table of species: `mass_kda` is where the peak is highest, `mean_kda` the mean of
+what makes it, `mass_se` is the statistical standard error, `mass_systematic` the error of the mass
+scale, 0 where none is known, and the interval of the mass holds both.
 `efficiency` is of particles that stay as long as the window; of those that stay `stay_frames` every
 other one is found (NaN where the window is not known, or where it is too short for that).
 Intervals are 95 %, `fraction` and `count_corrected` are of the
-particles that came, the other counts of those that were seen; `outlier` where these are fewer than
-`LEAST_SPECIES`.  A species of less `efficiency` than `LEAST_EFFICIENCY`, or that may be a flank of
-a lighter one, is not determined: the mass is where its events lie, without error or interval, and
-what came of it is NaN, as is its fraction; those of the others are among the others."""
+particles that came, the other counts of those that were seen; `outlier` marks what is no species:
+fewer events than `LEAST_SPECIES`, or the background, which has a row without a mass, and a column
+`background`, where there is one.  A species of less `efficiency` than `LEAST_EFFICIENCY`, or of
+more than `MOST_DOUBT` of it, is not determined: the mass is where its events lie, without error or
+interval, and what came of it is NaN, as is its fraction; those of the others are among the
+others."""
 
 _TWO_SIDED_95 = 1.959964
 _INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
-_MOST_RELATIVE_WIDTH = 0.4  # width over mass
+_SKEWED = 0.02  # of the mass: how far from it a mean is told
 _NO_LADDER = 0.01  # p-value
-_CLEAR_OF_EDGE = 5.0  # widths of a peak, whose lightest of 1000 events lies 3.2 below it
 _DIGITS = 6  # of the curves in summary.json
 
 
@@ -153,12 +156,11 @@ def describe(
     window_frames: int | None = None,
     choice: Choice | None = None,
     limit_known: bool = True,
-    errors_known: bool = True,
 ) -> Distribution:
     """Describe a set of masses as a mixture of species.
 
-    Without `limit_known` the efficiency is a guess, from the lightest event; without `errors_known`
-    the sigmas stand for errors that nobody knows.
+    Without `limit_known` nobody knows what is detected, and `efficiency` says nothing: intervals
+    hold that doubt (`edges`).
 
     Notes
     -----
@@ -183,7 +185,7 @@ def describe(
     if branch == "magnitude" and np.count_nonzero(~usable):
         left_out = count(int(np.count_nonzero(~usable)), "event")
         notes.append(f"{left_out} without a mass and an error left out")
-    events = Events(np.abs(mass[usable]), sigma[usable], efficiency)
+    events = Events(np.abs(mass[usable]), sigma[usable], efficiency if limit_known else None)
     if events.x.size < LEAST_EVENTS:
         held = count(events.x.size, "event")
         notes.append(f"{held}, too few for species; {LEAST_EVENTS} are needed")
@@ -191,21 +193,18 @@ def describe(
 
     choice = Searched(max_species) if choice is None else choice
     found = choice.choose(events)
-    best = found.best
-    structure = None
-    if found.structure is not None and found.limits is not None:
-        structure = (found.structure, found.limits)
-    repeats, support = bootstrap(
-        events, best, draws=draws, least=LEAST_EVENTS, seed=seed, structure=structure,
-        searched=found.searched,
-    )  # fmt: skip
-    scale = np.zeros(best.mean.shape) if scale_error is None else scale_error(best.mean)
-    flank = np.zeros(best.mean.shape, dtype=bool)
-    if not limit_known and found.structure is None:
-        flank = _flanks(events, best, errors_known=errors_known)
-    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, flank)
+    possible_limits = [Possible(1.0, events, found.best, found.limits)]
+    if not limit_known:
+        possible_limits = possible_edges(events, found, LEAST_SPECIES - 0.5)
+    events, best = possible_limits[0].events, possible_limits[0].mixture
+    repeats, support = bootstrap(possible_limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
+    mass_kda = peaks(events, best)
+    scale = np.zeros(mass_kda.shape) if scale_error is None else scale_error(mass_kda)
+    doubtful = ratio_of_doubt(possible_limits)[: best.species] > MOST_DOUBT
+    found = replace(found, best=best)
+    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, doubtful)
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
-    bandwidth = bandwidth_of(events, len(species))
+    bandwidth = bandwidth_of(events, max(best.species, 1))
     return Distribution(
         species=species,
         selection=selection_of(found, events.x.size),
@@ -219,7 +218,8 @@ def describe(
         seed=seed,
         notes=(
             *notes,
-            *_remarks(species, flank),
+            *_skews(best, species),
+            *_remarks(species, doubtful),
             *_brief(species, window_frames),
             *_doubts(ladder),
         ),
@@ -234,39 +234,44 @@ def _table(
     lands: BoolArray,
     scale: FloatArray,
     window_frames: int | None,
-    flank: BoolArray,
+    doubtful: BoolArray,
 ) -> pd.DataFrame:
     """Lay out the species, with intervals from the repetitions and from the mass scale."""
     best = found.best
-    known = best.weight.size - int(found.background)
+    known = best.species
     share = best.shares(events)
+    k = share.shape[1]
+    is_species = np.arange(k) < known
     seen = share.sum(axis=0)
-    outlier = seen < LEAST_SPECIES - 0.5
-    efficiency = best.chance(events).mean(axis=0)
-    undetermined = (efficiency < LEAST_EFFICIENCY) | flank
-    undetermined[known:] = False
-    some = np.arange(best.weight.size) < known
-    some &= ~undetermined
+    outlier = ~is_species | (seen < LEAST_SPECIES - 0.5)
+    efficiency = best.detected(events)
+    undetermined = efficiency < LEAST_EFFICIENCY
+    undetermined[:known] |= doubtful
+    some = is_species & ~undetermined
     some &= ~outlier | outlier[some].all()
-    k = best.weight.size
-    mass_low, mass_high = interval_of([r.mixture.mean for r in repeats], k)
-    width_low, width_high = interval_of([np.sqrt(r.mixture.variance) for r in repeats], k)
-    part_low, part_high = interval_of([_fractions(r.mixture.weight, some) for r in repeats], k)
+    mass_low, mass_high = interval_of([r.mass for r in repeats], known)
+    width_low, width_high = interval_of([r.mixture.widths() for r in repeats], k)
+    part_low, part_high = interval_of([_fractions(r.mixture.came, some) for r in repeats], k)
     count_low, count_high = interval_of([r.count for r in repeats], k)
     came_low, came_high = interval_of([r.corrected for r in repeats], k)
-    means = np.array([r.mixture.mean for r in repeats])
+    masses = np.array([r.mass for r in repeats])
+    mass = peaks(events, best)
     searched = events.efficiency.searched if events.efficiency else 1.0
+    nothing = np.full(k - known, math.nan)
     table = pd.DataFrame(
         {
-            "mass_kda": best.mean,
-            "mass_se": means.std(axis=0, ddof=1) if len(repeats) > 1 else math.nan,
-            "mass_low": mass_low - widening(best.mean - mass_low, scale),
-            "mass_high": mass_high + widening(mass_high - best.mean, scale),
-            "mass_systematic": scale,
-            "width_kda": np.sqrt(best.variance),
+            "mass_kda": np.append(mass, nothing),
+            "mass_se": np.append(masses.std(axis=0, ddof=1), nothing)
+            if len(repeats) > 1
+            else math.nan,
+            "mass_low": np.append(mass_low - widening(mass - mass_low, scale), nothing),
+            "mass_high": np.append(mass_high + widening(mass_high - mass, scale), nothing),
+            "mass_systematic": np.append(scale, nothing),
+            "mean_kda": np.append(best.means()[:known], nothing),
+            "width_kda": best.widths(),
             "width_low": width_low,
             "width_high": width_high,
-            "fraction": _fractions(best.weight, some),
+            "fraction": _fractions(best.came, some),
             "fraction_low": part_low,
             "fraction_high": part_high,
             "count": seen,
@@ -275,8 +280,8 @@ def _table(
             "landing": share[lands].sum(axis=0),
             "leaving": share[~lands].sum(axis=0),
             "efficiency": searched * efficiency,
-            "stay_frames": _residence(events, best, window_frames),
-            "count_corrected": best.weight * best.arrived(events) / searched,
+            "stay_frames": np.append(_residence(events, mass, window_frames), nothing),
+            "count_corrected": best.came * best.arrived(events) / searched,
             "corrected_low": came_low / searched,
             "corrected_high": came_high / searched,
             "outlier": outlier,
@@ -284,13 +289,16 @@ def _table(
         columns=list(SPECIES_COLUMNS),
     )
     unknown = ["count_corrected", "corrected_low", "corrected_high", "stay_frames"]
-    if found.structure is None:
+    if not found.held:
         unknown += ["mass_se", "mass_low", "mass_high"]
-    table.loc[undetermined, unknown] = math.nan
-    if found.structure is not None:
-        table["background"] = np.arange(best.weight.size) >= known
+    table.loc[undetermined & is_species, unknown] = math.nan
+    if best.background:
+        table["background"] = ~is_species
+        unknown = ["width_kda", "width_low", "width_high", "efficiency", "count_corrected",
+                   "corrected_low", "corrected_high"]  # fmt: skip
+        table.loc[~is_species, unknown] = math.nan
     if found.steps:
-        table.insert(0, "n", [*found.steps, *[0] * (best.weight.size - known)])
+        table.insert(0, "n", [*found.steps, *[0] * (k - known)])
     return table
 
 
@@ -311,42 +319,12 @@ def selection_of(found: Chosen, events: int) -> pd.DataFrame:
     bic = [fit.bic(events) for fit in found.tried]
     return pd.DataFrame(
         {
-            "species": [fit.weight.size - int(found.background) for fit in found.tried],
+            "species": [fit.species for fit in found.tried],
             "log_likelihood": [fit.log_likelihood for fit in found.tried],
             "bic": bic,
             "delta_bic": np.subtract(bic, min(bic)),
         }
     )
-
-
-def _flanks(events: Events, best: Mixture, *, errors_known: bool) -> BoolArray:
-    """Tell which species may be what is seen of lighter ones: the lightest, and narrow.
-
-    A whole peak is as wide as the errors of its events, or as most of the heavier species where
-    these errors are unknown.  With neither, nobody can tell.  One that begins far above the
-    lightest event is no flank: what is lighter was detected.
-
-    Shapes: result (k,).
-    """
-    share = best.shares(events)
-    seen = share.sum(axis=0)
-    middle = (events.x @ share) / seen
-    width = np.sqrt(np.sum(share * (events.x[:, np.newaxis] - middle) ** 2, axis=0) / seen)
-    near_edge = middle - events.x.min() < _CLEAR_OF_EDGE * width
-    found = np.zeros(best.mean.shape, dtype=bool)
-    species = np.flatnonzero(seen >= LEAST_SPECIES - 0.5)
-    for place, one in enumerate(species):
-        heavier = width[species[place + 1 :]]
-        if errors_known:
-            whole = float(np.median(events.sigma))
-        elif heavier.size:
-            whole = float(np.median(heavier))
-        else:
-            whole = math.inf if species.size == 1 else 0.0
-        found[one] = near_edge[one] and width[one] < LEAST_WIDTH * whole
-        if not found[one]:
-            break
-    return found
 
 
 def _fractions(weight: FloatArray, some: BoolArray) -> FloatArray:
@@ -389,12 +367,12 @@ def _doubts(ladder: LadderFit | None) -> list[str]:
     ]
 
 
-def _residence(events: Events, best: Mixture, window_frames: int | None) -> FloatArray:
+def _residence(events: Events, mass: FloatArray, window_frames: int | None) -> FloatArray:
     """Frames that a particle of each species must stay for a detection probability of one half."""
     if window_frames is None or events.efficiency is None:
-        return np.full(best.mean.shape, math.nan)
+        return np.full(mass.shape, math.nan)
     with np.errstate(divide="ignore"):  # one of no mass is never found
-        frames = np.ceil(window_frames * events.efficiency.threshold_kda / best.mean)
+        frames = np.ceil(window_frames * events.efficiency.threshold_kda / mass)
     return np.where(frames <= window_frames, np.maximum(frames, 1.0), math.nan)
 
 
@@ -404,19 +382,33 @@ def widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
     return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
 
 
-def _remarks(species: pd.DataFrame, flank: BoolArray) -> list[str]:
+def _skews(best: Mixture, species: pd.DataFrame) -> list[str]:
+    """Name the peaks that more than one component describes."""
+    said = []
+    for number in range(best.species):
+        own = np.flatnonzero(best.kinds == number)
+        mass, mean = species["mass_kda"][number], species["mean_kda"][number]
+        if own.size > 1 and not species["outlier"][number]:
+            beside = best.mean[own[np.argmax(np.abs(best.mean[own] - mass))]]
+            means = "" if abs(mean / mass - 1) < _SKEWED else f", and its mean is {mean:.4g} kDa"
+            said.append(
+                f"the peak at {mass:.4g} kDa is one species, and skewed: a second component near "
+                f"{beside:.3g} kDa describes it better{means}"
+            )
+    return said
+
+
+def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> list[str]:
     """List reasons to doubt single species."""
-    if "background" in species:
-        flank = flank[~species["background"]]
-        species = species[~species["background"]]
-    undetectable = (species["efficiency"] < LEAST_EFFICIENCY) & ~flank
+    species = species[: doubtful.size]
+    undetectable = (species["efficiency"] < LEAST_EFFICIENCY) & ~doubtful
     cases = (
         (
-            pd.Series(flank, index=species.index),
-            "what lies at {} kDa may be all that is seen of a lighter species, for it is the only "
-            "peak, or narrower than a whole one: its mass and number are not determined, and "
-            "fractions are of the others; `limit_kda` says what is detected, or `above_kda` from "
-            "where on everything is",
+            pd.Series(doubtful, index=species.index),
+            "what lies at {} kDa may be all that is seen of a lighter species: its mass and number "
+            f"are not determined, for what is missed of it is not known to a factor of "
+            f"{MOST_DOUBT:g}, and fractions are of the others; `limit_kda` says what is detected, "
+            "or `above_kda` from where on everything is",
         ),
         (
             undetectable,
@@ -424,7 +416,7 @@ def _remarks(species: pd.DataFrame, flank: BoolArray) -> list[str]:
             "detected: its mass and number are not determined, and fractions are of the others",
         ),
         (
-            (species["efficiency"] < 0.5) & ~undetectable & ~flank,
+            (species["efficiency"] < 0.5) & ~undetectable & ~doubtful,
             "fewer than half of the particles of {} kDa are detected: their mass and number rest "
             "on the detection model",
         ),
@@ -433,7 +425,7 @@ def _remarks(species: pd.DataFrame, flank: BoolArray) -> list[str]:
             f"at {{}} kDa there are fewer than {LEAST_SPECIES} events: outliers, and no species",
         ),
         (
-            species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
+            species["width_kda"] > MOST_RELATIVE_WIDTH * species["mass_kda"],
             "the species at {} kDa is as broad as a background: it may hold all events that the "
             "other species do not explain",
         ),

@@ -44,6 +44,7 @@ from iscat_analysis.species.describe import (
     selection_of,
     widening,
 )
+from iscat_analysis.species.edges import Possible
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.units import count
@@ -125,14 +126,20 @@ def describe_sizes(
     if diameter.size < LEAST_EVENTS:
         return None
     power = _power(diameter, sigma)
-    events = Events(np.log(diameter / UNIT_NM), sigma / diameter, None)
+    events = Events(np.log(diameter / UNIT_NM), sigma / diameter, None, plain=True)
     measured, choice = events, Searched(max_populations)
     found = choice.choose(events)
     for _ in range(_TURNS):
         events = _beside(measured, power, found.best)
         found = choice.choose(events)
     best = found.best
-    repeats, support = bootstrap(events, best, draws=draws, least=LEAST_EVENTS, seed=seed)
+    repeats, support = bootstrap(
+        [Possible(1.0, events, best, found.limits)],
+        found,
+        draws=draws,
+        least=LEAST_EVENTS,
+        seed=seed,
+    )
     middle_low, middle_high = interval_of([r.mixture.mean for r in repeats], best.mean.size)
     width_low, width_high = interval_of(
         [np.sqrt(r.mixture.variance) for r in repeats], best.mean.size
@@ -200,7 +207,9 @@ def _beside(measured: Events, power: float, population: Mixture) -> Events:
     mean = (weight * x).sum(axis=0)
     spread = (weight * (x - mean) ** 2).sum(axis=0)
     information = np.maximum(1 / spread - 1 / variance, _LEAST_TOLD / measured.variance)
-    return Events((mean / spread - centre / variance) / information, information**-0.5, None)
+    return Events(
+        (mean / spread - centre / variance) / information, information**-0.5, None, plain=True
+    )
 
 
 def _curve(events: Events, best: Mixture) -> pd.DataFrame:

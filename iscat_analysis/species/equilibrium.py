@@ -134,8 +134,8 @@ def fit_equilibrium(
         landing_power_se=constant_errors.get("power", 0.0),
         masses_kda=series.modes(full),
         detected=series.detected(full),
-        width_kda=math.sqrt(float(shared.variance[0])),
-        tail_kda=shared.tail,
+        width_kda=math.sqrt(max(float(shared.variance[0]), 0.0)),
+        tail_kda=shared.tail * math.sqrt(float(shared.variance[0]) + series.noise),
         limit_kda=shared.limit[0],
         chi2=chi2,
         dof=dof,
@@ -264,7 +264,7 @@ class _Equilibrium:
         begin = np.append(free.theta[: self.at], starts[int(np.argmin(far))])
         found = [maximise(self.problem(), begin)]
         for tail in (-_TURNED, _TURNED):
-            turned = self.series.turned(found[0].theta, tail * self.series.width)
+            turned = self.series.turned(found[0].theta, tail)
             found.append(maximise(self.problem(), turned))
         return sorted(found, key=lambda one: -one.value)
 

@@ -8,13 +8,15 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import ndtr
+from scipy.special import log_ndtr, ndtr
 
 from iscat_analysis.records import BoolArray, FloatArray
 
 POSSIBLE_KDA = (1e-6, 1e9)
 """Masses of particles, and errors of them, that a light microscope can tell of: a proton has 1e-3,
 a protein as large as the wavelength 1e8.  Their squares, and ratios of these, are numbers."""
+
+_SHARPEST = 1e-6  # of a limit: its softness
 
 
 def possible(mass_kda: FloatArray, sigma_kda: FloatArray) -> BoolArray:
@@ -56,14 +58,40 @@ class Efficiency:
         """Noise of the filter's estimate beyond that of the fit."""
         return np.asarray(np.sqrt(np.maximum(self.sigma_kda**2 - sigma**2, 0.0)))
 
+    def deciding_sigma(self, sigma: FloatArray) -> FloatArray:
+        """Noise of the estimate that decides on detection."""
+        return np.maximum(sigma, self.sigma_kda)
+
+
+@dataclass(frozen=True)
+class Edge(Efficiency):
+    """A limit that is not the filter's: of what was measured, and soft by itself."""
+
+    softness_kda: float = 0.0
+
+    @classmethod
+    def at(cls, limit_kda: float, softness_kda: float) -> Edge:
+        """Half of what is measured at the limit is seen."""
+        spread = max(softness_kda, _SHARPEST * limit_kda)
+        return cls(limit_kda / spread, spread, softness_kda=spread)
+
+    def extra_sigma(self, sigma: FloatArray) -> FloatArray:
+        """Noise of what decides, beyond that of the fit: the same for every event."""
+        return np.full(sigma.shape, self.softness_kda)
+
+    def deciding_sigma(self, sigma: FloatArray) -> FloatArray:
+        """Noise of the fit and of what decides."""
+        return np.hypot(sigma, self.softness_kda)
+
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Events that were seen."""
+    """Events that were seen; `plain` where they are no masses, but logarithms of diameters."""
 
     x: FloatArray
     sigma: FloatArray
     efficiency: Efficiency | None
+    plain: bool = False
 
     @cached_property
     def variance(self) -> FloatArray:
@@ -73,6 +101,22 @@ class Events:
     @cached_property
     def filter_variance(self) -> FloatArray:
         """s_i² of the estimate that decides on detection, (n, 1), or (1, 1) where all agree."""
-        least = self.efficiency.sigma_kda if self.efficiency else 0.0
-        s = np.maximum(self.sigma, least)[:, np.newaxis]
+        s = self.efficiency.deciding_sigma(self.sigma) if self.efficiency else self.sigma
+        s = s[:, np.newaxis]
         return np.asarray((s[:1] if np.all(s == s[:1]) else s) ** 2)
+
+    @cached_property
+    def usual_variance(self) -> float:
+        """The median of σ_i² [kDa²]."""
+        return max(float(np.median(self.variance)), 1e-18)
+
+    @cached_property
+    def log_seen(self) -> float:
+        """Logarithm of the chance to see events where they were measured; of a filter it is 0.
+
+        There it depends on nothing that is fitted.
+        """
+        if not isinstance(self.efficiency, Edge):
+            return 0.0
+        away = (self.x - self.efficiency.threshold_kda) / self.efficiency.softness_kda
+        return float(log_ndtr(away).sum())

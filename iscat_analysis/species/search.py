@@ -1,25 +1,49 @@
-"""The number of species: fits with one after another, until BIC stops improving."""
+"""The number of components: fits with one after another, until BIC stops improving.
+
+A component that is as broad as the background belongs to it, and components whose sum has one
+maximum are one species: a shoulder, as of a protein of which some lost a part, is no second
+protein, and neither is what a skewed peak has beside a normal one.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtr
 
+from iscat_analysis._kernels.mixture import mixture_score, mixture_sums
+from iscat_analysis.records import FloatArray
+from iscat_analysis.species.background import broad
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.mixture import Mixture, ascend, height
+from iscat_analysis.species.mixture import BACKGROUND, Mixture
 from iscat_analysis.species.structure import polish
+from iscat_analysis.species.widths import width_prior
 
+MOST_RELATIVE_WIDTH = 0.4
+"""Width over mass from which a component is as broad as a background."""
+
+_EM_STEPS = 40
 _POLISHED = 2  # starts, the best after climbing
+_FIRST_SHARE = 0.05  # of the background
+_BROAD = 4.0  # whole widths that the others would have
+_REACH, _POINTS = 4.0, 81  # of a component: widths to both sides that are searched for maxima
+_ZOOMS, _ZOOM_POINTS = 4, 41  # towards the highest point of a peak
+_NOISES = np.linspace(0.1, 0.9, 5)  # quantiles that stand for the events' own noise
 
 
-def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mixture]:
-    """Fit 1, 2, … species; stop after two numbers without a better BIC."""
+def fit_species(
+    events: Events, max_species: int, *, least: int = 1, background: bool = False
+) -> list[Mixture]:
+    """Fit 1, 2, … components, on a background; stop after two numbers without a better BIC."""
     fits: list[Mixture] = []
     most = min(max_species, max(1, events.x.size // 5))
     for k in range(1, most + 1):
         starts = [_spread_start(events, k)]
+        if background:
+            starts[0] = starts[0].on_background(*broad(events), _FIRST_SHARE)
         if fits:
             starts += split_starts(events, fits[-1])
         climbed = sorted(
@@ -31,6 +55,115 @@ def fit_species(events: Events, max_species: int, *, least: int = 1) -> list[Mix
         if k >= least and len(fits) - 1 - int(np.argmin(bic)) >= 2:
             break
     return fits
+
+
+def without_background(events: Events, fit: Mixture) -> Mixture:
+    """Leave the background out where BIC does not like it."""
+    own = slice(0, fit.narrow)
+    bare = Mixture(fit.weight[own] / fit.weight[own].sum(), fit.mean[own], fit.variance[own])
+    found = polish(events, bare)
+    return found if found.bic(events.x.size) <= fit.bic(events.x.size) else fit
+
+
+def ascend(events: Events, start: Mixture) -> Mixture:
+    """EM steps without selection by the detector: a start for `structure.polish`."""
+    weight, mean, variance = start.weight.copy(), start.mean.copy(), start.variance.copy()
+    own, rest, noise = slice(0, start.narrow), slice(start.narrow, None), events.usual_variance
+    rows, middle = width_prior(mean[own])
+    precision, pull = rows.T @ rows, rows.T @ middle
+    for _ in range(_EM_STEPS):
+        sums = mixture_sums(events.x, events.variance, weight, mean, variance)[1]
+        size, first, second, _, noisy = sums[own].T
+        size = size + 1e-12
+        before = variance[own]
+        shift = before * first / size  # from the old mean, to avoid cancellation
+        square = before * (before * second + noisy) / size - shift**2
+        if not events.plain:  # of ln T, n events have the information 2 n
+            pulled = pull + size * np.log(np.maximum(square, 0.0) + noise)
+            square = np.exp(2 * np.linalg.solve(precision + np.diag(2 * size), pulled)) - noise
+        mean[own] += shift
+        variance[own] = np.maximum(square, 0.0)
+        weight[own] = size / events.x.size
+        if start.broad:
+            weight[rest] = sums[rest, 0].sum() / (events.x.size * start.broad)
+    return replace(start, weight=weight / weight.sum(), mean=mean, variance=variance)
+
+
+def height(events: Events, start: Mixture) -> float:
+    """Log-likelihood of a start, without selection by the detector."""
+    return float(
+        mixture_score(events.x, events.variance, start.weight, start.mean, start.variance)[0]
+    )
+
+
+def by_peaks(events: Events, fit: Mixture) -> Mixture:
+    """Say which components are one species, and which are background."""
+    own = slice(0, fit.narrow)
+    weight, mean, variance = fit.weight[own], fit.mean[own], fit.variance[own]
+    whole = np.sqrt(variance + events.usual_variance)
+    relative = np.log(whole / np.sqrt(mean))
+    trend = np.exp(np.average(relative, weights=weight)) * np.sqrt(mean)
+    wide = (whole > _BROAD * trend) & (np.sqrt(variance) > MOST_RELATIVE_WIDTH * mean)
+    if wide.all():
+        wide[:] = False
+    kind = np.full(fit.narrow, BACKGROUND)
+    kept = np.flatnonzero(~wide)
+    valleys = _valleys(events, weight[kept], mean[kept], variance[kept])
+    kind[kept] = np.unique(np.searchsorted(valleys, mean[kept]), return_inverse=True)[1]
+    return replace(fit, kind=tuple(kind.tolist()))
+
+
+def peaks(events: Events, fit: Mixture) -> FloatArray:
+    """Mass at which the peak of each species is highest (s,)."""
+    found = fit.means()[: fit.species].copy()
+    noise = np.quantile(events.variance, _NOISES)
+    for number in range(fit.species):
+        own = np.flatnonzero(fit.kinds == number)
+        if own.size > 1:
+            total = (fit.variance[own][:, None] + noise).ravel()
+            weight, mean = (np.repeat(v[own], noise.size) for v in (fit.weight, fit.mean))
+            found[number] = top_of(weight, mean, total)
+    return found
+
+
+def top_of(weight: FloatArray, mean: FloatArray, total: FloatArray) -> float:
+    """Find where a sum of normal densities is highest.
+
+    Shapes: `weight, mean, total` (k,).
+    """
+    low, high = float(mean.min()), float(mean.max())
+    for _ in range(_ZOOMS):
+        if high <= low:
+            break
+        grid = np.linspace(low, high, _ZOOM_POINTS)
+        away = grid[:, None] - mean
+        density = (np.exp(-0.5 * away**2 / total) / np.sqrt(total)) @ weight
+        top, step = grid[int(np.argmax(density))], grid[1] - grid[0]
+        low, high = max(low, top - step), min(high, top + step)
+    return (low + high) / 2
+
+
+def _density(
+    events: Events, weight: FloatArray, mean: FloatArray, variance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Sum components where there is any of them, with the errors that events have."""
+    noise = np.quantile(events.variance, _NOISES)
+    whole = np.sqrt(variance + events.usual_variance)
+    grid = np.sort((mean + np.outer(np.linspace(-_REACH, _REACH, _POINTS), whole)).ravel())
+    total = variance[:, None] + noise
+    away = grid[:, None, None] - mean[:, None]
+    density = weight[:, None] * np.exp(-0.5 * away**2 / total) / np.sqrt(total)
+    return grid, np.asarray(density.sum(axis=(1, 2)))
+
+
+def _valleys(
+    events: Events, weight: FloatArray, mean: FloatArray, variance: FloatArray
+) -> FloatArray:
+    """Give the minima between the maxima of a sum of components."""
+    grid, density = _density(events, weight, mean, variance)
+    high = np.flatnonzero((density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])) + 1
+    low = [grid[i + int(np.argmin(density[i:j]))] for i, j in pairwise(high)]
+    return np.array(low)
 
 
 def _spread_start(events: Events, k: int) -> Mixture:
@@ -46,8 +179,12 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
     starts = []
     sigma = float(np.median(events.sigma))
     places = np.sort(events.x)
-    k = fit.weight.size
-    for h in (sigma, 4 * sigma):
+    own = slice(0, fit.narrow)
+    k, weights, means, variances = fit.narrow, fit.weight[own], fit.mean[own], fit.variance[own]
+    widths = [sigma, 4 * sigma]
+    if not events.plain:  # the errors may be unknown, and those of the peaks are not
+        widths.append(float(np.sqrt(variances + sigma**2).min()) / 2)
+    for h in widths:
         near = np.searchsorted(places, places + h) - np.searchsorted(places, places - h)
         expected = np.zeros(places.size)
         for w, m, v in zip(fit.weight, fit.mean, fit.variance, strict=True):
@@ -56,22 +193,22 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
         excess = (near - places.size * expected) / np.sqrt(places.size * expected + 1)
         place = float(places[int(np.argmax(excess))])
         starts.append(
-            Mixture(
-                np.append(fit.weight * (1 - 1 / (2 * k + 2)), 1 / (2 * k + 2)),
-                np.append(fit.mean, place),
-                np.append(fit.variance, (h / 2) ** 2),
+            fit.with_free(
+                np.append(weights * (1 - 1 / (2 * k + 2)), 1 / (2 * k + 2)),
+                np.append(means, place),
+                np.append(variances, (h / 2) ** 2),
             )
         )
-    widest = int(np.argmax(fit.weight * np.sqrt(fit.variance + sigma**2)))
-    half = 0.7 * math.sqrt(fit.variance[widest] + sigma**2)
-    weight, mean, variance = fit.weight.copy(), fit.mean.copy(), fit.variance.copy()
+    widest = int(np.argmax(weights * np.sqrt(variances + sigma**2)))
+    half = 0.7 * math.sqrt(variances[widest] + sigma**2)
+    weight, mean, variance = weights.copy(), means.copy(), variances.copy()
     weight[widest] /= 2
     mean[widest] -= half
     variance[widest] /= 4
     starts.append(
-        Mixture(
+        fit.with_free(
             np.append(weight, weight[widest]),
-            np.append(mean, fit.mean[widest] + half),
+            np.append(mean, means[widest] + half),
             np.append(variance, variance[widest]),
         )
     )
@@ -81,7 +218,7 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
 def joined_starts(fit: Mixture) -> list[Mixture]:
     """Merge two neighbouring species."""
     starts = []
-    k = fit.weight.size
+    k = fit.narrow
     for i in range(k - 1):
         pair = slice(i, i + 2)
         weight = fit.weight[pair] / fit.weight[pair].sum()
@@ -89,7 +226,7 @@ def joined_starts(fit: Mixture) -> list[Mixture]:
         variance = float(weight @ (fit.variance[pair] + (fit.mean[pair] - mean) ** 2))
         rest = np.r_[0:i, i + 2 : k]
         starts.append(
-            Mixture(
+            fit.with_free(
                 np.append(fit.weight[rest], fit.weight[pair].sum()),
                 np.append(fit.mean[rest], mean),
                 np.append(fit.variance[rest], variance),

@@ -5,9 +5,9 @@ them, have in common:
 
 - Species of mass Σ n_p m_p + b.  The offset b is an error of the mass scale, of `_OFFSET` of the
   lightest species (a prior, as all widths that follow).
-- Peaks with an exponential tail t, of either sign (`_kernels.tailed_mixture`), and a variance that
-  goes with the mass, from that of the lightest to that of the complex.
-- A background whose density is learned: it is linear between the middles of the gaps between
+- Peaks with an exponential tail t, of either sign, as a few normal components (`_segments`), and
+  widths of their own under the prior of `widths`: a complex may well be twice as wide as a monomer.
+- A background whose density is learned: broad normal components at the middles of the gaps between
   species, so that it bends nowhere under a peak, and of the same shape in every table.  That shape
   is smooth: its logarithm is nearly a line.  Shares scatter about a level that the series has.
 - Of tables that do not say what was missed, one chance of detection Φ((x − T)/r) of what was
@@ -32,21 +32,25 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
-from scipy.special import erfcx, log_ndtr, ndtr
+from scipy.special import log_ndtr, ndtr
 
-from iscat_analysis._kernels.tailed_mixture import tailed_score
+from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import Problem
+from iscat_analysis.species.search import top_of
 from iscat_analysis.species.structure import LOGIT_REACH
+from iscat_analysis.species.widths import width_prior
 
 _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass
-_WIDEST = 0.35  # of the lightest: standard deviation of a species
-_LONGEST = 0.4  # of the lightest: a tail
-_WIDTH_SPREAD = 0.5  # of the squared width: how the widths of species differ
+# Of the lightest, times the root of the mass over its: standard deviation of a species
+_WIDEST = 0.35
+_LONGEST, _FIRST_TAIL = 2.0, 0.2  # of a peak's width: a tail
+_WIDTH_STEP = 0.3  # of the logarithm of a width
+_CUTS = (0.0, 0.5, 1.2, 2.3, np.inf)  # of an exponential of mean 1: its parts are nearly normal
+_OVERLAP = 0.5  # width of a part of the background over the distance to its neighbours
 # Of a peak's width: a tail; less, and a tail of one width is taken for a limit
 _TAIL_SPREAD = 1.5
 _SLOPE_SPREAD = 0.7  # of the logarithm of the background's density over the window
@@ -63,28 +67,45 @@ _NODES = 64
 _NOISE_KINDS = 8  # of noise, in each table
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
 _SIGMA_PER_MAD = 1.4826
-_NARROW = 0.1  # of the squared width: what a start leaves beside the tail
-_NO_TAIL = 1e-3  # of a peak's width
+_TINY = 1e-290
 _DIFFERENCE = 1e-3  # of about a standard error: steps for second derivatives
+
+
+def _segments() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Cut an exponential of mean 1 into parts; shares, means and variances of these (4,)."""
+    a, b = np.array(_CUTS[:-1]), np.array(_CUTS[1:])
+    left, right = np.exp(-a), np.exp(-b)
+    finite = np.where(np.isfinite(b), b, 0.0)
+    share = left - right
+    mean = ((a + 1) * left - (finite + 1) * right) / share
+    square = ((a**2 + 2 * a + 2) * left - (finite**2 + 2 * finite + 2) * right) / share
+    return share, mean, square - mean**2
+
+
+SHARES, MEANS, VARIANCES = _segments()
+"""Parts of a tail of mean 1."""
+
+
+def _cut(table: Events, softest: float) -> float:
+    """Give the limit of a table that is cut there, sharper than nodes are apart; else 0."""
+    known = table.efficiency
+    if known is None or float(known.extra_sigma(table.sigma).max(initial=0.0)) >= softest:
+        return 0.0
+    return known.threshold_kda
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
     """The events of one table inside the mass window, and its detector.
 
-    Shapes: `x, noise` (n,), `size, kind_noise` (c,), `nodes, steps` (g,), `seen` (c, g).
+    Shapes: `x, noise` (n,), `size` (c,), `seen` (c, g).
     """
 
     x: FloatArray
     noise: FloatArray
     size: FloatArray
-    kind_noise: FloatArray
-    nodes: FloatArray
-    steps: FloatArray
     seen: FloatArray
     learned: bool
-    background: FloatArray
-    node_background: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,48 +134,55 @@ class Series:
         self.kinds, self.parts = composition.shape
         self.masses = composition @ masses
         lightest = float(self.masses.min())
-        self.ends = 0.5 * lightest, float(self.masses.max()) + 0.5 * lightest
-        self.along = (self.masses - lightest) / max(float(np.ptp(self.masses)), 1e-9)
+        high = float(self.masses.max()) + 0.5 * lightest
+        softest = (high - 0.5 * lightest) / _NODES
+        cuts = [_cut(table, softest) for table in tables]
+        low = max(0.5 * lightest, *cuts)  # all that is seen is used, and exactly, above a cut
+        self.ends = min(low, 0.25 * lightest + 0.5 * high), high
         everything = np.concatenate([self._within(table, table.x) for table in tables])
         noise = np.concatenate([self._within(table, table.variance) for table in tables])
         self.events = everything.size
         total = self._width(everything) ** 2 if self.events else (0.1 * lightest) ** 2
-        typical = float(np.median(noise)) if self.events else 1.0
-        self.noise = typical
-        self.width = math.sqrt(max(total, typical))
+        self.noise = float(np.median(noise)) if self.events else 1.0
+        self.width = math.sqrt(max(total, self.noise))
+        self.noise = min(self.noise, self.width**2)
         self.knots = self._middles()
+        points, steps = np.polynomial.legendre.leggauss(_NODES)
+        half = (self.ends[1] - self.ends[0]) / 2
+        self.nodes, self.steps = self.ends[0] + half * (points + 1), half * steps
+        self.noise_ends = np.unique(
+            np.quantile(noise, np.linspace(0, 1, _NOISE_KINDS + 1)[1:-1]) if self.events else []
+        )
+        kind = np.searchsorted(self.noise_ends, noise)
+        count = np.bincount(kind, minlength=self.noise_ends.size + 1)
+        mean = np.bincount(kind, noise, self.noise_ends.size + 1) / np.maximum(count, 1)
+        self.kind_noise = np.where(count > 0, mean, self.noise)
         self.tables = [self._window(table) for table in tables]
         self.learned = any(table.learned for table in self.tables)
-        own = max(self.width**2 - typical, 0.05 * self.width**2)
-        widest = (_WIDEST * lightest) ** 2
-        low = [*((1 - _MASS_RANGE) * masses), -0.3 * lightest, 0.0, 0.0, -_LONGEST * lightest]
-        high = [*((1 + _MASS_RANGE) * masses), 0.3 * lightest, widest, widest, _LONGEST * lightest]
-        start = [*masses, 0.0, min(own, widest / 2), min(own, widest / 2), 0.2 * self.width]
-        scale = [*np.full(self.parts, self.width), self.width, *[self.width**2] * 2, self.width]
-        bends = self.knots.size - 1
-        low += [-LOGIT_REACH] * bends
-        high += [LOGIT_REACH] * bends
-        start += [0.0] * bends
-        scale += [1.0] * bends
+        self.back_mean, self.back_variance, self.back_share = self._background()
+        parts: list[tuple[float, float, float, float]] = [
+            ((1 - _MASS_RANGE) * mass, (1 + _MASS_RANGE) * mass, mass, self.width)
+            for mass in masses.tolist()
+        ]
+        parts.append((-0.3 * lightest, 0.3 * lightest, 0.0, self.width))
+        narrowest, log_width = math.log(self.noise) / 2, math.log(self.width)
+        for mass in self.masses:
+            widest = max(_WIDEST * math.sqrt(lightest * mass), 2 * math.sqrt(self.noise))
+            parts.append((narrowest, math.log(widest), log_width, _WIDTH_STEP))
+        parts.append((-_LONGEST, _LONGEST, _FIRST_TAIL, 1.0))
+        self.tail = len(parts) - 1
+        parts += [(-LOGIT_REACH, LOGIT_REACH, 0.0, 1.0)] * (self.knots.size - 1)
         if self.learned:
             edge = np.concatenate([t.x for t in self.tables if t.learned])
             rise = float(np.quantile(edge, _EDGE_QUANTILE)) if edge.size else self.ends[0]
-            low += [self.ends[0] - 3 * self.width, 0.25 * self.width]
-            high += [max(1.3 * lightest, rise + _ABOVE_RISE * self.width), 1.6 * self.width]
-            start += [rise, _SOFT * self.width]
-            scale += [self.width, self.width]
-        self.shares = len(start)
-        low += [-LOGIT_REACH] * self.number
-        high += [LOGIT_REACH] * self.number
-        start += [_FIRST_BACKGROUND] * self.number
-        scale += [1.0] * self.number
-        self.own = len(start)
-        free = self.number * (self.kinds - 1)
-        low += [-LOGIT_REACH] * free
-        high += [LOGIT_REACH] * free
-        start += [0.0] * free
-        scale += [1.0] * free
-        self.low, self.high, self.first, self.scale = map(np.array, (low, high, start, scale))
+            highest = max(1.3 * lightest, rise + _ABOVE_RISE * self.width)
+            parts.append((self.ends[0] - 3 * self.width, highest, rise, self.width))
+            parts.append((0.25 * self.width, 1.6 * self.width, _SOFT * self.width, self.width))
+        self.shares = len(parts)
+        parts += [(-LOGIT_REACH, LOGIT_REACH, _FIRST_BACKGROUND, 1.0)] * self.number
+        self.own = len(parts)
+        parts += [(-LOGIT_REACH, LOGIT_REACH, 0.0, 1.0)] * (self.number * (self.kinds - 1))
+        self.low, self.high, self.first, self.scale = np.array(parts).T
         self._priors()
 
     def _within(self, table: Events, values: FloatArray) -> FloatArray:
@@ -180,41 +208,39 @@ class Series:
         ]
         return np.array([self.ends[0], *gaps, self.ends[1]])
 
-    def _hats(self, x: FloatArray) -> FloatArray:
-        """Triangular basis functions of area 1 on the middles."""
-        found = np.array([np.interp(x, self.knots, row) for row in np.eye(self.knots.size)])
+    def _background(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give means, variances and weights of the parts of the background, for each middle.
+
+        Beyond the ends there is one more part, which goes with that at the end.
+
+        Shapes: results (b,), (b,), (b, middles).
+        """
         step = np.diff(self.knots)
-        area = 0.5 * (np.append(step, 0.0) + np.append(0.0, step))
-        return np.ascontiguousarray((found / area[:, None]).T)
+        mean = np.concatenate([[self.knots[0] - step[0]], self.knots, [self.knots[-1] + step[-1]]])
+        gaps = np.concatenate([[step[0]], step, [step[-1]]])
+        width = _OVERLAP * (np.append(gaps[0], gaps) + np.append(gaps, gaps[-1])) / 2
+        low, high = self.ends
+        inside = ndtr((high - mean) / width) - ndtr((low - mean) / width)
+        middles = np.eye(self.knots.size)
+        share = np.vstack([middles[:1], middles, middles[-1:]])
+        share[[0, -1]] *= inside[[0, -1], None]
+        share[1:-1] *= inside[1:-1, None]
+        # As much of a part as lies within the window, of one that varies as the density would.
+        return mean, width**2, share / (share.sum(axis=0) * inside[:, None])
 
     def _window(self, table: Events) -> Window:
         """Take a table's events within the window, in kinds of noise."""
         low, high = self.ends
-        softest = (high - low) / _NODES
-        known = table.efficiency
-        sharp = known is not None and float(known.extra_sigma(table.sigma).max()) < softest
-        if known is not None and sharp:
-            low = min(max(low, known.threshold_kda), 0.5 * (low + high))
         inside = (table.x >= low) & (table.x < high)
-        x, sigma = table.x[inside], table.sigma[inside]
-        parts = (
-            np.array_split(np.sort(sigma), _NOISE_KINDS if np.ptp(sigma) > 0 else 1)
-            if x.size
-            else []
-        )
-        size = np.array([float(part.size) for part in parts if part.size])
-        each = np.array([float(part.mean()) for part in parts if part.size])
-        points, steps = np.polynomial.legendre.leggauss(_NODES)
-        nodes = low + (high - low) * (points + 1) / 2
-        steps = steps * (high - low) / 2
-        seen = np.tile(steps, (size.size, 1))
-        if known is not None and not sharp:
-            reach = np.maximum(known.extra_sigma(each), softest)[:, None]
-            seen = steps * ndtr((nodes - known.threshold_kda) / reach)
-        return Window(
-            x, sigma**2, size, each**2, nodes, steps, seen, known is None,
-            self._hats(x), self._hats(nodes),
-        )  # fmt: skip
+        x, noise = table.x[inside], table.variance[inside]
+        kind = np.searchsorted(self.noise_ends, noise)
+        size = np.bincount(kind, minlength=self.kind_noise.size).astype(np.float64)
+        seen, known = np.tile(self.steps, (size.size, 1)), table.efficiency
+        softest = (high - low) / _NODES
+        if known is not None and not _cut(table, softest):
+            reach = np.maximum(known.extra_sigma(np.sqrt(self.kind_noise)), softest)[:, None]
+            seen = seen * ndtr((self.nodes - known.threshold_kda) / reach)
+        return Window(x, noise, size, seen, known is None)
 
     def _priors(self) -> None:
         """Mean and width of the prior of combinations of parameters."""
@@ -222,12 +248,11 @@ class Series:
         rows: list[tuple[dict[int, float], float, float]] = []
         place = self.parts
         rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
-        rows.append(({place + 1: -1.0, place + 2: 1.0}, 0.0, _WIDTH_SPREAD * self.width**2))
-        rows.append(({place + 3: 1.0}, 0.0, _TAIL_SPREAD * self.width))
+        rows.append(({self.tail: 1.0}, 0.0, _TAIL_SPREAD))
         last = self.shares - (2 if self.learned else 0) - 1
         rows.append(({last: 1.0}, 0.0, _SLOPE_SPREAD))
         for knot in range(1, self.knots.size - 1):
-            at = place + 3 + knot  # the first knot's logarithm is 0 and no parameter
+            at = self.tail + knot  # the first knot's logarithm is 0 and no parameter
             below = {at - 1: -0.5} if knot > 1 else {}
             rows.append(({**below, at: 1.0, at + 1: -0.5}, 0.0, _BEND_SPREAD))
         if self.learned:
@@ -239,6 +264,11 @@ class Series:
             for at, value in parts.items():
                 self.prior_design[row, at] = value / width
         self.prior_middle = np.array([middle / width for _, middle, width in rows])
+        of_widths, middle = width_prior(self.masses)
+        design = np.zeros((self.kinds, self.own))
+        design[:, place + 1 : place + 1 + self.kinds] = of_widths
+        self.prior_design = np.vstack([self.prior_design, design])
+        self.prior_middle = np.append(self.prior_middle, middle)
         # Shares of background scatter about a level that they have in common.
         covariance = np.full((self.number, self.number), _BACKGROUND**2)
         covariance += _SHARE_SPREAD**2 * np.eye(self.number)
@@ -252,38 +282,34 @@ class Series:
         """Convert parameters to masses, widths and the shape of the background."""
         place = self.parts
         mean = self.composition @ theta[:place] + theta[place]
-        light, heavy, tail = theta[place + 1 : place + 4]
-        variance = light + (heavy - light) * self.along
-        logits = np.append(0.0, theta[place + 4 : place + 3 + self.knots.size])
+        variance = np.exp(2 * theta[place + 1 : self.tail]) - self.noise
+        logits = np.append(0.0, theta[self.tail + 1 : self.tail + self.knots.size])
         shape = np.exp(logits - logits.max())
         limit = (math.nan, math.nan)
         if self.learned:
             limit = float(theta[self.shares - 2]), float(theta[self.shares - 1])
-        return Shared(mean, variance, float(tail), shape / shape.sum(), limit)
+        return Shared(mean, variance, float(theta[self.tail]), shape / shape.sum(), limit)
 
     def modes(self, theta: FloatArray) -> FloatArray:
         """Give the masses at which the peaks are highest, for the median noise of events.
 
-        There the density of the peak is that of its normal part alone; of what a tail moves, means
-        and their offset, it is what the events tell.
+        Of what a tail moves, means and their offset, it is what the events tell.
 
         Shapes: result (k,).
         """
         now = self.shared(theta)
-        tail = abs(now.tail)
-        found = now.mean.copy()
-        for number, width in enumerate(np.sqrt(now.variance + self.noise)):
-            shift = tail
-            if tail > _NO_TAIL * width:
-                level = math.sqrt(2 / math.pi) * tail / width
+        means, variances = self._parts(now)
+        return np.array(
+            [top_of(SHARES, m, v + self.noise) for m, v in zip(means, variances, strict=True)]
+        )
 
-                def excess(away: float, width: float = width, level: float = level) -> float:
-                    at = (width / tail - away / width) / math.sqrt(2)
-                    return float(erfcx(at)) - level
-
-                shift = float(scipy.optimize.brentq(excess, 0.0, tail))
-            found[number] += math.copysign(shift, now.tail)
-        return found
+    def _parts(self, now: Shared) -> tuple[FloatArray, FloatArray]:
+        """Means and variances of the parts of each species (k, q)."""
+        width = np.sqrt(now.variance + self.noise)[:, None]
+        return (
+            now.mean[:, None] + now.tail * width * MEANS,
+            now.variance[:, None] + (now.tail * width) ** 2 * VARIANCES,
+        )
 
     def detected(self, theta: FloatArray) -> FloatArray:
         """Give the share of each species that the learned limit lets through; else 1.
@@ -295,7 +321,8 @@ class Series:
             return np.ones(self.kinds)
         limit, spread = now.limit
         reach = np.sqrt(now.variance + self.noise + spread**2)
-        return np.asarray(ndtr((now.mean + now.tail - limit) / reach))
+        width = np.sqrt(now.variance + self.noise)
+        return np.asarray(ndtr((now.mean + now.tail * width - limit) / reach))
 
     def logits(self, theta: FloatArray) -> FloatArray:
         """Give the logits of the species of each table, the first 0.
@@ -328,39 +355,72 @@ class Series:
         Shapes: `theta` (p,), results (tables,), (tables, shares + k).
         """
         now, weights = self.shared(theta), self.weights(theta)
-        values, slopes = np.zeros(self.number), np.zeros((self.number, self.shares + self.kinds))
-        place = self.parts
-        limit, spread = now.limit
+        means, variances = self._parts(now)
+        k, q = means.shape
+        mean = np.append(means.ravel(), self.back_mean)
+        variance = np.append(variances.ravel(), self.back_variance)
+        back = self.back_share @ now.shape
+        weight = np.hstack([np.kron(weights[:, :-1], SHARES), weights[:, -1:] * back])
+        values = np.zeros(self.number)
+        by_part = np.zeros((self.number, 3, mean.size))
         for number, table in enumerate(self.tables):
-            seen, slope = table.seen, slopes[number]
-            if table.learned:
-                at_nodes = (table.nodes - limit) / spread
-                seen = np.tile(table.steps * ndtr(at_nodes), (table.size.size, 1))
-            values[number], by_weight, by_peak, by_shape, by_seen = tailed_score(
-                table.x, table.noise, table.background, table.size, table.kind_noise,
-                table.nodes, table.node_background, seen,
-                weights[number], now.mean, now.variance, now.tail, now.shape,
-            )  # fmt: skip
-            slope[:place] = by_peak[0] @ self.composition
-            slope[place] = by_peak[0].sum()
-            slope[place + 1] = by_peak[1] @ (1 - self.along)
-            slope[place + 2] = by_peak[1] @ self.along
-            slope[place + 3] = by_peak[2].sum()
-            bends = by_shape - by_shape.sum() * now.shape
-            slope[place + 4 : place + 3 + self.knots.size] = bends[1:]
-            species, back = by_weight[:-1].sum(), weights[number, -1]
-            slope[self.shares] = by_weight[-1] * (1 - back) - species * back
-            part = weights[number, :-1] / (1 - back)
-            slope[self.shares + 1 :] = (by_weight[:-1] - species * part)[1:]
-            if table.learned:
+            if table.x.size:
+                values[number], by_part[number] = mixture_score(
+                    table.x, table.noise, weight[number], mean, variance
+                )
+        # The chance that a particle of a part is seen within the window, (tables, kinds, parts).
+        limit, spread = now.limit
+        seen = np.array([table.seen for table in self.tables])
+        at_nodes = (self.nodes - limit) / spread
+        if self.learned:
+            seen[[table.learned for table in self.tables]] = self.steps * ndtr(at_nodes)
+        total = variance + self.kind_noise[:, None, None]
+        away = self.nodes[:, None] - mean
+        density = np.exp(-0.5 * away**2 / total) / np.sqrt(2 * math.pi * total)
+        rise = away / total * density
+        bend = 0.5 * (away**2 / total - 1) / total * density
+        chance = np.einsum("tcg,cgj->tcj", seen, density)
+        size = np.array([table.size for table in self.tables])
+        norm = np.maximum(np.einsum("tcj,tj->tc", chance, weight), _TINY)
+        values -= (size * np.log(norm)).sum(axis=1)
+        over = size / norm
+        by_part[:, 0] -= weight * np.einsum("tc,tcj->tj", over, chance)
+        pulled = np.einsum("tc,tcg->tcg", over, seen).reshape(self.number, -1)
+        by_part[:, 1] -= weight * (pulled @ rise.reshape(-1, mean.size))
+        by_part[:, 2] -= weight * (pulled @ bend.reshape(-1, mean.size))
+        slopes = np.zeros((self.number, self.shares + self.kinds))
+        own, place = by_part[:, :, : k * q].reshape(self.number, 3, k, q), self.parts
+        by_mean, by_variance = own[:, 1].sum(axis=2), own[:, 2].sum(axis=2)
+        slopes[:, :place] = by_mean @ self.composition
+        slopes[:, place] = by_mean.sum(axis=1)
+        width = np.sqrt(now.variance + self.noise)
+        moved, tail = (own[:, 1] * MEANS).sum(axis=2) * width, now.tail
+        spread_out = 2 * (own[:, 2] * VARIANCES).sum(axis=2) * width**2
+        slopes[:, place + 1 : self.tail] = tail * moved + tail**2 * spread_out
+        slopes[:, place + 1 : self.tail] += 2 * width**2 * by_variance
+        slopes[:, self.tail] = moved.sum(axis=1) + tail * spread_out.sum(axis=1)
+        by_back = by_part[:, 0, k * q :]
+        by_shape = (by_back / np.maximum(back, _TINY)) @ self.back_share * now.shape
+        bends = by_shape - by_shape.sum(axis=1, keepdims=True) * now.shape
+        slopes[:, self.tail + 1 : self.tail + self.knots.size] = bends[:, 1:]
+        by_kind, share = own[:, 0].sum(axis=2), weights[:, -1]
+        species = by_kind.sum(axis=1)
+        slopes[:, self.shares] = by_back.sum(axis=1) * (1 - share) - species * share
+        part = weights[:, :-1] / (1 - share)[:, None]
+        slopes[:, self.shares + 1 :] = (by_kind - species[:, None] * part)[:, 1:]
+        if self.learned:
+            bell = self.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
+            by_node = np.einsum("tc,cgj,tj->tg", over, density, weight) * bell
+            for number, table in enumerate(self.tables):
+                if not table.learned:
+                    continue
                 at = (table.x - limit) / spread
                 log_seen = log_ndtr(at)
                 values[number] += float(log_seen.sum())
-                rise = np.exp(-0.5 * at**2 - log_seen) / math.sqrt(2 * math.pi)
-                bell = table.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
-                by_node = by_seen.sum(axis=0) * bell
-                slope[self.shares - 2] = -(rise.sum() + by_node.sum()) / spread
-                slope[self.shares - 1] = -(rise @ at + by_node @ at_nodes) / spread
+                tilt = np.exp(-0.5 * at**2 - log_seen) / math.sqrt(2 * math.pi)
+                nodes = by_node[number]
+                slopes[number, self.shares - 2] = (nodes.sum() - tilt.sum()) / spread
+                slopes[number, self.shares - 1] = (nodes @ at_nodes - tilt @ at) / spread
         return values, slopes
 
     def likelihood(self, theta: FloatArray) -> tuple[float, FloatArray]:
@@ -405,12 +465,13 @@ class Series:
         Shapes: `theta` (at least own,), result the same.
         """
         found, at = theta.copy(), self.parts
-        least = _NARROW * self.width**2
-        found[at] += theta[at + 3] - tail
-        found[at + 1 : at + 3] += theta[at + 3] ** 2 - tail**2
-        found[at + 1 : at + 3] = np.maximum(found[at + 1 : at + 3], least)
-        found[at + 3] = tail
-        found[at + 4 : at + 3 + self.knots.size] = 0.0
+        before, light = theta[self.tail], int(np.argmin(self.masses))
+        widths = slice(at + 1, self.tail)
+        found[widths] += np.log((1 + before**2) / (1 + tail**2)) / 2
+        found[at] += before * math.exp(theta[at + 1 + light])
+        found[at] -= tail * math.exp(found[at + 1 + light])
+        found[self.tail] = tail
+        found[self.tail + 1 : self.tail + self.knots.size] = 0.0
         return found
 
     def problem(self) -> Problem:

@@ -7,8 +7,8 @@ Light particles are missed, and what tells how many depends on the table.
 - Given a limit M₅₀ and a spread: u σ_d = M₅₀, and σ_d is the spread.
 - Given a cut: events below it are left out, and the species are those of a distribution that is cut
   there, which is exact whatever was missed below.
-- Otherwise the lightest event is taken for such a cut, except by equilibria, which learn a limit
-  from all tables together (`series`).
+- Otherwise a limit is learned: from the peaks of the table (`edges`), or of all tables of a series
+  together (`series`).  Comparisons take the lightest event of each table for a cut.
 
 Tables without errors of their own have σ = `UNKNOWN_SIGMA_KDA` for every event, less than any
 instrument's; the width of a species then holds its error.
@@ -115,8 +115,8 @@ class EventTable:
         if self.edge_kda is None:
             return self.notes
         sentence = (
-            "lies the lightest event, below which all is taken to be missed; `above_kda` cuts "
-            "where all are still detected, `limit_kda` says where half are"
+            "events begin, and nothing says what was missed of the lightest: intervals hold that "
+            "doubt; `above_kda` cuts where all are still detected, `limit_kda` says where half are"
         )
         return *self.notes, Note(self.name, sentence, f"at {self.edge_kda:.3g} kDa")
 

@@ -17,6 +17,7 @@ from iscat_analysis.species import (
     LEAST_EVENTS,
     SPECIES_COLUMNS,
     Efficiency,
+    Number,
     describe,
 )
 from iscat_analysis.species.bootstrap import draw_events
@@ -179,16 +180,24 @@ def test_few_events_are_listed_and_not_described() -> None:
         json.dumps(found.to_dict())
 
 
-def test_one_event_apart_is_an_outlier() -> None:
+def test_one_event_apart_is_no_species() -> None:
+    """It is background, which has events and nothing else, and spoils no species."""
     mass, sigma = sample()
-    found = describe(np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=0)
-    assert found.species["count"].iloc[-1] == pytest.approx(1)
+    found = describe(np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=4)
     assert found.species["outlier"].tolist() == [False, False, True]
-    assert any("at 400 kDa there are fewer than 3 events" in note for note in found.notes)
-    assert found.species["width_kda"].iloc[1] < 5  # and spoils no species
+    assert found.species["background"].tolist() == [False, False, True]
+    assert found.species["count"].iloc[-1] == pytest.approx(1, abs=0.7)
+    nothing = found.species.iloc[-1][["mass_kda", "mass_se", "width_kda", "fraction"]]
+    assert nothing.isna().all()
+    assert found.species["width_kda"].iloc[1] < 5
+    asked = describe(
+        np.append(mass, 400.0), np.append(sigma, 6.0), seed=1, draws=0, choice=Number(3)
+    )
+    assert asked.species["outlier"].tolist() == [False, False, True]
+    assert any("at 400 kDa there are fewer than 3 events" in note for note in asked.notes)
 
 
-def test_an_outlier_takes_no_part_of_the_particles_that_came() -> None:
+def test_an_event_apart_takes_no_part_of_the_particles_that_came() -> None:
     """One event where one in 200 is detected stood for more particles than all others."""
     mass, sigma = sample()
     mass = np.abs(mass) + 60
@@ -197,12 +206,13 @@ def test_an_outlier_takes_no_part_of_the_particles_that_came() -> None:
     found = describe(
         np.append(mass, 12.0), np.append(sigma, 6.0), efficiency=seen, seed=1, draws=20
     ).species
-    assert found["outlier"].tolist() == [True, *[False] * len(alone)]
-    assert found["efficiency"].iloc[0] < 0.05
-    assert np.isnan(found[["count_corrected", "mass_low", "mass_high", "fraction"]].iloc[0]).all()
-    assert found["fraction"].iloc[1:].sum() == pytest.approx(1)
-    for name in ("fraction", "fraction_low", "fraction_high"):
-        np.testing.assert_allclose(found[name].iloc[1:], alone[name], atol=0.05)
+    hardly = found["efficiency"] < 0.05
+    assert hardly.any()
+    nothing = found.loc[hardly, ["count_corrected", "mass_low", "mass_high", "fraction"]]
+    assert nothing.isna().all(axis=None)
+    assert found["fraction"].sum() == pytest.approx(1)
+    for name in ("fraction", "fraction_low", "fraction_high", "count_corrected"):
+        np.testing.assert_allclose(found[name].iloc[-1], alone[name].iloc[-1], rtol=0.05)
 
 
 def test_events_far_below_what_is_detected_stop_nothing() -> None:

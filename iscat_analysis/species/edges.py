@@ -1,0 +1,104 @@
+"""Where the limit of detection may lie, in a table that does not say what was missed.
+
+The chance that an event is seen where it was measured is Φ((x − T)/r).  Tables mostly begin where
+detection ends: T has some value between `_PLACES` of the lightest species, each as likely as any
+other, and with a probability of `_FAR` lies far below, where it makes no difference; r is as the
+noise of what was measured, or less.  At each of these the mixture is fitted again, and the
+likelihood says how probable that limit is: shares and counts are repeated at limits drawn from
+these.  A limit within the lightest peak makes it narrower than the others, and skewed, by which it
+is told.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from iscat_analysis.records import FloatArray
+from iscat_analysis.species.choices import Chosen
+from iscat_analysis.species.events import Edge, Events
+from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.structure import Limits, fit_jointly, free_structure
+
+_STEP = 0.25  # of the places: as fine as the likelihood of hundreds of events tells
+_PLACES = np.arange(-2.5, 1.51, _STEP)  # of T from the peak, in widths
+_SOFT = (0.0, 0.3, 0.6, 1.0)  # r in widths; the first are as sharp as a cut
+_HOPELESS = 12.0  # log-likelihood below the highest, beyond which a limit is not moved on
+_FAR = 0.2  # prior: that T lies below all of these, where it makes no difference
+_LOWEST = 10  # events that tell how far below the lightest a cut may be
+_JUST_BELOW = 1e-9  # of the lightest event
+_LEAST = 1e-3  # probability of a limit that is kept
+_EVALUATIONS, _TOLERANCE = 100, 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Possible:
+    """A limit of detection, how probable it is, and the species that go with it."""
+
+    probability: float
+    events: Events
+    mixture: Mixture
+    limits: Limits
+
+
+def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible]:
+    """Give the limits that are possible, the most probable first; `least` events make a species.
+
+    `events` say nothing of a limit.
+    """
+    best = found.best
+    seen = best.shares(events).sum(axis=0)[: best.species]
+    light = np.flatnonzero(seen >= least)
+    first = int(light[np.argmin(best.means()[light])]) if light.size else 0
+    middle = float(best.means()[first])
+    width = math.hypot(float(best.widths()[first]), math.sqrt(events.usual_variance))
+    lowest = np.sort(events.x)[:_LOWEST]
+    gap = float(np.ptp(lowest)) / max(lowest.size - 1, 1)
+    tried = [(math.log(_FAR), best, events, found.limits)]
+
+    def at(limit: float, soft: float, part: float, start: Mixture) -> tuple[float, Mixture]:
+        edge = replace(events, efficiency=Edge.at(limit, soft))
+        limits = found.limits if found.held else free_structure(edge, best)[1]
+        fit = fit_jointly(
+            edge, start, found.structure, limits, evaluations=_EVALUATIONS, tolerance=_TOLERANCE
+        )
+        prior = math.log((1 - _FAR) * max(part, 1e-9) / (_PLACES.size * len(_SOFT)))
+        tried.append((prior, fit, edge, limits))
+        return prior + fit.log_likelihood, fit
+
+    at(float(lowest[0]) * (1 - _JUST_BELOW), 0.0, min(gap / (_STEP * width), 1.0), best)
+    highest = max(prior + fit.log_likelihood for prior, fit, *_ in tried)
+    for soft in _SOFT:
+        fit, last = best, -math.inf
+        for limit in middle + _PLACES * width:
+            if limit <= 0 or (soft == 0 and limit >= lowest[0]):
+                continue
+            value, fit = at(limit, soft * width, 1.0, fit)
+            highest = max(highest, value)
+            if value < min(highest - _HOPELESS, last):
+                break
+            last = value
+    height = np.array([prior + fit.log_likelihood for prior, fit, *_ in tried])
+    chance: FloatArray = np.exp(height - height.max())
+    chance /= chance.sum()
+    order = [i for i in np.argsort(-chance, kind="stable") if chance[i] > _LEAST]
+    total = chance[order].sum()
+    return [
+        Possible(float(chance[i] / total), tried[i][2], tried[i][1], tried[i][3]) for i in order
+    ]
+
+
+def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
+    """Highest over lowest detected share of each species, within 95 % of the probability (s,)."""
+    shares = np.array([one.mixture.detected(one.events) for one in possible])
+    weight = np.array([one.probability for one in possible])
+    ratios = np.ones(shares.shape[1])
+    for number, column in enumerate(shares.T):
+        order = np.argsort(column)
+        below = np.cumsum(weight[order])
+        low = column[order][np.searchsorted(below, 0.025)]
+        high = column[order][min(np.searchsorted(below, 0.975), column.size - 1)]
+        ratios[number] = high / max(float(low), 1e-300)
+    return ratios
