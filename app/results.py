@@ -361,7 +361,7 @@ class Results:
             self._species_table.object = ""
             return
         self._species_curve.data = {"x": found[0], "y": found[1]}
-        means = self.species.species["mass_kda"].to_numpy(float)
+        means = self.species.species["mass_kda"].dropna().to_numpy(float)
         self._handles.data = {"x": means, "y": np.interp(means, *found)}
         rows = [
             (

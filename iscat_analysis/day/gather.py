@@ -125,8 +125,8 @@ def species_table(found: Sequence[Found]) -> pd.DataFrame:
     rows = []
     for each in found:
         described = each.summary.get("distribution") or {}
-        shares = shares_of(described.get("species", ()))
-        for species, share in zip(described.get("species", ()), shares, strict=True):
+        known = [s for s in described.get("species", ()) if not s.get("background")]
+        for species, share in zip(known, shares_of(known), strict=True):
             values = {key: species.get(key) for key in SPECIES_COLUMNS if key in species}
             seen = poisson_rate(species["landing"], each.seconds)
             rate, low, high = (value / (species["efficiency"] or math.nan) for value in seen)

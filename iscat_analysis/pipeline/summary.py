@@ -251,7 +251,8 @@ def species_width(
     used: pd.DataFrame, distribution: Mapping[str, Any] | None
 ) -> list[dict[str, Any]]:
     """Compare the width of each species with the σ of its events."""
-    species = distribution["species"] if distribution is not None else []
+    found = distribution["species"] if distribution is not None else []
+    species = [one for one in found if not one.get("background")]
     if not species:
         return []
     means = np.array([one["mass_kda"] for one in species])

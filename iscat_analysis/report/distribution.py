@@ -57,8 +57,9 @@ def distribution_section(found: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def _lead(found: Mapping[str, Any]) -> str:
-    fitted = len(found["species"])
-    count = sum(not item["outlier"] for item in found["species"])
+    described = [item for item in found["species"] if not item.get("background")]
+    fitted = len(described)
+    count = sum(not item["outlier"] for item in described)
     rivals = [row["delta_bic"] for row in found["selection"] if row["species"] != fitted]
     text = (
         f"{count} species explain {found['events']} events best (BIC), fitted to the events "
@@ -68,6 +69,10 @@ def _lead(found: Mapping[str, Any]) -> str:
     )
     if count < fitted:
         text += " What lies apart from them in one or two events is listed, and is no species."
+    for item in found["species"]:
+        if item.get("background"):
+            share = 100 * item["count"] / found["events"]
+            text += f" {share:.2g} % of the events are background, which is no species."
     if rivals:
         text += f" The next best number is worse by {number(min(rivals), 2)};"
     support = found["support"]

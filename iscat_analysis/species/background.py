@@ -30,6 +30,8 @@ def broad(events: Events) -> tuple[FloatArray, FloatArray]:
     octaves = math.log(high / low) / _OCTAVE
     if octaves < 1:
         mean = np.array([(low + high) / 2])
-        return mean, np.array([max((high - low) / 2, 0.5 * _OVERLAP * _OCTAVE * low) ** 2])
-    mean = np.geomspace(low, high, math.ceil(octaves) + 1)
-    return mean, (_OVERLAP * math.log(mean[1] / mean[0]) * mean) ** 2
+        return mean, (_OVERLAP * _OCTAVE * mean) ** 2
+    number = math.ceil(octaves)
+    step = math.log(high / low) / number
+    mean = low * np.exp(step * (np.arange(number) + 0.5))
+    return mean, (_OVERLAP * step * mean) ** 2

@@ -47,10 +47,9 @@ def bootstrap(
     rng = np.random.default_rng(seed)
     repeats, agreed = [], []
     chance = np.cumsum([one.probability for one in possible])
-    for number in range(draws):
-        one = possible[0]
-        if len(possible) > 1:
-            one = possible[int(np.searchsorted(chance[:-1], rng.random(), side="right"))]
+    places = (rng.permutation(draws) + 0.5) / draws if len(possible) > 1 else np.zeros(draws)
+    for number, place in enumerate(places):
+        one = possible[int(np.searchsorted(chance[:-1], place, side="right"))]
         events, best = one.events, one.mixture
         drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
         # from the estimate, so that species keep their places

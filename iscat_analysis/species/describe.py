@@ -37,8 +37,8 @@ LEAST_EFFICIENCY = 0.05
 it is free, what they weigh."""
 
 MOST_DOUBT = 3.0
-"""Where nobody knows what is detected, and the share of a species that is detected is not known to
-this factor, how many came is not determined."""
+"""Where nobody knows what is detected, and the share of a species among those that came is not
+known to this factor for what may have been missed of it, it is not determined."""
 
 LEAST_EVENTS = 10
 """Fewer are listed, not described."""
@@ -200,7 +200,7 @@ def describe(
     repeats, support = bootstrap(possible_limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
     mass_kda = peaks(events, best)
     scale = np.zeros(mass_kda.shape) if scale_error is None else scale_error(mass_kda)
-    doubtful = ratio_of_doubt(possible_limits)[: best.species] > MOST_DOUBT
+    doubtful = ratio_of_doubt(possible_limits) > MOST_DOUBT
     found = replace(found, best=best)
     species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, doubtful)
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
@@ -406,8 +406,8 @@ def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> list[str]:
         (
             pd.Series(doubtful, index=species.index),
             "what lies at {} kDa may be all that is seen of a lighter species: its mass and number "
-            f"are not determined, for what is missed of it is not known to a factor of "
-            f"{MOST_DOUBT:g}, and fractions are of the others; `limit_kda` says what is detected, "
+            f"are not determined, for its share is not known to a factor of {MOST_DOUBT:g}, and "
+            "fractions are of the others; `limit_kda` says what is detected, "
             "or `above_kda` from where on everything is",
         ),
         (

@@ -26,9 +26,10 @@ _STEP = 0.25  # of the places: as fine as the likelihood of hundreds of events t
 _PLACES = np.arange(-2.5, 1.51, _STEP)  # of T from the peak, in widths
 _SOFT = (0.0, 0.3, 0.6, 1.0)  # r in widths; the first are as sharp as a cut
 _HOPELESS = 12.0  # log-likelihood below the highest, beyond which a limit is not moved on
-_FAR = 0.2  # prior: that T lies below all of these, where it makes no difference
+_FAR = 0.35  # prior: that T lies below all of these, where it makes no difference
 _LOWEST = 10  # events that tell how far below the lightest a cut may be
 _JUST_BELOW = 1e-9  # of the lightest event
+_ENDS = (0.025, 0.975)
 _LEAST = 1e-3  # probability of a limit that is kept
 _EVALUATIONS, _TOLERANCE = 100, 1e-7
 
@@ -91,14 +92,23 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
 
 
 def ratio_of_doubt(possible: list[Possible]) -> FloatArray:
-    """Highest over lowest detected share of each species, within 95 % of the probability (s,)."""
-    shares = np.array([one.mixture.detected(one.events) for one in possible])
+    """Give the highest over the lowest share of each species that limits make possible (s,).
+
+    Within 95 % of their probability; a share that changes because another species is missed is not
+    in doubt, and has the ratio of its own chances of detection.
+    """
     weight = np.array([one.probability for one in possible])
-    ratios = np.ones(shares.shape[1])
-    for number, column in enumerate(shares.T):
-        order = np.argsort(column)
-        below = np.cumsum(weight[order])
-        low = column[order][np.searchsorted(below, 0.025)]
-        high = column[order][min(np.searchsorted(below, 0.975), column.size - 1)]
-        ratios[number] = high / max(float(low), 1e-300)
+    species = possible[0].mixture.species
+    ratios = np.full(species, np.inf)
+    for values in (
+        np.array([one.mixture.detected(one.events)[:species] for one in possible]),
+        np.array(
+            [one.mixture.came[:species] / one.mixture.came[:species].sum() for one in possible]
+        ),
+    ):
+        for number, column in enumerate(values.T):
+            order = np.argsort(column)
+            ends = np.searchsorted(np.cumsum(weight[order]), _ENDS)
+            low, high = column[order][np.minimum(ends, column.size - 1)]
+            ratios[number] = min(ratios[number], high / max(low, 1e-300))
     return ratios

@@ -31,6 +31,7 @@ _FIRST_SHARE = 0.05  # of the background
 _BROAD = 4.0  # whole widths that the others would have
 _REACH, _POINTS = 4.0, 81  # of a component: widths to both sides that are searched for maxima
 _ZOOMS, _ZOOM_POINTS = 4, 41  # towards the highest point of a peak
+_APART = 1e-3  # of a width: points that are nearer would have maxima of rounding between them
 _NOISES = np.linspace(0.1, 0.9, 5)  # quantiles that stand for the events' own noise
 
 
@@ -101,9 +102,11 @@ def by_peaks(events: Events, fit: Mixture) -> Mixture:
     own = slice(0, fit.narrow)
     weight, mean, variance = fit.weight[own], fit.mean[own], fit.variance[own]
     whole = np.sqrt(variance + events.usual_variance)
-    relative = np.log(whole / np.sqrt(mean))
-    trend = np.exp(np.average(relative, weights=weight)) * np.sqrt(mean)
-    wide = (whole > _BROAD * trend) & (np.sqrt(variance) > MOST_RELATIVE_WIDTH * mean)
+    usual = [  # of widths that grow with the root of the mass, and of such that do not
+        np.exp(np.average(np.log(whole / form), weights=weight)) * form
+        for form in (np.sqrt(mean), np.ones(mean.shape))
+    ]
+    wide = whole > _BROAD * np.maximum(*usual)
     if wide.all():
         wide[:] = False
     kind = np.full(fit.narrow, BACKGROUND)
@@ -150,6 +153,7 @@ def _density(
     noise = np.quantile(events.variance, _NOISES)
     whole = np.sqrt(variance + events.usual_variance)
     grid = np.sort((mean + np.outer(np.linspace(-_REACH, _REACH, _POINTS), whole)).ravel())
+    grid = grid[np.diff(grid, prepend=-np.inf) > _APART * whole.min()]
     total = variance[:, None] + noise
     away = grid[:, None, None] - mean[:, None]
     density = weight[:, None] * np.exp(-0.5 * away**2 / total) / np.sqrt(total)

@@ -19,7 +19,7 @@ from iscat_analysis.records import FloatArray
 
 _POWER, _POWER_SPREAD = 0.5, 0.5
 _DEVIATION = 0.25  # of ln T
-_ANY = 10.0  # of a, in ln T: as good as flat
+_ANY = 100.0  # of a, in ln T: as good as flat
 
 
 def width_prior(mass: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -76,7 +76,7 @@ def test_fewer_species_are_not_split(count: int) -> None:
 
 def test_each_events_own_error_matters_and_a_pooled_one_is_biased() -> None:
     """Half the events are five times as noisy; all are one species without a width."""
-    own, pooled, numbers = [], [], []
+    own, wrong, numbers = [], [], []
     for seed in range(DRAWS):
         rng = np.random.default_rng(1000 + seed)
         sigma = np.where(np.arange(300) % 2 == 0, 4.0, 20.0)
@@ -84,13 +84,14 @@ def test_each_events_own_error_matters_and_a_pooled_one_is_biased() -> None:
         mine = describe(x, sigma, seed=1, draws=0, max_species=3)
         same = describe(x, np.full(300, float(np.median(sigma))), seed=1, draws=0, max_species=3)
         own.append(mine.species["width_kda"].max())
-        pooled.append(same.species["width_kda"].max())
-        numbers.append((len(mine.species), len(same.species)))
-    assert [n for n, _ in numbers].count(1) >= DRAWS - 1
+        species = same.species
+        wrong.append(species["width_kda"].max() > 5 or species["outlier"].any())
+        numbers.append(len(mine.species))
+    assert numbers.count(1) >= DRAWS - 1
     assert np.median(own) < 2
-    # The control: pooled, one species falls apart or grows a width that it does not have.
-    assert np.median(pooled) > 5
-    assert sum(n > 1 for _, n in numbers) > DRAWS / 2
+    # The control: pooled, one peak grows a width that it does not have, or stands on a background;
+    # it falls apart no longer, for two components of one peak are one species.
+    assert sum(wrong) > DRAWS / 2
 
 
 def test_missed_particles_are_accounted_for_and_ignoring_them_is_biased() -> None:

@@ -21,7 +21,7 @@ from iscat_analysis.species import (
     describe,
 )
 from iscat_analysis.species.bootstrap import draw_events
-from iscat_analysis.species.events import Events
+from iscat_analysis.species.events import Edge, Events
 from iscat_analysis.species.mixture import Mixture
 
 
@@ -227,7 +227,10 @@ def test_events_far_below_what_is_detected_stop_nothing() -> None:
     assert any("mass and number are not determined" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("efficiency", [None, Efficiency(5.0, 12.0), Efficiency(5.0, 7.0)])
+@pytest.mark.parametrize(
+    "efficiency",
+    [None, Efficiency(5.0, 12.0), Efficiency(5.0, 7.0), Edge.at(58.0, 9.0), Edge.at(58.0, 0.0)],
+)
 def test_a_drawn_event_is_one_that_was_drawn_and_then_detected(
     efficiency: Efficiency | None,
 ) -> None:
@@ -239,7 +242,7 @@ def test_a_drawn_event_is_one_that_was_drawn_and_then_detected(
         true = rng.normal(mixture.mean[species], np.sqrt(mixture.variance[species]))
         x = rng.normal(true, noise)
         if efficiency is not None:
-            extra = math.sqrt(max(efficiency.sigma_kda**2 - noise**2, 0.0))
+            extra = float(efficiency.extra_sigma(np.array([noise]))[0])
             x = x[rng.normal(x, extra) > efficiency.threshold_kda]
         assert ks_2samp(found.x, np.abs(x)).pvalue > 1e-3
 

@@ -223,6 +223,22 @@ def test_the_monomer_is_taken_from_two_peaks() -> None:
     assert peaks == pytest.approx([80, 160], abs=6)
 
 
+@pytest.mark.parametrize("seed", [1, 3])
+def test_dimers_may_be_twice_as_wide_as_monomers(seed: int) -> None:
+    """The common width of both was that of monomers, and dimers' tails were background."""
+    random, kd_nm = np.random.default_rng([61, seed]), 8.35
+    totals = 2.0 ** np.arange(7.0)[:, None]
+    tables = []
+    for monomer, dimer in at_equilibrium("dimer", totals, kd_nm) * [1, 2**LANDING_POWER]:
+        is_dimer = random.random(600) < dimer / (monomer + dimer)
+        mass = random.normal(np.where(is_dimer, 160.0, 80.0), np.where(is_dimer, 25.3, 12.7))
+        tables.append(pd.DataFrame({"mass_kda": mass}))
+    samples = pd.DataFrame({"concentration_nm": totals[:, 0]})
+    fit = ia.fit_kd(samples, tables=tables, model="dimer", masses_kda=[80.0]).fit
+    assert fit.kd_low < kd_nm < fit.kd_high < 3 * fit.kd_low
+    assert fit.masses_kda == pytest.approx([80, 160], abs=4)
+
+
 def test_peaks_that_are_no_ladder_need_the_mass() -> None:
     totals = DIMER.to_numpy(float)
     tables = draw_series(np.random.default_rng(11), "dimer", totals, 1e-5, [80.0], number=300)
