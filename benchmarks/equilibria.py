@@ -47,6 +47,7 @@ class Kind:
     tail_kda: float = 0.0  # mean of an exponential that is added
     uniform: float = 0.0  # share of events anywhere from 20 to 600 kDa
     aggregates: float = 0.0  # share of particles of 3 to 8 monomers
+    growth: float = 0.0  # power of the mass with which widths grow
     power: float = LANDING_POWER
 
 
@@ -57,6 +58,8 @@ KINDS = {
     "uniform": Kind(uniform=0.25),
     "aggregates": Kind(aggregates=0.1),
     "landing": Kind(power=0.0),
+    "wide": Kind(growth=1.0),
+    "wide, landing": Kind(growth=1.0, power=0.0),
 }
 
 
@@ -72,7 +75,7 @@ def draw(random: np.random.Generator, kind: Kind) -> list[pd.DataFrame]:
         sigma = np.full(DRAWN, 12.0)
         if kind.sigma_kda:
             true, sigma = random.normal(true, 3.0), random.uniform(*kind.sigma_kda, DRAWN)
-        mass = random.normal(true, sigma)
+        mass = random.normal(true, sigma * copies**kind.growth)
         elsewhere = random.random(DRAWN) < kind.uniform
         mass = np.where(elsewhere, random.uniform(20, 600, DRAWN), mass)
         seen = (mass > 0) & (random.normal(mass, 8.0) > kind.limit_kda)

@@ -335,13 +335,15 @@ class Distribution(Document):
     branch: Literal["magnitude", "landing", "leaving"] = key("Which events; magnitude: all, |mass|")
     events: Count = key("Events used")
     species: list[dict[str, Any]] = key(
-        "By rising mass [kDa]; *_low and *_high are 95 % intervals of a parametric bootstrap; "
+        "By rising mass [kDa], that where the peak of a species is highest; mean_kda is its mean; "
+        "*_low and *_high are 95 % intervals of a parametric bootstrap; "
         "width_kda is beyond measurement error; mass_systematic is the error of the mass scale, "
         "which the interval of the mass includes; efficiency is for particles that stay as long "
         "as the window, and half of those that stay stay_frames are found; count is of the events "
-        "found, count_corrected and fraction are of the particles that landed; an outlier has "
-        "fewer than three events, and no fraction; a species that is detected less than once in "
-        "20 times, or may be a flank of a lighter one, is not determined, and count_corrected, "
+        "found, count_corrected and fraction are of the particles that landed; an outlier is no "
+        "species, but fewer than three events, or the background, which comes last and has "
+        "neither mass nor fraction; a species that is detected less than once in 20 times, or "
+        "whose share is not known to a factor of three, is not determined, and count_corrected, "
         "fraction and interval are null"
     )
     selection: list[dict[str, Any]] = key("Log-likelihood and BIC of each number of species tried")

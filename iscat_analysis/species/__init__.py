@@ -6,7 +6,10 @@ measured mass x_i and standard deviation σ_i comes from species k with
     x_i ~ N(μ_k, τ_k² + σ_i²),
 
 so the width τ_k is what exceeds the measurement error: extreme deconvolution in one dimension
-(Bovy, Hogg & Roweis, Ann. Appl. Stat. 5, 1657, 2011).  Nothing is binned.
+(Bovy, Hogg & Roweis, Ann. Appl. Stat. 5, 1657, 2011).  Nothing is binned.  Widths have a weak prior
+(`widths`), and events of any mass a background that varies slowly (`background`).  That one mixture
+serves species, ladders, comparisons and equilibria.  Where nobody asks for masses, species are
+peaks: components whose sum has one maximum are one (`search`).
 
 Light particles are missed.  The matched filter accepts a particle of mass m if its estimate
 y ~ N(m, σ_d²) exceeds u·σ_d, and the fit's x uses the same light at least as well, so that y is x
@@ -16,13 +19,15 @@ with further noise: given x, selection no longer depends on m.  The likelihood o
 
 s_i = max(σ_d, σ_i), and the weights w_k are those of the particles that came, seen or not.
 
-The number of species has the least BIC; a parametric bootstrap gives the intervals and says how
-often it would choose that number again.
+Where nobody says what is missed, the limit is a nuisance with a prior (`edges`).  The number of
+components has the least BIC; a parametric bootstrap gives the intervals and says how often it would
+choose that number again.
 
 `describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` holds the
-species, `structure` maximises the likelihood above where species or samples share parameters,
-`search` tries numbers of species, `choices` are a number, given masses or a ladder, `bootstrap`
-repeats the measurement, and `curves` holds what is drawn.  `tables` reads events of any program.
+components and says which are one species, `structure` maximises the likelihood above where species
+or samples share parameters, `search` tries numbers of components, `choices` are a number, given
+masses or a ladder, `bootstrap` repeats the measurement, and `curves` holds what is drawn.  `tables`
+reads events of any program.
 
 `diameters` runs the same mixture on the logarithms of the diameters of spheres, whose errors depend
 on the diameter.
