@@ -18,7 +18,7 @@ from iscat_analysis.species.search import ascend, height, joined_starts, peaks, 
 from iscat_analysis.species.structure import fit_jointly, polish
 
 _SUPPORT_DRAWS = 20
-_RIVAL_EVALUATIONS = 150
+_RIVAL_STEPS, _RIVAL_EVALUATIONS = 10, 150
 _TOLERANCE = 1e-6  # of the log-likelihood per event: a tenth of a standard error for hundreds
 
 
@@ -96,7 +96,7 @@ def draw_events(events: Events, mixture: Mixture, n: int, rng: np.random.Generat
 
 def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
     """Fit one species more and, where there are two or more, one less."""
-    more = [ascend(events, start) for start in split_starts(events, fit)]
+    more = [ascend(events, start, _RIVAL_STEPS) for start in split_starts(events, fit)]
     return [
         polish(
             events,

@@ -25,7 +25,6 @@ from iscat_analysis.species.widths import width_prior
 MOST_RELATIVE_WIDTH = 0.4
 """Width over mass from which a component is as broad as a background."""
 
-_EM_STEPS = 40
 _POLISHED = 2  # starts, the best after climbing
 _FIRST_SHARE = 0.05  # of the background
 _BROAD = 4.0  # whole widths that the others would have
@@ -66,13 +65,13 @@ def without_background(events: Events, fit: Mixture) -> Mixture:
     return found if found.bic(events.x.size) <= fit.bic(events.x.size) else fit
 
 
-def ascend(events: Events, start: Mixture) -> Mixture:
+def ascend(events: Events, start: Mixture, steps: int = 40) -> Mixture:
     """EM steps without selection by the detector: a start for `structure.polish`."""
     weight, mean, variance = start.weight.copy(), start.mean.copy(), start.variance.copy()
     own, rest, noise = slice(0, start.narrow), slice(start.narrow, None), events.usual_variance
     rows, middle = width_prior(mean[own])
     precision, pull = rows.T @ rows, rows.T @ middle
-    for _ in range(_EM_STEPS):
+    for _ in range(steps):
         sums = mixture_sums(events.x, events.variance, weight, mean, variance)[1]
         size, first, second, _, noisy = sums[own].T
         size = size + 1e-12
