@@ -24,7 +24,7 @@ from iscat_analysis.species.curves import (
 from iscat_analysis.species.edges import Possible, possible_edges, ratio_of_doubt
 from iscat_analysis.species.events import Efficiency, Events, possible
 from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.search import MOST_RELATIVE_WIDTH, peaks
+from iscat_analysis.species.search import peaks
 from iscat_analysis.units import count
 
 Branch = Literal["magnitude", "landing", "leaving"]
@@ -66,6 +66,7 @@ others."""
 _TWO_SIDED_95 = 1.959964
 _INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
+_MOST_RELATIVE_WIDTH = 0.4  # width over mass
 _SKEWED = 0.02  # of the mass: how far from it a mean is told
 _NO_LADDER = 0.01  # p-value
 _DIGITS = 6  # of the curves in summary.json
@@ -425,7 +426,7 @@ def _remarks(species: pd.DataFrame, doubtful: BoolArray) -> list[str]:
             f"at {{}} kDa there are fewer than {LEAST_SPECIES} events: outliers, and no species",
         ),
         (
-            species["width_kda"] > MOST_RELATIVE_WIDTH * species["mass_kda"],
+            species["width_kda"] > _MOST_RELATIVE_WIDTH * species["mass_kda"],
             "the species at {} kDa is as broad as a background: it may hold all events that the "
             "other species do not explain",
         ),

@@ -22,9 +22,6 @@ from iscat_analysis.species.mixture import BACKGROUND, Mixture
 from iscat_analysis.species.structure import polish
 from iscat_analysis.species.widths import width_prior
 
-MOST_RELATIVE_WIDTH = 0.4
-"""Width over mass from which a component is as broad as a background."""
-
 _POLISHED = 2  # starts, the best after climbing
 _FIRST_SHARE = 0.05  # of the background
 _BROAD = 4.0  # whole widths that the others would have

@@ -85,16 +85,21 @@ SIX = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 300.0])
 
 
 def bare(
-    seed: int, *, tail: float = 0.0, dirt: float = 0.0, limit: float = 0.0, power: float = -1 / 6
-) -> list[pd.DataFrame]:
-    """Tables of 600 masses without errors, as other programs give them; dirt is uniform."""
+    seed: int, *, tail: float = 0.0, dirt: float = 0.0, limit: float = 0.0, power: float = -1 / 6,
+    growth: float = 0.0,
+) -> list[pd.DataFrame]:  # fmt: skip
+    """Tables of 600 masses without errors, as other programs give them; dirt is uniform.
+
+    Widths grow with a power of the mass.
+    """
     random = np.random.default_rng([92, seed])
     tables = []
     for total in SIX:
         monomer, dimer = at_equilibrium("dimer", np.array([[total]]), KD_NM)[0] * [1, 2**power]
         true = np.where(random.random(3000) < dimer / (monomer + dimer), 132.0, 66.0)
+        width = 12.0 * (true / 66.0) ** growth
         true += random.exponential(tail, true.size) if tail else 0.0
-        mass = random.normal(true, 12.0)
+        mass = random.normal(true, width)
         mass = np.where(random.random(mass.size) < dirt, random.uniform(20, 600, mass.size), mass)
         seen = mass[random.normal(mass, 8.0) > limit] if limit else mass
         tables.append(pd.DataFrame({"mass_kda": seen[seen > 0][:600]}))
@@ -114,6 +119,7 @@ def bare_fit(seed: int, landing_power: float | None = None, **world: float) -> E
         pytest.param({"tail": 12.0}, id="tail"),
         pytest.param({"dirt": 0.25}, id="dirt", marks=pytest.mark.large),
         pytest.param({"limit": 65.0}, id="limit"),
+        pytest.param({"growth": 1.0}, id="wide"),
         pytest.param({"power": 0.0}, id="landing", marks=pytest.mark.large),
     ],
 )
