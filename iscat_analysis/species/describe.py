@@ -21,7 +21,7 @@ from iscat_analysis.species.curves import (
     curves_of,
     histogram_of,
 )
-from iscat_analysis.species.edges import Possible, possible_edges, ratio_of_doubt
+from iscat_analysis.species.edges import Possible, ratio_of_doubt, with_edges
 from iscat_analysis.species.events import Efficiency, Events, possible
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import peaks
@@ -196,7 +196,7 @@ def describe(
     found = choice.choose(events)
     possible_limits = [Possible(1.0, events, found.best, found.limits)]
     if not limit_known:
-        possible_limits = possible_edges(events, found, LEAST_SPECIES - 0.5)
+        found, possible_limits = with_edges(events, found, choice, LEAST_SPECIES - 0.5)
     events, best = possible_limits[0].events, possible_limits[0].mixture
     repeats, support = bootstrap(possible_limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
     mass_kda = peaks(events, best)

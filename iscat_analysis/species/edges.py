@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from iscat_analysis.records import FloatArray
-from iscat_analysis.species.choices import Chosen
+from iscat_analysis.species.choices import Choice, Chosen
 from iscat_analysis.species.events import Edge, Events
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.structure import Limits, fit_jointly, free_structure
@@ -44,12 +44,27 @@ class Possible:
     limits: Limits
 
 
+def with_edges(
+    events: Events, found: Chosen, choice: Choice, least: float
+) -> tuple[Chosen, list[Possible]]:
+    """Choose species again where a limit is probable: without it a cut peak looks like two."""
+    possible = possible_edges(events, found, least)
+    if possible[0].events.efficiency is None or not found.searched:
+        return found, possible
+    again = choice.choose(possible[0].events)
+    others = possible_edges(events, again, least)
+    n = events.x.size
+    if others[0].mixture.bic(n) < possible[0].mixture.bic(n):
+        return again, others
+    return found, possible
+
+
 def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible]:
     """Give the limits that are possible, the most probable first; `least` events make a species.
 
     `events` say nothing of a limit.
     """
-    best = found.best
+    best = fit_jointly(events, found.best, found.structure, found.limits)
     seen = best.shares(events).sum(axis=0)[: best.species]
     light = np.flatnonzero(seen >= least)
     first = int(light[np.argmin(best.means()[light])]) if light.size else 0
@@ -69,7 +84,8 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
         tried.append((prior, fit, edge, limits))
         return prior + fit.log_likelihood, fit
 
-    at(float(lowest[0]) * (1 - _JUST_BELOW), 0.0, min(gap / (_STEP * width), 1.0), best)
+    if gap > 0:
+        at(float(lowest[0]) * (1 - _JUST_BELOW), 0.0, min(gap / (_STEP * width), 1.0), best)
     highest = max(prior + fit.log_likelihood for prior, fit, *_ in tried)
     for soft in _SOFT:
         fit, last = best, -math.inf
