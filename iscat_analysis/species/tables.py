@@ -101,8 +101,6 @@ class EventTable:
     notes: tuple[Note, ...] = ()
     edge_kda: float | None = None
     """The lightest event, where nothing but it tells what was missed."""
-    errors_known: bool = True
-    """Whether the errors are of the table or of the user, and not `UNKNOWN_SIGMA_KDA`."""
 
     @property
     def events(self) -> Events:
@@ -302,10 +300,9 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         good[column].to_numpy(np.float64) if column in good else np.full(len(good), math.nan)
         for column in ("mass_kda", "sigma_mass_kda", "frame", "x_px", "y_px")
     )
-    errors_known = sigma_kda is not None or bool(np.isfinite(sigma[np.isfinite(mass)]).any())
     if sigma_kda is not None:
         sigma = np.full(mass.shape, sigma_kda)
-    elif not errors_known:
+    elif not np.isfinite(sigma[np.isfinite(mass)]).any():
         sigma = np.full(mass.shape, UNKNOWN_SIGMA_KDA)
         sentence = (
             "no event has an error of its own, so that the width of a species holds the errors; "
@@ -338,7 +335,6 @@ def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTab
         window_frames=window or None,
         scale_error=shared_error(rows),
         notes=tuple(notes),
-        errors_known=errors_known,
     )
 
 
