@@ -113,9 +113,8 @@ class EventTable:
         if self.edge_kda is None:
             return self.notes
         sentence = (
-            "there are no events, and nothing says what was missed of the lightest: intervals "
-            "hold that doubt; `above_kda` cuts where all are still detected, `limit_kda` says "
-            "where half are"
+            "there are no events, and nothing says what was missed of the lightest; `above_kda` "
+            "cuts where all are still detected, `limit_kda` says where half are"
         )
         return *self.notes, Note(self.name, sentence, f"below {self.edge_kda:.3g} kDa")
 
