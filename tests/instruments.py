@@ -9,7 +9,7 @@ calibration would.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -82,9 +82,17 @@ class Pictures:
         The microscope.
     reach_nm : float
         Distance from the particle to the farthest pixel.
+    pixel_nm : float
+        Side of the pixels, over which light is averaged; 0 for the light at a point.
     """
 
-    def __init__(self, instrument: Instrument, reach_nm: float = _FARTHEST_NM) -> None:
+    def __init__(
+        self,
+        instrument: Instrument,
+        reach_nm: float = _FARTHEST_NM,
+        pixel_nm: float = 84.0,
+    ) -> None:
+        self._inside_nm = pixel_nm / 2 * np.polynomial.legendre.leggauss(2)[0]
         m = instrument
         k = 2 * np.pi / m.wavelength_nm
         alpha = np.arcsin(m.na / m.n_immersion)
@@ -173,17 +181,26 @@ class Pictures:
 
     def contrast(self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float) -> FloatArray:
         """Contrast of a particle at camera minus particle coordinates that broadcast."""
-        linear, square = self._terms(dx_nm, dy_nm)
+        linear, square = self._averaged(self._terms, dx_nm, dy_nm)
         amplitude = mass_kda * self.per_kda
         return amplitude * linear + amplitude**2 * square
+
+    def _averaged(
+        self, light: Callable[..., tuple[FloatArray, ...]], dx_nm: FloatArray, dy_nm: FloatArray
+    ) -> list[FloatArray]:
+        """Average light over the pixels around points."""
+        points = [light(dx_nm + x, dy_nm + y) for x in self._inside_nm for y in self._inside_nm]
+        return [np.mean(parts, axis=0) for parts in zip(*points, strict=True)]
 
     def quadratures(
         self, dx_nm: FloatArray, dy_nm: FloatArray, mass_kda: float, turn: float
     ) -> FloatArray:
         """Interference with a reference that is ahead by an angle."""
-        e = self._field(dx_nm, dy_nm)
-        reference = self._reference * np.exp(1j * turn)
-        return mass_kda * self.per_kda * 2 * np.real(e @ np.conj(reference))
+        reference = np.conj(self._reference * np.exp(1j * turn))
+        (light,) = self._averaged(
+            lambda x, y: (2 * np.real(self._field(x, y) @ reference),), dx_nm, dy_nm
+        )
+        return mass_kda * self.per_kda * light
 
     def at_height(self, z_nm: float) -> Pictures:
         """Put the particle at another height, and leave the focus where it was."""
@@ -205,6 +222,13 @@ class Pictures:
         self, dx_nm: FloatArray, dy_nm: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Give what real part, imaginary part and squared size of a strength multiply."""
+        real, imaginary, square = self._averaged(self._of_scatterer, dx_nm, dy_nm)
+        return real, imaginary, square
+
+    def _of_scatterer(
+        self, dx_nm: FloatArray, dy_nm: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Do what `terms_of_scatterer` does, at points."""
         r, phi = np.hypot(dx_nm, dy_nm), np.arctan2(dy_nm, dx_nm)
         parts = self._spline(r)
         e = sum(parts[n] * np.exp(1j * h * phi)[..., None] for n, h in enumerate(self._orders))
@@ -243,7 +267,7 @@ def focus_scan(
     farthest = float(np.hypot(*shape)) * pixel_nm
     frames = np.empty((len(focus_nm), *shape), dtype=np.uint16)
     for t, focus in enumerate(focus_nm):
-        pictures = Pictures(replace(instrument, focus_nm=float(focus)), farthest)
+        pictures = Pictures(replace(instrument, focus_nm=float(focus)), farthest, pixel_nm)
         expected = np.full(shape, level_e)
         for (x_px, y_px), strength in zip(places_px, strengths, strict=True):
             at = (x - x_px * pixel_nm)[None, :], (y - y_px * pixel_nm)[:, None]
@@ -315,7 +339,7 @@ class InstrumentMovie:
             low, high = min(float(focus_nm.min()), 0.0), max(float(focus_nm.max()), 0.0)
             rises = np.linspace(low, high, max(math.ceil((high - low) / _FOCUS_PART_NM), 3) + 1)
         pictures = [
-            Pictures(replace(instrument, focus_nm=instrument.focus_nm + rise), reach_nm)
+            Pictures(replace(instrument, focus_nm=instrument.focus_nm + rise), reach_nm, pixel_nm)
             for rise in rises
         ]
         alike = Pictures(instrument, reach_nm)

@@ -17,10 +17,11 @@ import numpy as np
 from iscat_analysis.config import AUTO, CameraConfig, Optics
 from iscat_analysis.records import FloatArray
 
-TOLERANCE = 2e-4
+TOLERANCE = 2.5e-4
 """Largest error of the mean over a pixel, of any wave that the pupil passes; images are then right
 to this part of their peak, and masses too."""
 
+_LARGEST_NA = 1.5  # of most objectives; points do not move where optics are learned
 _ZERO_ERROR = 0.9  # of the band: the error vanishes there, and is about even below and above
 _NEWTON = 8  # steps to this point
 _WAVES = np.linspace(0.0, 1.0, 101)  # of the band, on which the error is judged
@@ -39,7 +40,8 @@ class PixelArea:
     """How pixels integrate.
 
     `samples` is their number along each axis, "auto" for as many as `TOLERANCE` asks for; `side`
-    that of the active square over the spacing of pixels; `band` is of the light [rad/nm].
+    that of the active square over the spacing of pixels; `band` is the largest wavenumber that is
+    averaged well [rad/nm].
     """
 
     samples: int | str
@@ -52,7 +54,9 @@ class PixelArea:
         samples = camera.samples_per_pixel
         if samples == AUTO and optics.convention == "dong2021":
             samples = 1
-        return cls(samples, math.sqrt(camera.fill_factor), bandwidth(optics))
+        aperture = _LARGEST_NA if optics.na <= _LARGEST_NA else optics.n_immersion
+        band = bandwidth(optics) * aperture / optics.na
+        return cls(samples, math.sqrt(camera.fill_factor), band)
 
     def points(self, pixel_nm: float) -> tuple[FloatArray, FloatArray]:
         """Offsets from the centre along each axis [nm], and their weights, whose sum is 1."""

@@ -82,7 +82,7 @@ def test_there_are_as_few_points_as_the_light_needs() -> None:
     for pixel_nm in np.geomspace(1.0, 400.0, 60):
         offsets, weights = PixelArea.of(*_camera(pixel_nm)).points(pixel_nm)
         assert weights.sum() == pytest.approx(1.0, abs=1e-12)
-        waves = np.linspace(0.0, 2 * np.pi / 525.0 * 1.42, 500)
+        waves = np.linspace(0.0, 2 * np.pi / 525.0 * 1.5, 500)  # of the largest aperture
         box = np.sinc(waves * pixel_nm / 2 / np.pi)
         assert np.abs(weights @ np.cos(np.outer(offsets, waves)) - box).max() < 1.01 * TOLERANCE
         fewer, share = np.polynomial.legendre.leggauss(max(offsets.size - 1, 1))

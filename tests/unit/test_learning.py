@@ -317,7 +317,7 @@ def test_a_median_has_its_own_noise_when_optics_are_tested(tmp_path: Path) -> No
         "simulation.photons_per_pixel": 3e4,
         "simulation.events": events,
     }
-    ia.simulate_movie({**setup, **light}, tmp_path / "movie.tif", seed=1)
+    ia.simulate_movie({**setup, **light}, tmp_path / "movie.tif", seed=2)
     result = ia.fit_movie(tmp_path / "movie.tif", config={**setup, "background.method": "median"})
     assert result.summary["optics"]["tested"] == 4
     assert result.summary["optics"]["median_p"] > 10 * REJECTED_P

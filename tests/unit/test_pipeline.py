@@ -246,7 +246,8 @@ def test_dark_field(level_e: float | None, camera: dict, tmp_path: Path) -> None
         camera={"gain_e_per_adu": 1.0, **camera},  # which little light does not tell
         background={"level_e": level_e},
         simulation={
-            "events": [GOLD_EVENTS[0]], "photons_per_pixel": 800.0, "background": "flat", "seed": 12,
+            "events": [GOLD_EVENTS[0]], "photons_per_pixel": 800.0, "background": "flat",
+            "seed": 12,
         },
     )  # fmt: skip
     analysis, truth = _run(config, tmp_path)
