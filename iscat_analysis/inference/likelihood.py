@@ -102,8 +102,11 @@ class Likelihood:
         """Which pixels are not masked, shape (ny, nx)."""
         return self.noise.used(self.data)
 
-    def values(self, thetas: FloatArray) -> FloatArray:
+    def values(self, thetas: FloatArray, *, pictured: bool = False) -> FloatArray:
         """Log-likelihood at many parameter vectors.
+
+        Where `pictured`, images at the model's height come from a table of them, whatever their
+        pixels; it is as right as the images of fits.
 
         Shapes: `thetas` (n, 5), result (n,).
         """
@@ -117,7 +120,7 @@ class Likelihood:
             return out
         known = points if inside.all() else points[inside]
         values = np.empty(len(known))
-        lens, table = self._table(known)
+        lens, table = self._table(known, pictured=pictured)
         value_batch(table, lens, *self._arguments[1:], known, values)
         out[inside] = values
         out[np.isnan(out)] = -np.inf  # an amplitude so large that the light overflows
@@ -343,12 +346,12 @@ class Likelihood:
             f"{self.model.reach_nm:.0f} nm from the particle to the farthest pixel"
         )
 
-    def _table(self, thetas: FloatArray) -> tuple[Lens, AxialTable]:
+    def _table(self, thetas: FloatArray, *, pictured: bool) -> tuple[Lens, AxialTable]:
         """Profiles along z, or at the particle's fixed height where no other is asked for."""
         model, fixed = self.model, self.model.height_nm
         if not np.all(thetas[:, 2] == fixed):
             return model.lens, model.axial_table
-        if self.is_pictured(fixed, thetas.min(0), thetas.max(0)):
+        if pictured and self.is_pictured(fixed, thetas.min(0), thetas.max(0)):
             return model.picture_table(self.grid.pixel_nm, max(self.grid.shape))
         return model.lens, model.height_table(fixed)
 

@@ -220,6 +220,6 @@ def compile_kernels(model: ForwardModel, parts: Collection[str]) -> None:
     else:
         calls = [maximise, differentiate, *calls]
     if "posteriors" in parts:
-        calls.append(lambda: likelihood.values(theta[None]))
+        calls.append(lambda: likelihood.values(theta[None], pictured=True))
     for call in calls:
         call()

@@ -71,7 +71,7 @@ def sample_posterior(
         out = np.full(len(points), -np.inf)
         thetas = np.tile(fit.theta, (int(inside.sum()), 1))
         thetas[:, index] = points[inside]
-        out[inside] = likelihood.values(thetas)
+        out[inside] = likelihood.values(thetas, pictured=True)
         if normal:
             out[inside] += prior.log_density(thetas, likelihood.model.scale)
         return out

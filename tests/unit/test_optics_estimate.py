@@ -60,7 +60,7 @@ def test_value_is_that_of_the_likelihood_of_fits() -> None:
         theta = np.array([image.x_nm, image.y_nm, image.z_nm, 5000.0, 0.01])
         place = (image.grid, image.x_nm, image.y_nm, image.z_nm, 5000.0)
         mine = image.noise.terms(image.data, model.gradient(*place)[0], 0.01)[0]
-        assert mine == pytest.approx(likelihood.score_fisher(theta)[0], rel=1e-9)
+        assert mine == pytest.approx(likelihood.values(theta[None])[0], rel=1e-9)
 
 
 @pytest.mark.parametrize("heights_nm", [None, (0.0, 200.0)])

@@ -86,7 +86,9 @@ def test_a_normal_prior_narrows_the_posterior_as_it_must(gaussian: Case) -> None
     thetas = np.tile(fit.theta, (32, 1))  # what is kept is the likelihood without the prior
     thetas[:, :3] = result.samples[:, 7, :3]
     thetas[:, 3] = [likelihood.model.scale.amplitude(m) for m in result.samples[:, 7, 3]]
-    np.testing.assert_allclose(likelihood.values(thetas), result.log_likelihood[:, 7], rtol=1e-9)
+    np.testing.assert_allclose(
+        likelihood.values(thetas, pictured=True), result.log_likelihood[:, 7], rtol=1e-9
+    )
 
 
 def test_likelihoods_belong_to_their_draws(gaussian: Case) -> None:
@@ -95,7 +97,9 @@ def test_likelihoods_belong_to_their_draws(gaussian: Case) -> None:
     thetas = np.tile(fit.theta, (16, 1))
     thetas[:, :3] = result.samples[:, 7, :3]
     thetas[:, 3] = [likelihood.model.scale.amplitude(m) for m in result.samples[:, 7, 3]]
-    np.testing.assert_allclose(likelihood.values(thetas), result.log_likelihood[:, 7], rtol=1e-9)
+    np.testing.assert_allclose(
+        likelihood.values(thetas, pictured=True), result.log_likelihood[:, 7], rtol=1e-9
+    )
 
 
 def test_the_same_seed_draws_the_same(gaussian: Case) -> None:
@@ -158,7 +162,7 @@ def test_a_chain_grows_until_it_converges(gaussian: Case) -> None:
 def test_a_chain_that_is_interrupted_prints_nothing(
     gaussian: Case, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Likelihood, "values", interrupt)
