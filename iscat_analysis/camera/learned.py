@@ -20,12 +20,14 @@ from numpy.typing import NDArray
 from iscat_analysis.camera.burnt_in import find_text, patched, without_text
 from iscat_analysis.camera.calibration.laws import Law, find_law
 from iscat_analysis.camera.calibration.transfer import Transfer, measure_transfer
+from iscat_analysis.camera.calibration.true_zero import TOLD, judge_zero
 from iscat_analysis.camera.counts import (
     Camera,
     camera_from_config,
     padded_bits,
     rounding_variance_adu2,
 )
+from iscat_analysis.camera.first_frames import noise_adu2, sample
 from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain
 from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
 from iscat_analysis.camera.response import Response, full_scale, linear, response_of
@@ -40,17 +42,9 @@ MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", 
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
 """Where a number comes from."""
 
-_MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at, a second
-_LEAST_FRAMES = 8
 _GAIN_FRAMES = 128  # on which the gain is measured, to some parts in a thousand
-_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
-_FIRST_FRAMES = 64  # frames among which some may be dark
-_DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
-_DARK_SPREAD_SHARE = 0.01  # of the usual counts, by which dark frames may differ
-# of what the counts of dark frames would show, if they were light: its error, and itself
-_LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
+_FIRST_FRAMES = 64  # frames that motion of the pattern is taken from
 _LARGEST_NOISE_RATIO = 4.0  # times the median, of the noise of a pixel in the dark that is left out
-_DARK_NOISE_SHARE = 0.5  # of the noise that its counts would have if they were light
 _READ_E, _READ_STEPS = 30.0, 3.0  # read noise that a camera may have without anybody saying so [e]
 _ROUNDED = 1e-3  # of the light's variance, from where rounding is not left out
 _FINE = 1e4  # times the variance of rounding, from where that has no part in the gain
@@ -80,6 +74,7 @@ class LearnedCamera:
     numbers: Mapping[str, Number]
     messages: tuple[str, ...]
     level_e: float = 0.0
+    refusal: str = ""
     response: Response | None = None
     text: BoolArray | None = None
     padded: int = 0
@@ -149,6 +144,8 @@ def with_camera(
         moving=config.fit.mode == "track" and resolved,
         metadata=movie.metadata,
     )  # fmt: skip
+    if learned.refusal:
+        raise DataError(f"{movie.name}: {learned.refusal}")
     if text is not None:
         movie = without_text(movie, text, learned.camera)
         learned = replace(learned, text=text)
@@ -174,7 +171,7 @@ def learn_camera(
     if config.response is not None:
         camera = replace(camera, full_scale_adu=full_scale(config, movie.dtype))
     free = {key for key in ASSUMED if getattr(config, key) == AUTO}
-    counts, dark = _sample(movie, span, math.prod(shape))
+    counts, dark = sample(movie, span, math.prod(shape))
     found = _Learning(camera, free, counts, additive, moving)
     if metadata is not None and config.response is None:
         found.take_metadata(metadata)
@@ -188,67 +185,11 @@ def learn_camera(
         camera=replace(found.camera, law=found.law),
         numbers=numbers,
         messages=tuple(found.messages),
-        level_e=found.transfer.level if found.transfer else 0.0,
+        level_e=found.level_e,
+        refusal=found.refusal,
         response=found.response(),
         padded=padded_bits(counts) if counts.dtype.itemsize * 8 == _WORD else 0,
     )
-
-
-def _sample(
-    movie: CountSource, span: tuple[int, int], pixels: int
-) -> tuple[NDArray[Any], NDArray[Any] | None]:
-    """Read the first frames with light, without repeats, and those in the dark.
-
-    Shapes: `lit` (t, y, x), `dark` (k, y, x).
-    """
-    total = movie.shape[0]
-    looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
-    levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
-    first = min(_FIRST_FRAMES, total)
-    looked = [(k, float(one.mean())) for k in range(first) for one in _finite(movie.read(k, k + 1))]
-    if not levels or not looked:
-        return movie.read(0, 0), None
-    usual = float(np.quantile(levels, 0.75))
-    means = np.array([mean for _, mean in looked])
-    dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
-    dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
-    most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
-    counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
-    lit = counts.mean(axis=(1, 2)) > _DARK_LIGHT_SHARE * usual
-    repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
-    counts = counts[lit & ~repeats]
-    if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
-        return counts, None
-    dark = np.concatenate(
-        [movie.read(k, k + 1) for (k, _), d in zip(looked, dim, strict=True) if d]
-    )
-    return counts, dark if _is_dark(dark, counts) else None
-
-
-def _finite(frames: NDArray[Any]) -> NDArray[Any]:
-    """Drop frames with pixels that are not numbers; these are handled later.
-
-    Shapes: `frames` and result (t, y, x).
-    """
-    whole: NDArray[Any] = frames[np.isfinite(frames).all(axis=(1, 2))]
-    return whole
-
-
-def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
-    """Tell whether frames have neither the pattern of light nor its noise.
-
-    Shapes: `dark` (k, y, x), `lit` (t, y, x).
-    """
-    as_light = float(dark.mean()) / float(lit.mean())  # if all of it were light
-    apart, pattern = (part.mean(axis=0) - part.mean() for part in (dark, lit))
-    power = float(np.sum(pattern**2))
-    share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
-    rest = float(np.mean((apart - share * pattern) ** 2))
-    error = math.sqrt(rest / power) if power > 0 else math.inf
-    if error < _LIT_SHARE_ERROR * as_light:
-        return abs(share) < _LIT_SHARE * as_light + 3 * error
-    noise = _noise_adu2(dark) if len(dark) > 1 else _noise_adu2(np.moveaxis(dark, 2, 0))
-    return noise < _DARK_NOISE_SHARE * as_light * _noise_adu2(lit)
 
 
 class _Learning:
@@ -268,6 +209,7 @@ class _Learning:
         self.law: Law | None = None
         self.transfer: Transfer | None = None
         self.messages: list[str] = []
+        self.level_e, self.refusal = 0.0, ""
         self._se = dict.fromkeys(ASSUMED, 0.0)
         self._source = {key: ASSUMPTION if key in free else CONFIGURED for key in ASSUMED}
         self._dark_variance: float | None = None
@@ -319,6 +261,7 @@ class _Learning:
             return
         self._learn_law()
         self._mind_rounding()
+        self._mind_zero()
 
     def _set(self, key: str, value: float, se: float, source: str) -> None:
         self.camera = replace(self.camera, **{key: value})  # type: ignore[arg-type]
@@ -336,7 +279,7 @@ class _Learning:
     def _learn_gain(self) -> bool:
         """Measure the gain; False where it cannot be."""
         quiet = self._dark_variance is None and not np.any(self.camera.read_noise_e)
-        fine = _noise_adu2(self.counts) > _FINE * rounding_variance_adu2(self.counts)
+        fine = noise_adu2(self.counts) > _FINE * rounding_variance_adu2(self.counts)
         for _ in range(1 if quiet and fine else _TURNS):  # what is no light depends on the gain
             if self._dark_variance is not None:
                 gain = float(np.mean(self.camera.gain_e_per_adu))
@@ -356,7 +299,7 @@ class _Learning:
         """Measure the gain by the noise between neighbouring frames, or by that of averages."""
         camera, counts = self.camera, self.counts[:_GAIN_FRAMES]
         step2 = 12 * rounding_variance_adu2(counts)
-        if step2 and 0 < _noise_adu2(counts) < _COARSE * step2:
+        if step2 and 0 < noise_adu2(counts) < _COARSE * step2:
             as_stored = counts.astype(np.float64)  # of which nothing is taken off for rounding
             found = diagnose_gain(as_stored, replace(camera, read_noise_e=0.0))
             return found.gain_e_per_adu, found.gain_se, EFFECTIVE
@@ -401,9 +344,9 @@ class _Learning:
         self.transfer = found = measure_transfer(self.counts, self.camera)
         if found is None:
             return
+        self.level_e = found.level
         gain = float(np.mean(self.camera.gain_e_per_adu))
-        steps = math.sqrt(12 * rounding_variance_adu2(self.counts))
-        plausible = max(_READ_E, _READ_STEPS * steps * gain) ** 2 / found.level
+        plausible = self._most_read_e2 / found.level
         dark = self._source["offset_adu"] in (DARK, METADATA)
         lowest = -float(np.mean(self.camera.offset_adu)) * gain / found.level
         self.law = law = find_law(found, most_read=plausible, least_offset=lowest)
@@ -438,6 +381,48 @@ class _Learning:
         self._learn_gain()
         self._learn_law()
 
+    @property
+    def _most_read_e2(self) -> float:
+        """Variance of the read noise that a camera may have without anybody saying so."""
+        steps = math.sqrt(12 * rounding_variance_adu2(self.counts))
+        gain = float(np.mean(self.camera.gain_e_per_adu))
+        return max(_READ_E, _READ_STEPS * steps * gain) ** 2
+
+    def _mind_zero(self) -> None:
+        """Refuse counts without a true zero, where neither offset nor gain is known otherwise."""
+        if self._source["offset_adu"] != ASSUMPTION or self._source["gain_e_per_adu"] not in (
+            MEASURED, EFFECTIVE,
+        ):  # fmt: skip
+            return
+        law = self.law
+        if law is not None and law.below_nothing:
+            level = self.level_e / float(np.mean(self.camera.gain_e_per_adu))
+            counts, error = law.offset * level, law.contrast_se * level
+            self.refusal = (
+                "counts were subtracted from it: noise and flicker of the pixels show the zero of "
+                f"the light at {counts:.0f} ± {error:.0f} counts, so that contrasts and masses "
+                f"would be {law.contrast:.2g} times too large; give the camera's raw counts, or "
+                f"set camera.offset_adu = {counts:.0f}"
+            )
+            return
+        if law is not None and law.contrast_se <= TOLD:
+            return
+        zero = judge_zero(
+            self.counts, self.camera, most_read_e2=self._most_read_e2, moving=self.moving
+        )
+        if zero is not None and zero.cause:
+            self.refusal = (
+                f"its counts do not tell where the light is zero: {zero.cause}.  Without that "
+                "there are no contrasts and no masses.  Was the movie divided by its background, "
+                "or was that taken off, and the result scaled?  Give the camera's raw counts, or "
+                "set camera.offset_adu, the counts without light, and camera.gain_e_per_adu"
+            )
+        elif zero is not None and zero.error is not None:
+            told = law.se if law is not None else math.inf
+            self.level_e = zero.level_e
+            gain = float(np.mean(self.camera.gain_e_per_adu))
+            self._se["offset_adu"] = min(told, zero.error) * zero.level_e / gain
+
     def _mind_rounding(self) -> None:
         """Count rounding as read noise, unless it is far below the noise of the light."""
         gain = float(np.mean(self.camera.gain_e_per_adu))
@@ -446,13 +431,6 @@ class _Learning:
         read = float(np.mean(np.square(self.camera.read_noise_e)))
         if self._source["gain_e_per_adu"] != EFFECTIVE and rounding > max(read, _ROUNDED * light):
             self._set("read_noise_e", math.sqrt(rounding), 0.0, ROUNDING)
-
-
-def _noise_adu2(counts: NDArray[Any]) -> float:
-    """Half the mean square of what successive frames differ by, without the laser's flicker."""
-    steps = np.diff(counts[:_FIRST_FRAMES].astype(np.float64), axis=0)
-    steps -= steps.mean(axis=(1, 2), keepdims=True)
-    return float(np.mean(steps**2)) / 2
 
 
 def _gain_of_detail(counts: NDArray[Any], camera: Camera) -> tuple[float, float]:

@@ -217,7 +217,7 @@ def test_particles_that_land_in_wandering_light(monkeypatch: pytest.MonkeyPatch)
         optics={"calibrate": "never"}, detection={"false_alarms_per_movie": 1e-3},
         simulation={"shape": [64, 64], "frames": 150, "photons_per_pixel": 1e5, "events": events},
     )  # fmt: skip
-    rng = np.random.default_rng(6)
+    rng = np.random.default_rng(7)
     x = np.linspace(-1, 1, 64)
     tilt = [1 + 0.02 * np.sin(t / 40) * x + 0.01 * np.cos(t / 30) * x[:, None] for t in range(150)]
     light = np.array(list(Movie(config, 6).expected_frames())) * tilt

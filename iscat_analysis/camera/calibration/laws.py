@@ -97,6 +97,14 @@ class Law:
         return self.kind in ("offset", "other light") and wrong
 
     @property
+    def below_nothing(self) -> bool:
+        """Whether counts are a line in light whose zero lies clearly below no counts."""
+        line = self.contrast / (1 - self.offset)
+        error = SIGMAS * self.contrast_se
+        straight = abs(1 - line) <= TOLERANCE + error
+        return self.bent and straight and -self.offset > TOLERANCE + error
+
+    @property
     def certain(self) -> bool:
         """Whether the error of masses is known, because no other kind of law fits as well."""
         return self.flickers or not self.alike
