@@ -338,9 +338,9 @@ def fit_picture(
         covariance = covariance / size**2
         prior = _prior(waves, coefficients, covariance, step_nm)
         template = _template(
-            waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm,
-            freed=0.0 if blur[0].size == 1 else nominal.area.side,
-        )  # fmt: skip
+            waves, coefficients, covariance, own, roi_nm=roi_nm, side_nm=side, step_nm=step_nm
+        )
+        template = replace(template, side=nominal.area.side if blur[0].size > 1 else 0.0)
         model = with_template(nominal, template)
         own = list(mapper(lambda s, m=model: fit_own(s, m, level=level), own))
         moved = float(np.linalg.norm(coefficients - before) / np.sqrt(np.trace(covariance)))
@@ -468,7 +468,6 @@ def _template(
     roi_nm: float,
     side_nm: float,
     step_nm: float,
-    freed: float,
 ) -> Template:
     """Sample the picture on its lattice; beyond what was seen it fades."""
     count = math.ceil((side_nm / 2 + _FADE_NM) / step_nm)
@@ -491,5 +490,4 @@ def _template(
         roi_nm=roi_nm,
         peak_se=float(np.sqrt(rest @ covariance @ rest)),
         sights=len(images),
-        side=freed,
     )
