@@ -321,10 +321,10 @@ def _optics(
         f"{report['events']} particles of {report['at']['mass_kda']:g} kDa, signal-to-noise ratio "
         f"{short(report['snr'])} each"
     )
-    found = table("optics, all fitted together", "value", "±", "plausible")
+    found = table("optics, all fitted together", "value", "±", "without images")
     for row in report["parameters"]:
-        sigma = short(row["sigma"]) if row["determined"] else "held"
-        found.add_row(row["parameter"], f"{row['value']:g}", sigma, f"±{row['prior_range']:g}")
+        cells = f"{row['value']:g}", short(row["sigma"]), f"±{row['usual_error']:g}"
+        found.add_row(row["parameter"], *cells)
     print_result(found)
     found = table("error common to all fits", *("x_nm", "y_nm", "z_nm", "mass_kda"))
     for name, common in report["common"].items():

@@ -1,15 +1,15 @@
 """How well particles would tell the microscope, before they are recorded.
 
 The information that each expected picture holds about the optics, once the particle's own place,
-mass and level are fitted, adds up over the pictures; its inverse is the covariance that
-`iscat calibrate optics` will report.  What it leaves in the masses and heights of later fits
-follows from `iscat_analysis.bounds.shared`.
+mass and level are fitted, adds up over the pictures, with that of the prior; the inverse of the sum
+is the covariance that `iscat calibrate optics` will report.  What it leaves in the masses and
+heights of later fits follows from `iscat_analysis.bounds.shared`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -29,13 +29,11 @@ from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.parameters import (
     FAINTEST,
     FREE,
-    LEAST_IMAGES,
     MOST_IMAGES,
-    Hidden,
+    are_told,
     exists,
-    find_hidden,
     free_groups,
-    prior_range,
+    prior_of,
     settings_of,
 )
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
@@ -68,23 +66,20 @@ class OpticsForecast:
     snr: float
     values: dict[str, float]
     covariance: FloatArray
-    hidden: tuple[Hidden, ...]
+    usual: FloatArray
     moves: dict[str, FloatArray]
     sigma: dict[str, FloatArray]
     needed: pd.DataFrame
 
     @cached_property
     def parameters(self) -> pd.DataFrame:
-        """One row per free parameter; `sigma` is NaN where it would be held as configured."""
-        errors = dict(zip(self.values, np.sqrt(np.diag(self.covariance)), strict=True))
-        settings = settings_of(self.config)
-        names = [*self.values, *(each.name for each in self.hidden)]
-        rows = [
-            (n, float(settings[n]), float(errors.get(n, math.nan)), prior_range(n), n in errors)
-            for n in names
-        ]
-        columns = ["parameter", "value", "sigma", "prior_range", "determined"]
-        return pd.DataFrame(rows, columns=columns)
+        """One row per free parameter, with its error after the pictures and before them."""
+        sigma = np.sqrt(np.diag(self.covariance))
+        columns = {
+            "parameter": list(self.values), "value": list(self.values.values()), "sigma": sigma,
+            "usual_error": self.usual, "determined": are_told(sigma, self.usual),
+        }  # fmt: skip
+        return pd.DataFrame(columns)
 
     @cached_property
     def common(self) -> dict[str, dict[str, float]]:
@@ -103,14 +98,12 @@ class OpticsForecast:
     @property
     def unidentifiable(self) -> tuple[str, ...]:
         """What the pictures would not tell, one sentence each."""
-        found = []
-        for each in self.hidden:
-            moved = ", ".join(f"{n} {v:+.3g}" for n, v in each.direction.items())
-            found.append(
-                f"{each.name} is {each.why}: one standard deviation is ({moved}), beyond the "
-                f"plausible ±{prior_range(each.name):g}, and it would be held as configured"
-            )
-        return tuple(found)
+        untold = self.parameters[~self.parameters["determined"]]
+        return tuple(
+            f"{row.parameter} would be known to ±{row.sigma:.3g}, and to ±{row.usual_error:g} "
+            "without any picture ([uncertainty] optics)"
+            for row in untold.itertuples()
+        )
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -122,10 +115,9 @@ class OpticsForecast:
                 f"optics uses those above {FAINTEST:g}: take heavier particles, more frames, or "
                 "more light"
             )
-        if not LEAST_IMAGES <= self.events <= MOST_IMAGES:
+        if self.events > MOST_IMAGES:
             found.append(
-                f"iscat calibrate optics uses between {LEAST_IMAGES} and {MOST_IMAGES} pictures, "
-                f"not {self.events}"
+                f"of {self.events} pictures iscat calibrate optics uses the {MOST_IMAGES} brightest"
             )
         return tuple(found)
 
@@ -151,10 +143,6 @@ class OpticsForecast:
             "names": list(self.values),
             "covariance": self.covariance,
             "unidentifiable": list(self.unidentifiable),
-            "hidden": [
-                {"name": h.name, "others": list(h.others), "direction": dict(h.direction)}
-                for h in self.hidden
-            ],
             "common": self.common,
             "single": {
                 mode: dict(zip(FREE_PARAMETERS[mode], sigma, strict=True))
@@ -177,20 +165,18 @@ def forecast_optics(
     model, grid = _model(config)
     pictures = {f: _Picture.expected(config, model, grid, f, names) for f in FACTORS}
     here = pictures[1.0]
-    kept, covariance, hidden = _identified(here.information * events, names)
-    places = [names.index(name) for name in kept]
-    moves = {mode: here.moves(mode)[:, places] for mode in MODES}
+    usual = prior_of(config).errors(names)
     settings = settings_of(config)
     return OpticsForecast(
         config=config,
         events=events,
         snr=here.snr,
-        values={name: float(settings[name]) for name in kept},
-        covariance=covariance,
-        hidden=hidden,
-        moves=moves,
+        values={name: float(settings[name]) for name in names},
+        covariance=_known(here.information * events, usual),
+        usual=usual,
+        moves={mode: here.moves(mode) for mode in MODES},
         sigma={mode: here.sigma(mode) for mode in MODES},
-        needed=pd.DataFrame([_needed(picture, names) for picture in pictures.values()]),
+        needed=pd.DataFrame([_needed(picture, names, usual) for picture in pictures.values()]),
     )
 
 
@@ -289,47 +275,40 @@ class _Picture:
         return np.asarray(joint[np.isfinite(joint)])
 
 
-def _identified(
-    information: FloatArray, names: Sequence[str]
-) -> tuple[tuple[str, ...], FloatArray, tuple[Hidden, ...]]:
-    """Give what is determined, its covariance, and what is not."""
-    kept, hidden = list(names), []
-    while True:
-        places = [names.index(name) for name in kept]
-        part = information[np.ix_(places, places)]
-        worst = find_hidden(part, kept)
-        if worst is None:
-            break
-        hidden.append(worst)
-        kept.remove(worst.name)
-    scale = np.array([prior_range(name) for name in kept])
-    both = np.outer(scale, scale)
-    covariance = np.linalg.inv(part * both) * both if kept else np.zeros((0, 0))
-    return tuple(kept), np.asarray(covariance), tuple(hidden)
+def _known(information: FloatArray, usual: FloatArray) -> FloatArray:
+    """Give the covariance of the optics after pictures, from their information and the prior.
+
+    Shapes: `information`, result (n, n); `usual` (n,).
+    """
+    both = np.outer(usual, usual)
+    return np.asarray(np.linalg.inv(information * both + np.eye(usual.size)) * both)
 
 
-def _needed(picture: _Picture, names: Sequence[str]) -> dict[str, float]:
-    """Say how many events the goals take, once everything is identified that can be."""
-    kept, covariance, _ = _identified(picture.information * _MANY, names)
-    one = covariance * _MANY
-    scale = np.array([prior_range(name) for name in kept])
-    widest = float(np.linalg.eigvalsh(one / np.outer(scale, scale))[-1]) if kept else math.nan
-    identified = max(LEAST_IMAGES, widest)
-    moves = picture.moves("mass")[:, [names.index(name) for name in kept]]
-    mass_row = FREE_PARAMETERS["mass"].index("mass_kda")
-    variances = {
-        "focus_nm": one[kept.index("focus_nm"), kept.index("focus_nm")]
-        if "focus_nm" in kept
-        else math.nan,
-        "mass_rel": shared_sigma(moves, one)[mass_row] ** 2 / picture.mass_kda**2,
-    }
-    counts = {
-        name: max(identified, variance / dict(GOALS)[name] ** 2)
-        for name, variance in variances.items()
-    }
+def _needed(picture: _Picture, names: Sequence[str], usual: FloatArray) -> dict[str, float]:
+    """Say how many events the goals take, and how many tell what can be told at all."""
+    moves, mass_row = picture.moves("mass"), FREE_PARAMETERS["mass"].index("mass_kda")
+
+    def errors(events: float) -> tuple[FloatArray, float]:
+        covariance = _known(picture.information * events, usual)
+        mass = shared_sigma(moves, covariance)[mass_row] / picture.mass_kda
+        return np.sqrt(np.diag(covariance)), float(mass)
+
+    def least(reached: Callable[[float], bool]) -> float:
+        """Find the number of events that suffices, by halves."""
+        low, high = 0, _MANY
+        while high - low > 1:
+            middle = (low + high) // 2
+            low, high = (low, middle) if reached(middle) else (middle, high)
+        return float(high) if reached(high) else math.nan
+
+    can = are_told(errors(_MANY)[0], usual)
+    goals = dict(GOALS)
+    focus = names.index("focus_nm") if "focus_nm" in names else None
     return {
         "mass_kda": picture.mass_kda,
         "snr": picture.snr,
-        "identified": float(np.ceil(identified)),
-        **{name: float(np.ceil(value)) for name, value in counts.items()},
-    }
+        "identified": least(lambda n: bool(are_told(errors(n)[0], usual)[can].all())),
+        "focus_nm": math.nan if focus is None
+        else least(lambda n: bool(errors(n)[0][focus] <= goals["focus_nm"])),
+        "mass_rel": least(lambda n: errors(n)[1] <= goals["mass_rel"]),
+    }  # fmt: skip

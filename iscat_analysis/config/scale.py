@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from iscat_analysis.config.covariance import OpticsCovariance
+from iscat_analysis.config.covariance import MEASURABLE, OpticsCovariance
 from iscat_analysis.config.instrument import Optics
 from iscat_analysis.config.values import LARGEST_NM, Finite, NonNegative, Positive, Section, length
 
@@ -80,6 +80,13 @@ class Calibration(Section):
         return self
 
 
+def _measurable(errors: dict[str, float]) -> dict[str, float]:
+    for name in errors:
+        if name not in MEASURABLE:
+            raise ValueError(f"{name} cannot be learned: give some of {', '.join(MEASURABLE)}")
+    return errors
+
+
 class Uncertainty(Section):
     """Standard deviations of inputs that were not measured; 0 turns one off.
 
@@ -103,4 +110,9 @@ class Uncertainty(Section):
     )
     offset_adu: NonNegative = Field(
         1.0, description="of camera.offset_adu if it is configured, counts"
+    )
+    optics: Annotated[dict[str, Positive], AfterValidator(_measurable)] = Field(
+        default_factory=dict,
+        description="of keys of [optics], each aberration by its own name, before particles tell "
+        "them, as { focus_nm = 50.0 }; else focus 150, NA 0.01, phase 20, z11 20, others 10",
     )

@@ -21,14 +21,12 @@ from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.instrument.collect import bright_particle_images
-from iscat_analysis.instrument.fit_optics import Collected, fit_optics, misfit_of
+from iscat_analysis.instrument.fit_optics import Collected, fit_optics, misfit_of, none_bright
 from iscat_analysis.instrument.learning import (
-    LEAST_TESTED,
     NOISE,
     adopted,
     learned_from,
     noise_differs,
-    too_few,
     why_not,
 )
 from iscat_analysis.instrument.loop import accepted
@@ -44,7 +42,7 @@ from iscat_analysis.instrument.result import OpticsCalibration
 from iscat_analysis.instrument.sources import seen_in_field
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import forward_model, signed_peak
-from iscat_analysis.optics.parameters import FREE, LEAST_IMAGES, heights_free, settings_of
+from iscat_analysis.optics.parameters import FREE, heights_free, settings_of
 from iscat_analysis.threads import threads
 
 NEXT_TO_NONE = 0.3
@@ -134,8 +132,8 @@ def learn_sign(
             else:
                 images, others = bright_particle_images(movie, config, camera, pool, opening)
                 seen = Collected(config, images, others)
-            if len(seen.images) < LEAST_TESTED:
-                raise DataError(too_few(movie.name, len(seen.images)))
+            if not seen.images:
+                raise DataError(none_bright(movie.name))
             median, _ = median_p(list(seen.images), config, seen.others, pool.map)
             if median >= REJECTED_P:
                 raise DataError("with it the optics describe the particles of the movie")
@@ -154,7 +152,7 @@ def _begun(movie: Stack, wrong: WrongSign, camera: Camera, pool: ThreadPoolExecu
     best: tuple[float, Collected] | None = None
     for start in wrong.starts:
         images, others = seen_in_field(windows, start, pool)
-        if len(images) < LEAST_TESTED:
+        if not images:
             continue
         model = microscopes(start, max(map(reach_nm, images)))(settings_of(start))
         chi2 = float(np.median([goodness(image, model)[0] for image in images]))
@@ -168,21 +166,20 @@ def _found(
 ) -> OpticsCalibration:
     """Measure the focus alone, or where that does not describe the particles all of the optics."""
     config, origin = wrong.config, {"movie": movie.name}
-    found = fit_optics(replace(seen, least=LEAST_TESTED), ("focus",), origin, pool.map)
+    found = fit_optics(seen, ("focus",), origin, pool.map)
     focus = float(str(found.measured.settings["focus_nm"]))
     if found.accepted:
         learned, _ = with_sign(found.config)
         if learned is None or _phase(learned) != _phase(config):
             raise DataError(f"by the movie the focus is {focus:.0f} nm, which has that sign too")
         return found
-    if len(seen.images) >= LEAST_IMAGES:
-        if heights_free(config):
-            near = replace(seen, near=found.measured.settings)
-            every = fit_optics(near, tuple(FREE), origin, pool.map)
-        else:
-            every = learned_from(seen, movie, config, camera, tuple(FREE), origin, pool)
-        if accepted(every, config)[0] is not None:
-            return every
+    if heights_free(config):
+        near = replace(seen, near=found.measured.settings)
+        every = fit_optics(near, tuple(FREE), origin, pool.map)
+    else:
+        every = learned_from(seen, movie, config, camera, tuple(FREE), origin, pool)
+    if accepted(every, config)[0] is not None:
+        return every
     chi2 = misfit_of(found)
     more = "" if heights_free(config) else ", as where more than the focus is wrong"
     raise DataError(

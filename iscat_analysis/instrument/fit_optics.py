@@ -21,14 +21,13 @@ from iscat_analysis.optics.parameters import (
     FIELD,
     FOCUS_STEP,
     FREE,
-    LEAST_IMAGES,
     Settings,
     free_names,
     optics_limits,
+    prior_of,
     settings_of,
 )
 from iscat_analysis.records import Mapper
-from iscat_analysis.units import count
 
 STEP_FACTORS = (0.5, 2.0)
 """How much smaller or larger than said the steps of a scan may turn out."""
@@ -60,7 +59,6 @@ class Collected:
     found_with: Config | None = None
     """Optics with which they were found; None where no optics took part in that."""
 
-    least: int = LEAST_IMAGES
     focus_step_nm: float | None = None
     """Of a scan of the focus."""
 
@@ -90,6 +88,15 @@ def fit_optics(
     return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))
 
 
+def none_bright(name: str) -> str:
+    """Say that nothing tells the optics, and what would."""
+    return (
+        f"{name}: shows no bright particle that stands alone, from which the optics would be "
+        "learned; record brighter ones (20 nm gold, or protein of 400 kDa and more), or more "
+        "photons per frame"
+    )
+
+
 def misfit_of(found: OpticsCalibration) -> float:
     """Give the mean reduced χ² of pictures that were not fitted."""
     return float(found.measured.judgement.chi2_reduced.mean())
@@ -100,12 +107,8 @@ def _fitted(
 ) -> OpticsCalibration:
     """Measure the microscope and put the result together."""
     config, images = seen.config, seen.images
-    if len(images) < seen.least:
-        raise DataError(
-            f"{origin['movie']}: shows {count(len(images), 'bright particle')} standing alone, and "
-            f"at least {LEAST_IMAGES} are needed to learn the optics; record more particles, or "
-            "brighter ones (20 nm gold, or protein of 400 kDa and more), or more photons per frame"
-        )
+    if not images:
+        raise DataError(none_bright(origin["movie"]))
     configured = settings_of(config)
     limits = optics_limits(config.optics.n_immersion, config.optics.n_glass)
     if seen.focus_step_nm is not None:
@@ -121,6 +124,7 @@ def _fitted(
         build,
         groups,
         limits,
+        prior_of(config, configured),
         side=int(math.copysign(1, focus)) if focus else 0,
         others=seen.others,
         build_wide=rings_of(config, images[0]),
@@ -189,8 +193,8 @@ def _likeliest(seen: Collected, groups: Sequence[str], mapper: Mapper) -> _Begun
     def better(one: _Begun) -> _Begun:
         names = free_names(groups, one.settings, FREE["zernike"])
         fit = maximise(
-            one.images, build, one.settings, names, limits=limits, passes=_OPTICS_PASSES,
-            mapper=mapper,
+            one.images, build, one.settings, names, prior=prior_of(config), limits=limits,
+            passes=_OPTICS_PASSES, mapper=mapper,
         )  # fmt: skip
         return placed(fit.values, fit.images, one.others)
 

@@ -29,8 +29,8 @@ from iscat_analysis.instrument.particle_image import (
 from iscat_analysis.optics.parameters import (
     MASK_NA,
     PARAMETERS,
+    Prior,
     Settings,
-    prior_range,
 )
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -45,23 +45,38 @@ _TOGETHER = 5  # images of one task; a millisecond each
 
 @dataclass(frozen=True)
 class Estimate:
-    """A maximum of the joint likelihood."""
+    """A maximum of the joint posterior: likelihood of the pictures and prior of the optics.
+
+    Shapes: `information`, `scatter` (n, n), of likelihood and prior; `errors` (n,), of the prior.
+    """
 
     names: tuple[str, ...]
     values: Settings
     images: tuple[ParticleImage, ...]
     information: FloatArray
     scatter: FloatArray
+    errors: FloatArray
     log_likelihood: float
+    log_prior: float
     converged: bool
     passes: int
 
     @property
+    def log_posterior(self) -> float:
+        """Logarithm of the density that is largest here."""
+        return self.log_likelihood + self.log_prior
+
+    @property
+    def log_evidence(self) -> float:
+        """Log-likelihood averaged over the prior, by Laplace's approximation."""
+        scaled = self.information * np.outer(self.errors, self.errors)
+        return self.log_posterior - 0.5 * float(np.linalg.slogdet(scaled)[1])
+
+    @property
     def bound(self) -> FloatArray:
-        """Cramér–Rao bound of the covariance: the inverse information, shape (n, n)."""
-        scale = np.array([prior_range(name) for name in self.names])
-        scaled = self.information * np.outer(scale, scale)
-        return np.asarray(np.linalg.pinv(scaled, hermitian=True) * np.outer(scale, scale))
+        """Van Trees' bound of the covariance: the inverse information, shape (n, n)."""
+        both = np.outer(self.errors, self.errors)
+        return np.asarray(np.linalg.inv(self.information * both) * both)
 
     @property
     def covariance(self) -> FloatArray:
@@ -80,17 +95,22 @@ def maximise(
     start: Settings,
     names: Sequence[str],
     *,
+    prior: Prior | None = None,
     limits: Mapping[str, tuple[float, float]] | None = None,
     tolerance: float = 1e-2,
     passes: int = 40,
     mapper: Mapper = map,
 ) -> Estimate:
-    """Maximise the joint likelihood over the microscope and all particles."""
+    """Maximise the joint posterior over the microscope and all particles.
+
+    The prior is around the start where none is given.
+    """
     names = tuple(names)
     values = dict(start)
+    prior = prior or Prior(values)
     walls = _walls(images)
     private = np.clip([image.private for image in images], *walls)
-    at = _Point.evaluate(images, build, values, names, private, walls, mapper)
+    at = _Point.evaluate(images, build, values, names, private, walls, mapper, prior)
     damping, used, converged = _DAMPING[0], 1, False
     while used < passes and damping < _DAMPING[1]:
         if at.gain(names) < tolerance:
@@ -99,9 +119,9 @@ def maximise(
         shared, own = at.step(names, damping)
         trial_values = _limited(values, names, shared, limits or {})
         moved = np.clip(private + own, *walls)
-        trial = _Point.evaluate(images, build, trial_values, names, moved, walls, mapper)
+        trial = _Point.evaluate(images, build, trial_values, names, moved, walls, mapper, prior)
         used += 1
-        if trial.value > at.value:
+        if trial.value + trial.log_prior > at.value + at.log_prior:
             values, private, at = trial_values, moved, trial
             damping = max(damping / 8, 1e-9)
         else:
@@ -111,8 +131,10 @@ def maximise(
         values=values,
         images=tuple(s.moved(p) for s, p in zip(images, private, strict=True)),
         information=at.reduced(0.0)[0],
-        scatter=at.scatter([image.owner for image in images]),
+        scatter=at.scatter([image.owner for image in images]) + np.diag(at.precision),
+        errors=prior.errors(names),
         log_likelihood=at.value,
+        log_prior=at.log_prior,
         converged=converged,
         passes=used,
     )
@@ -194,6 +216,9 @@ class _Point:
     score: FloatArray  # (n, k + 5)
     fisher: FloatArray  # (n, k + 5, k + 5)
     squares: FloatArray  # the same, with squared residuals in place of their expectation
+    log_prior: float
+    pull: FloatArray  # (k,), slope of the logarithm of the prior
+    precision: FloatArray  # (k,), its information
 
     @classmethod
     def evaluate(
@@ -205,6 +230,7 @@ class _Point:
         private: FloatArray,
         walls: FloatArray,
         mapper: Mapper,
+        prior: Prior | None = None,
     ) -> _Point:
         """Evaluate all images; an unknown that its wall stops counts as known."""
         models = models_of(images, build, values)
@@ -228,11 +254,17 @@ class _Point:
         free = np.pad(~stopped, ((0, 0), (len(names), 0)), constant_values=True)
         both = free[:, :, None] & free[:, None, :]
         alone = np.eye(free.shape[1]) * ~free[:, None, :]
+        changes, errors = np.zeros(len(names)), np.full(len(names), np.inf)
+        if prior is not None:
+            changes, errors = prior.changes(values, names), prior.errors(names)
         return cls(
             value if math.isfinite(value) else -math.inf,
             np.where(free, score, 0.0),
             np.where(both, fisher, alone),
             np.where(both, squares, 0.0),
+            -0.5 * float(changes @ changes),
+            -changes / errors,
+            errors**-2.0,
         )
 
     def scatter(self, owners: Sequence[int]) -> FloatArray:
@@ -265,7 +297,8 @@ class _Point:
     def reduced(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Information and score of the shared parameters, and the private blocks inverted."""
         information, score, inverse = self.each(damping)
-        return information.sum(axis=0), score.sum(axis=0), inverse
+        whole = information.sum(axis=0) + np.diag(self.precision)
+        return whole, score.sum(axis=0) + self.pull, inverse
 
     def each(self, damping: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Give the same of every picture.
@@ -325,16 +358,12 @@ def excess(scatter: FloatArray, scores: FloatArray, owners: NDArray[np.int64]) -
 def _solve(
     information: FloatArray, score: FloatArray, names: tuple[str, ...], damping: float
 ) -> FloatArray:
-    """Solve the damped normal equations in units of the prior ranges.
-
-    What is added to the diagonal, one part in 10⁴ of what a direction worth knowing has, keeps
-    directions of which the pictures say nothing at rest.
-    """
+    """Solve the damped normal equations in units of the usual errors."""
     if not names:
         return np.empty(0)
-    scale = np.array([prior_range(name) for name in names])
+    scale = np.array([PARAMETERS[name].usual_error for name in names])
     scaled = information * np.outer(scale, scale)
-    ridge = damping * np.maximum(np.diag(scaled), 0.0) + 1e-4
+    ridge = damping * np.diag(scaled)
     return np.asarray(scale * np.linalg.solve(scaled + np.diag(ridge), scale * score))
 
 

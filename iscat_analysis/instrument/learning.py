@@ -23,7 +23,7 @@ from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
-from iscat_analysis.instrument.fit_optics import Collected
+from iscat_analysis.instrument.fit_optics import Collected, none_bright
 from iscat_analysis.instrument.loop import accepted, learn
 from iscat_analysis.instrument.microscope import (
     REJECTED_P,
@@ -53,6 +53,7 @@ from iscat_analysis.optics.parameters import (
     LEAST_IMAGES,
     free_groups,
     heights_free,
+    prior_of,
     settings_of,
 )
 from iscat_analysis.records import Progress, Windows, silent
@@ -60,10 +61,7 @@ from iscat_analysis.search.sliding import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 
-LEAST_TESTED = 4
-"""Bright particles without which the optics are not even tested."""
-
-_AGREEING = 2  # images, of which one alone may show something that is no particle
+_MANY = 4  # particles alone, with fewer of which a field is looked at as a whole
 _MOST_STEP_NM = 5e3  # farther than the model's pictures reach
 _LEAST_SCAN_NM = 10.0  # over all frames; a step in µm stays below it
 NOISE = "its noise is not what the camera's numbers predict"
@@ -98,12 +96,15 @@ def learn_optics(
         try:
             tested = tested_optics(movie, config, camera, pool, opening)
             passed = optics.calibrate == "auto" and not tested.rejected
-            if passed and not tested.change.matters:
+            if passed and tested.particles and not tested.change.matters:
                 return config, tested.summary | {"calibrated": False}
             if optics.calibrate == "auto" and noise_differs(movie, config, camera):
+                tested = replace(tested, together=_together((), config, pool))
                 reason = f"{NOISE}; the analysis goes on as configured"
                 warn(f"the optics cannot be tested on this movie: {reason}")
                 return config, tested.summary | {"calibrated": False, "reason": reason}
+            if not tested.particles:
+                raise DataError(none_bright(movie.name))
             notify("learning the optics from the particles of the movie, which may take minutes…")
             origin = {"movie": movie.name}
             if passed:
@@ -115,10 +116,6 @@ def learn_optics(
                 found = learn(known, config, tuple(FREE), origin, pool.map).outcome
             else:
                 found = learned_from(tested.seen, movie, config, camera, tuple(FREE), origin, pool)
-        except _TooFewError as error:
-            warn(f"{_verdict(None)}: {error}; the analysis goes on as configured")
-            summary = {} if error.together is None else _doubted(error.together)
-            return config, summary | {"calibrated": False, "reason": str(error)}
         except DataError as error:
             changing = tested is not None and tested.change.matters
             reason = f"{error}; {tested.change.said}" if tested and changing else str(error)
@@ -137,7 +134,7 @@ class Tested:
     """Those that stand alone, from which optics can be learned at once."""
 
     particles: int
-    median_p: float
+    median_p: float | None
     change: Change = EVEN
     """Over the field or in time, that they ask for."""
 
@@ -156,9 +153,10 @@ class Tested:
         return said if self.together is None else said | _doubted(self.together)
 
 
-def _are_rejected(median: float, together: ScoreTest | None) -> bool:
+def _are_rejected(median: float | None, together: ScoreTest | None) -> bool:
     """Whether images reject the configured optics, one by one or together."""
-    return median < REJECTED_P or (together is not None and together.rejected)
+    poor = median is not None and median < REJECTED_P
+    return poor or (together is not None and together.rejected)
 
 
 def _doubted(together: ScoreTest) -> dict[str, Any]:
@@ -168,25 +166,6 @@ def _doubted(together: ScoreTest) -> dict[str, Any]:
         "left_over": together.left_over,
         "doubt": together.doubt.model_dump() | {"field_px": together.field_px},
     }
-
-
-class _TooFewError(DataError):
-    """Too few particles to test the optics one by one, with the test of all together."""
-
-    def __init__(self, text: str, together: ScoreTest | None) -> None:
-        super().__init__(text)
-        self.together = together
-
-
-def _of_few(
-    images: list[ParticleImage],
-    config: Config,
-    others: Sequence[ParticleImage],
-    pool: ThreadPoolExecutor,
-) -> ScoreTest | None:
-    """Test particles together that are too few to be tested one by one."""
-    fitted = median_p(images, config, others, pool.map)[1] if images else ()
-    return _together(fitted, config, pool)
 
 
 def tested_optics(
@@ -204,16 +183,13 @@ def tested_optics(
     first = sliding and auto
     images, others = bright_particle_images(movie, config, camera, pool, opening, rings=not first)
     alone = len(images)
-    if alone < LEAST_TESTED and background_mode(config) == "fixed":
+    if alone < _MANY and background_mode(config) == "fixed":
         windows = _summed(movie, config, camera)
         if drift_warning(movie.name, examine_background(movie, camera, windows)):
             raise DataError("the edges of a fixed pattern that moved look like particles")
         images, others = seen_in_field(windows, config, pool)
-    if len(images) < LEAST_TESTED:
-        by_noise = noise_differs(movie, config, camera)
-        said = too_few(movie.name, len(images), by_noise=by_noise)
-        few = [] if by_noise or len(images) < _AGREEING else images
-        raise _TooFewError(said, _of_few(few, config, others, pool))
+    if not images:
+        return Tested(Collected(config, ()), 0, None, EVEN, _together((), config, pool))
     median, fitted = median_p(images, config, others, pool.map)
     together = _together(fitted, config, pool)
     if first and _are_rejected(median, together):  # more particles, and whose rings they show
@@ -238,8 +214,6 @@ def tested_optics(
         alone -= sum(k < alone for k in pairs)
         single = [image for k, image in enumerate(fitted) if k not in pairs]
         together = _together(single, config, pool)
-        if len(images) < LEAST_TESTED:
-            raise _TooFewError(too_few(movie.name, len(images)), together)
     seen = Collected(config, images[:alone], others)
     return Tested(seen, len(images), median, change, together)
 
@@ -254,7 +228,7 @@ def _together(
     if heights_free(config):
         return None
     build = microscopes(config, max(map(reach_nm, fitted), default=0.0))
-    return score_test(fitted, build, settings_of(config), terms, pool.map)
+    return score_test(fitted, build, settings_of(config), prior_of(config), terms, pool.map)
 
 
 def why_not(config: Config) -> str:
@@ -279,24 +253,13 @@ def why_not(config: Config) -> str:
     return next((reason for holds, reason in reasons if holds), "")
 
 
-def too_few(name: str, number: int, *, by_noise: bool = False) -> str:
-    """Say that too few particles stand alone."""
-    said = (
-        f"{name}: shows {count(number, 'bright particle')} standing alone, and {LEAST_TESTED} are "
-        f"needed to test the optics, {LEAST_IMAGES} to learn them"
-    )
-    if by_noise:
-        said += "; they stand out by the noise, which is not what the camera's numbers predict"
-    return said
-
-
 def adopted(
     found: OpticsCalibration,
     config: Config,
     tested: Mapping[str, Any],
     verdict: str,
     *,
-    pictures_of: str = "particles",
+    picture_of: str = "particle",
     warn: Callable[[str], None],
 ) -> tuple[Config, dict[str, Any]]:
     """Use what was learned, where it may be used, and say so."""
@@ -306,7 +269,7 @@ def adopted(
         return config, {**tested, **_told(found), "calibrated": False, "reason": why}
     if learned.optics.reference_phase_deg != found.config.optics.reference_phase_deg:
         found = found.with_phase(learned.optics.reference_phase_deg, _turned(config))
-    headline = found.headline(pictures_of)
+    headline = found.headline(picture_of)
     warn(f"optics learned from the movie, instead of the configured ones: {headline}")
     for note in found.notes:
         warn(note)
@@ -385,7 +348,7 @@ def learned_from(
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     scan, way = seen.focus_step_nm is not None, background_mode(config)
     crowded = way == "fixed" and not scan
-    if not crowded or len(seen.images) >= LEAST_IMAGES:
+    if not crowded or len(seen.images) >= min(LEAST_IMAGES, len(seen.others)):
         asked = not scan and not heights_free(config) and set(groups) == set(FREE)
         view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
         found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome
@@ -413,16 +376,17 @@ def noise_differs(movie: Stack, config: Config, camera: Camera) -> bool:
 
 def _verdict(tested: Tested | None) -> str:
     """Say what the test found where the optics are not learned."""
-    if tested is None:
+    if tested is None or not tested.particles:
         return "the optics cannot be tested on this movie"
     if not tested.rejected:
         return "the optics cannot be learned from this movie"
     why = f"median p-value {tested.median_p:.1g}"
-    if tested.median_p >= REJECTED_P and tested.together is not None:
+    if not _are_rejected(tested.median_p, None) and tested.together is not None:
         why = f"log Bayes factor {tested.together.log_bayes_factor:.3g} for other optics"
+    brightest = count(min(tested.particles, TESTED), "particle")
     return (
-        f"the configured optics do not describe the brightest {min(tested.particles, TESTED)} "
-        f"particles ({why}), and they cannot be learned from them"
+        f"the configured optics do not describe the brightest {brightest} ({why}), and they cannot "
+        "be learned from them"
     )
 
 

@@ -1,9 +1,10 @@
 """From pictures of particles to the microscope that made them, and a verdict on it.
 
-Two thirds of the pictures are fitted and a third decides: how many aberrations are worth having,
-and whether the result describes pictures that it has not seen.  Directions in the space of
-parameters that the pictures do not determine within the plausible range are named and held at the
-configured values.
+What is known before is a prior around the configured values, and any number of pictures adds what
+it tells.  Two thirds of the pictures are fitted and a third decides: how many aberrations are worth
+having, and whether the result describes pictures that it has not seen.  Where there are too few for
+that, the evidence decides, the likelihood averaged over the prior, and the fitted pictures judge.
+What they do not tell keeps the width of the prior.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.parameters import (
     FREE,
     HIGHER,
+    LEAST_IMAGES,
     PARAMETERS,
     PRIMARY,
     SECONDARY,
+    Prior,
     Settings,
-    find_hidden,
     free_names,
     is_term,
 )
@@ -65,11 +67,18 @@ _CLOSE = 0.01  # states whose average is explained this much worse are tried on 
 
 @dataclass(frozen=True)
 class Judgement:
-    """How the pictures that were not fitted agree with the microscope."""
+    """How pictures agree with the microscope."""
 
     p_values: FloatArray
     chi2_reduced: FloatArray
     uniform_p: float
+    fitted: bool = False
+    """Whether they were fitted with it, because they are few."""
+
+    @property
+    def pictures(self) -> str:
+        """Say which pictures."""
+        return "the fitted pictures" if self.fitted else "pictures that were not fitted"
 
     @property
     def good(self) -> bool:
@@ -91,7 +100,6 @@ class Measured:
 
     settings: Settings
     estimate: Estimate
-    held: Mapping[str, str]
     dropped: tuple[str, ...]
     undecided: tuple[str, ...]
     judgement: Judgement
@@ -114,19 +122,20 @@ def judge(
     def one(image: ParticleImage) -> tuple[float, float]:
         return goodness(image, build(image.seen_with(settings)))
 
-    found = np.array(list(mapper(one, images)))
+    found = np.array(list(mapper(one, images))).reshape(-1, 2)
     p_values = found[:, 1]
     return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
 
 
 def _fitted(images: Sequence[ParticleImage]) -> list[ParticleImage]:
-    """Give the pictures that are fitted."""
-    return [image for i, image in enumerate(images) if i % HELD_OUT != 1]
+    """Give the pictures that are fitted: all where they are few."""
+    few = len(images) < LEAST_IMAGES
+    return [image for i, image in enumerate(images) if few or i % HELD_OUT != 1]
 
 
 def _held_out(images: Sequence[ParticleImage]) -> list[ParticleImage]:
     """Give the pictures that are not."""
-    return list(images[1::HELD_OUT])
+    return list(images[1::HELD_OUT]) if len(images) >= LEAST_IMAGES else []
 
 
 @dataclass
@@ -139,6 +148,7 @@ class OpticsSearch:
     """Groups of parameters."""
 
     limits: Mapping[str, tuple[float, float]]
+    prior: Prior
     side: int = 0
     """Sign of the focus, where the configuration tells it."""
 
@@ -162,7 +172,6 @@ class OpticsSearch:
         else:
             best, held_out = self._of_known_kind(images, self.known)
         best, held_out = self._cleared(best, held_out)
-        best, held = self._identified(best)
         before = len(best.images) + len(held_out)
         best, held_out = self._uncontaminated(best, held_out)
         contaminated = before - len(best.images) - len(held_out)
@@ -171,19 +180,28 @@ class OpticsSearch:
         best, twin = self._twin(best)
         best, held_out = self._cleared(best, held_out)
         best, held_out = self._signed(best, held_out)
-        judged = self._fit(held_out, best.values, ())
-        held_out = judged.images
-        judgement = judge(held_out, self.build, best.values, self.mapper)
-        nominal = self._fit(with_masses(held_out, self.build, self.configured), self.configured, ())
+        judged = self._fit(held_out or best.images, best.values, ())
+        judgement = judge(judged.images, self.build, best.values, self.mapper)
+        judgement = replace(judgement, fitted=not held_out)
+        nominal = self._fit(
+            with_masses(judged.images, self.build, self.configured), self.configured, ()
+        )
         configured = judge(nominal.images, self.build, self.configured, self.mapper)
         worse = nominal.log_likelihood - judged.log_likelihood > WORSE_GAP
-        final = self._fit((*best.images, *held_out), best.values, best.names)
+        images = (*best.images, *judged.images) if held_out else best.images
+        final = self._fit(images, best.values, best.names)
         refusals = self._refusals(final, judgement, twin, worse=worse)
         return Measured(
-            settings=final.values, estimate=final, held=held, dropped=dropped,
-            undecided=undecided, judgement=judgement, configured=configured, held_out=held_out,
-            twin=twin, contaminated=contaminated, refusals=refusals,
+            settings=final.values, estimate=self._with_dropped(final, dropped), dropped=dropped,
+            undecided=undecided, judgement=judgement, configured=configured,
+            held_out=judged.images, twin=twin, contaminated=contaminated, refusals=refusals,
         )  # fmt: skip
+
+    def _with_dropped(self, final: Estimate, dropped: Sequence[str]) -> Estimate:
+        """Give the errors of what is not worth having, too, and what they add to all others."""
+        names = (*final.names, *dropped)
+        whole = self._fit(final.images, final.values, names, passes=1)
+        return replace(whole, converged=final.converged)
 
     def _fit(
         self,
@@ -193,8 +211,15 @@ class OpticsSearch:
         passes: int = 40,
     ) -> Estimate:
         return maximise(
-            images, self.build, start, names, limits=self.limits, passes=passes, mapper=self.mapper
-        )
+            images, self.build, start, names,
+            prior=self.prior, limits=self.limits, passes=passes, mapper=self.mapper,
+        )  # fmt: skip
+
+    def _worth(self, fit: Estimate, held_out: Sequence[ParticleImage]) -> float:
+        """Say how well a microscope does, by pictures that were not fitted or by its evidence."""
+        if not held_out:
+            return fit.log_evidence
+        return self._fit(held_out, fit.values, ()).log_likelihood
 
     def _cleared(
         self, best: Estimate, held_out: Sequence[ParticleImage]
@@ -206,14 +231,13 @@ class OpticsSearch:
         self.others = near.particles  # where they are is known the next time
         among = near.around((*best.images, *held_out), self.mapper)
         fitted, judged = among[: len(best.images)], among[len(best.images) :]
-        judged = self._own(judged, best.values) if judged else ()
-        return self._fit(fitted, best.values, best.names), judged
+        return self._fit(fitted, best.values, best.names), self._own(judged, best.values)
 
     def _own(
         self, images: Sequence[ParticleImage], settings: Settings
     ) -> tuple[ParticleImage, ...]:
         """Fit what is an image's own."""
-        return self._fit(images, settings, ()).images
+        return self._fit(images, settings, ()).images if images else ()
 
     def _best_state(
         self, averages: Sequence[ParticleImage], placed: Sequence[ParticleImage]
@@ -224,14 +248,14 @@ class OpticsSearch:
         The pictures that are not fitted come back with their places and masses.
         """
         states = StateSearch(
-            self.configured, self.build, tuple(self.free), self.limits, self.mapper
+            self.configured, self.build, tuple(self.free), self.limits, self.prior, self.mapper
         )
         refined = states.run(averages)
-        top = refined[0].log_likelihood
+        top = refined[0].log_posterior
         joint: list[tuple[float, Estimate, tuple[ParticleImage, ...]]] = []
         tried: list[Estimate] = []
         for rough in refined:
-            far = top - rough.log_likelihood > max(_CLOSE * top, 2 * TWIN_GAP)
+            far = top - rough.log_posterior > max(_CLOSE * top, 2 * TWIN_GAP)
             if far or any(same_state(rough, other) for other in tried):
                 continue
             x_nm, y_nm = (np.median([getattr(a, k) for a in rough.images]) for k in _PLACE)
@@ -243,10 +267,10 @@ class OpticsSearch:
             names = free_names(self.free, rough.values, FREE["zernike"])
             tried.append(rough)
             fit = self._fit(_fitted(images), rough.values, names, _TRIAL_PASSES)
-            judged = self._fit(_held_out(images), fit.values, ())
+            judged = _held_out(images)
             new_mask = fit.values["mask_na"] > 0 and not self.configured["mask_na"]
-            earned = judged.log_likelihood - (TWIN_GAP if new_mask else 0.0)
-            joint.append((earned, fit, judged.images))
+            earned = self._worth(fit, judged) - (TWIN_GAP if new_mask else 0.0)
+            joint.append((earned, fit, self._own(judged, fit.values)))
         _, best, held_out = max(joint, key=lambda each: each[0])
         if not best.converged:
             best = self._fit(best.images, best.values, best.names)
@@ -264,27 +288,15 @@ class OpticsSearch:
         held_out = [s.raised(float(rise)) for s in _held_out(images)]
         return best, self._own(held_out, best.values)
 
-    def _identified(self, best: Estimate) -> tuple[Estimate, dict[str, str]]:
-        """Hold what the pictures do not determine within the plausible range."""
-        held: dict[str, str] = {}
-        while (worst := find_hidden(best.information, best.names)) is not None:
-            name = worst.name
-            held[name] = worst.why
-            kept = tuple(n for n in best.names if n != name)
-            settings = {**best.values, name: self.configured[name]}
-            best = self._fit(best.images, settings, kept)
-        return best, held
-
     def _uncontaminated(
         self, best: Estimate, held_out: Sequence[ParticleImage]
     ) -> tuple[Estimate, tuple[ParticleImage, ...]]:
         """Leave out the few pictures in which something else happened, if the others are fine."""
-        good = [
-            judge(images, self.build, best.values, self.mapper).p_values > CONTAMINATED_P
-            for images in (best.images, held_out)
-        ]
-        bad = sum(int(np.sum(~g)) for g in good)
-        if not bad or bad > _CONTAMINATED_SHARE * (len(best.images) + len(held_out)):
+        whole = (*best.images, *held_out)
+        fine = judge(whole, self.build, best.values, self.mapper).p_values > CONTAMINATED_P
+        good = fine[: len(best.images)], fine[len(best.images) :]
+        bad = int(np.sum(~fine))
+        if not bad or bad > _CONTAMINATED_SHARE * len(whole):
             return best, tuple(held_out)
         kept = [s for s, ok in zip(best.images, good[0], strict=True) if ok]
         rest = tuple(s for s, ok in zip(held_out, good[1], strict=True) if ok)
@@ -305,7 +317,7 @@ class OpticsSearch:
             names = tuple(n for n in best.names if not is_term(n) or n in rung)
             start = {**best.values, **{n: 0.0 for n in terms if n not in rung}}
             fit = best if rung == terms else self._fit(best.images, start, names, _RUNG_PASSES)
-            tried.append((self._fit(held_out, fit.values, ()).log_likelihood, fit))
+            tried.append((self._worth(fit, held_out), fit))
             if tried[-1][0] < tried[0][0] - _TOO_FEW:
                 break
         _, chosen = max(tried, key=lambda pair: pair[0])
@@ -317,7 +329,7 @@ class OpticsSearch:
             return best, ()
         was = bool(best.values["analyzer"])
         other = self._fit(best.images, {**best.values, "analyzer": not was}, best.names, passes=8)
-        gap = best.log_likelihood - other.log_likelihood
+        gap = best.log_posterior - other.log_posterior
         if abs(gap) < TWIN_GAP:
             return best, ("analyzer",)
         return (best if gap > 0 else other), ()
@@ -383,7 +395,7 @@ class OpticsSearch:
                 reasons.append(f"{name} = {final.values[name]:g} lies at its limit")
         if not judgement.good:
             reasons.append(
-                f"of {judgement.p_values.size} pictures that were not fitted the p-values are not "
+                f"the p-values of {judgement.p_values.size} of {judgement.pictures} are not "
                 f"uniform (p = {judgement.uniform_p:.1g}, mean reduced chi2 = "
                 f"{float(np.mean(judgement.chi2_reduced)):.3f})"
             )

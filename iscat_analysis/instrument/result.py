@@ -28,6 +28,7 @@ from iscat_analysis.optics.parameters import (
     FOCUS_STEP,
     RISES,
     Settings,
+    are_told,
     exists,
     is_term,
     with_settings,
@@ -166,7 +167,11 @@ class OpticsCalibration:
             config = _with_covariance(config, self.names, covariance)
         return replace(self, config=config, parameters=parameters, covariance=covariance)
 
-    def headline(self, pictures_of: str = "particles") -> str:
+    def names_of(self, state: str) -> list[str]:
+        """Name the parameters of a state."""
+        return list(self.parameters.loc[self.parameters["state"] == state, "parameter"])
+
+    def headline(self, picture_of: str = "particle") -> str:
         """Say in one line what was found."""
         judged, before = self.measured.judgement, self.measured.configured
         parts = []
@@ -201,8 +206,8 @@ class OpticsCalibration:
             parts.append(f"mask of NA {self.value('mask_na'):.3f}")
         parts.append(f"{self.measured.settings['polarization']} polarisation")
         return (
-            f"{', '.join(parts)} from {self.images} {pictures_of}; reduced chi2 of those that "
-            f"were not fitted {np.mean(judged.chi2_reduced):.3f} "
+            f"{', '.join(parts)} from {count(self.images, picture_of)}; reduced chi2 of "
+            f"{judged.pictures} {np.mean(judged.chi2_reduced):.3f} "
             f"({np.mean(before.chi2_reduced):.3g} as configured)"
         )
 
@@ -261,8 +266,8 @@ class OpticsCalibration:
             "covariance": self.covariance.tolist(),
             "correlation": correlation(self.covariance).tolist(),
             "settings": dict(found.settings),
-            "held": dict(found.held),
-            "dropped": list(found.dropped),
+            "untold": self.names_of("prior"),
+            "dropped": self.names_of("dropped"),
             "undecided": list(found.undecided),
             "twin": None if twin is None else {"settings": dict(twin.settings), "gap": twin.gap},
             "held_out": _judged(found.judgement),
@@ -285,6 +290,7 @@ def make_result(
     """Put a result together."""
     estimate = measured.estimate
     covariance, bound = estimate.covariance, estimate.bound
+    told = are_told(np.sqrt(np.diag(covariance)), estimate.errors)
     rows = []
     for name, value in measured.settings.items():
         turns = name == "polarization_deg"
@@ -295,12 +301,11 @@ def make_result(
         if name in estimate.names:
             k = estimate.names.index(name)
             sigma, crb = float(np.sqrt(covariance[k, k])), float(np.sqrt(bound[k, k]))
-            state = "measured"
-        elif name in measured.held:
-            state = "held"
-        elif name in measured.dropped:
-            state = "dropped"
+            state = "dropped" if name in measured.dropped else "measured"
+            if not told[k]:
+                state = "prior"
         rows.append((name, float(value), sigma, crb, float(configured[name]), state))
+    untold, dropped = ([row[0] for row in rows if row[-1] == s] for s in ("prior", "dropped"))
     if not measured.refusals:
         config = _with_covariance(
             with_settings(config, measured.settings), estimate.names, covariance
@@ -314,7 +319,7 @@ def make_result(
         pictures=pictures,
         images=len(estimate.images),
         source=source,
-        notes=(*_notes(measured), *_on_the_pixel(config, configured, measured)),
+        notes=(*_notes(measured, untold, dropped), *_on_the_pixel(config, configured, measured)),
     )
 
 
@@ -340,19 +345,22 @@ def _with_covariance(config: Config, names: tuple[str, ...], covariance: FloatAr
     return config.model_copy(update={"optics": optics})
 
 
-def _notes(measured: Measured) -> tuple[str, ...]:
+def _notes(measured: Measured, untold: Sequence[str], dropped: Sequence[str]) -> tuple[str, ...]:
     """Say in words what could not be known."""
     notes = []
-    for name, why in measured.held.items():
-        notes.append(f"{name} is {why} in these pictures and was held as configured")
+    if untold:
+        notes.append(
+            f"the pictures tell little or nothing of {', '.join(untold)}: what is configured and "
+            "its usual error ([uncertainty] optics) count, which is part of the error of all masses"
+        )
     for name in measured.undecided:
         notes.append(
             f"the pictures do not tell {name} = true from false; it stays as configured "
             "(particles of higher contrast would tell)"
         )
-    if measured.dropped:
+    if dropped:
         notes.append(
-            f"{', '.join(measured.dropped)} did not improve pictures that were not fitted and are 0"
+            f"{', '.join(dropped)} did not improve {measured.judgement.pictures} and are 0"
         )
     if measured.contaminated:
         notes.append(

@@ -8,8 +8,9 @@ posterior mean CS with C = (P⁻¹ + I)⁻¹, and optics that are off are by the
     B = exp(½ SᵀCS) / √det(1 + PI)
 
 likelier than those that are right (R. E. Kass, A. E. Raftery, J. Am. Stat. Assoc. 90, 773 (1995)).
-The remaining doubt about the optics is an error of all masses: the configured optics are right with
-probability 1/(1 + B), and otherwise off by a change of mean square C + CS(CS)ᵀ.
+One parameter may be off, or all: B is the mean over these, of which all are as likely before.
+The remaining doubt about the optics is an error of all masses: the width C of what prior and images
+leave, and the change CS, whose square counts with the probability B/(1 + B) that there is one.
 
 Images that show something else, such as two particles at once, disagree with each other.  Scores
 and information are divided by the ratio of the scatter of the scores to that expected from the
@@ -23,7 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, logsumexp
 
 from iscat_analysis.config import OpticsCovariance
 from iscat_analysis.instrument.joint_fit import asked_changes, excess
@@ -32,8 +33,7 @@ from iscat_analysis.instrument.particle_image import Build, ParticleImage
 from iscat_analysis.optics.field_map import BASES
 from iscat_analysis.optics.parameters import (
     FREE,
-    PARAMETERS,
-    PRIMARY,
+    Prior,
     Settings,
     free_names,
 )
@@ -70,7 +70,7 @@ class ScoreTest:
     def doubt(self) -> OpticsCovariance:
         """Errors that the configured optics may still have after the test."""
         off = float(expit(self.log_bayes_factor))
-        matrix = off * (self.covariance + np.outer(self.change, self.change))
+        matrix = self.covariance + off * np.outer(self.change, self.change)
         return OpticsCovariance(names=self.names, matrix=tuple(map(tuple, matrix.tolist())))
 
 
@@ -78,6 +78,7 @@ def score_test(
     images: Sequence[ParticleImage],
     build: Build,
     settings: Settings,
+    prior: Prior,
     terms: Sequence[str] = (),
     mapper: Mapper = map,
 ) -> ScoreTest:
@@ -85,8 +86,8 @@ def score_test(
 
     `terms` are coefficients of the field that are tested beside the optics.
     """
-    names = (*free_names(tuple(FREE), settings, PRIMARY), *terms)
-    usual = np.array([PARAMETERS[name].usual_error for name in names])
+    names = (*free_names(tuple(FREE), settings, FREE["zernike"]), *terms)
+    usual = prior.errors(names)
     size, count = len(names), len(images)
     score, information = np.zeros((count, size)), np.zeros((count, size, size))
     if count:
@@ -107,8 +108,20 @@ def score_test(
     total, asks = total / widened, asks / widened
     spread = np.linalg.inv(np.eye(size) + total)
     change = spread @ asks
-    gain = 0.5 * float(asks @ change) - 0.5 * float(np.linalg.slogdet(np.eye(size) + total)[1])
+    gains, explains = np.transpose([
+        _alternative(total[np.ix_(free, free)], asks[free])
+        for free in (*np.arange(size)[:, None], np.arange(size))
+    ])  # fmt: skip
+    gain = float(logsumexp(gains)) - math.log(len(gains))
     power = math.fsum(image.snr**2 for image in images)
-    explained = float(expit(gain)) * max(float(change @ total @ change), 0.0)
+    explained = float(expit(gain)) * explains[np.argmax(gains)]
     left_over = math.sqrt(explained / power) if power else 0.0
     return ScoreTest(names, usual * change, spread * np.outer(usual, usual), gain, left_over)
+
+
+def _alternative(information: FloatArray, asks: FloatArray) -> tuple[float, float]:
+    """Give log B of other optics, and what their change explains of the images."""
+    posterior = np.eye(asks.size) + information
+    change = np.linalg.solve(posterior, asks)
+    gain = 0.5 * float(asks @ change) - 0.5 * float(np.linalg.slogdet(posterior)[1])
+    return gain, max(float(change @ information @ change), 0.0)

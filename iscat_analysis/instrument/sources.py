@@ -26,9 +26,6 @@ from iscat_analysis.instrument.uneven import FieldOfView, asked_change, in_uneve
 from iscat_analysis.optics.parameters import LEAST_IMAGES, heights_free, settings_of
 from iscat_analysis.records import Status, Windows
 
-LEAST_ROUGH = 6
-"""Bright places, whatever is near them, without which the optics are not even learned roughly."""
-
 ROUNDS = 3
 """Of a fit of the field and optics learned from it."""
 
@@ -80,7 +77,7 @@ class WholeField:
         free = heights_free(self.config)
         if not rounds.all and not free:
             images, others = bright_places(self.windows, self.config, alone_nm=0.0)
-            return Collected(self.config, images, others, least=LEAST_ROUGH)
+            return Collected(self.config, images, others)
         if rounds.all and self._ended(rounds):
             return None
         ahead = rounds.all[-1].ahead if rounds.all else self.config

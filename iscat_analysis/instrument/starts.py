@@ -27,7 +27,13 @@ from iscat_analysis.instrument.particle_image import (
     best_amplitudes,
     contrast_of,
 )
-from iscat_analysis.optics.parameters import PRIMARY, SECONDARY, Settings, free_names
+from iscat_analysis.optics.parameters import (
+    PRIMARY,
+    SECONDARY,
+    Prior,
+    Settings,
+    free_names,
+)
 from iscat_analysis.records import FloatArray, Mapper
 
 FOCUS_RANGE_NM = 1000.0
@@ -35,6 +41,7 @@ FOCUS_RANGE_NM = 1000.0
 
 FOCUS_STEP_NM = 80.0
 """Step of the search over focus; a quarter of the depth of field at NA 1.2."""
+_LOOKED_FOR = ("focus_nm", "reference_phase_deg")
 _TURNS = 24  # of half a circle of phases, for strong particles
 _FAINT = 1e-3  # share of what is explained below which the scattered light alone is left out
 _DIRECTIONS_DEG = (45.0, 90.0, 135.0)
@@ -73,8 +80,9 @@ def search_starts(
     candidates: Sequence[Mapping[str, Any]],
     *,
     most: int,
+    prior: Prior | None = None,
 ) -> tuple[Start, ...]:
-    """Rank microscopes by how much of the average pictures they explain."""
+    """Rank microscopes by what they explain of the average pictures, and how likely they are."""
     pixel, shape = averages[0].grid.pixel_nm, averages[0].grid.shape
     spectra = []
     for average in averages:
@@ -103,7 +111,11 @@ def search_starts(
                 explained=float(explained[row, column]),
             )
         )
-    found.sort(key=lambda start: -start.explained)
+
+    def likely(start: Start) -> float:
+        return start.explained + 2 * (prior.log_density(start.values, _LOOKED_FOR) if prior else 0)
+
+    found.sort(key=likely, reverse=True)
     kept: list[Start] = []
     for start in found:
         near = any(
@@ -190,6 +202,7 @@ class StateSearch:
     build: Build
     free: tuple[str, ...]
     limits: Mapping[str, tuple[float, float]]
+    prior: Prior
     mapper: Mapper = map
 
     def run(self, averages: Sequence[ParticleImage]) -> list[Estimate]:
@@ -199,7 +212,7 @@ class StateSearch:
         refined = self._refine(averages, begun)
         hidden = self._hidden_masks(averages, refined)
         refined += self._refine(averages, hidden, refined) if hidden else []
-        return sorted(refined, key=lambda e: -e.log_likelihood)
+        return sorted(refined, key=lambda e: -e.log_posterior)
 
     def states(self) -> list[list[dict[str, Any]]]:
         """Give the settings to start from, those of one state together."""
@@ -233,7 +246,7 @@ class StateSearch:
         candidates: Sequence[Mapping[str, Any]],
         most: int = _STARTS,
     ) -> tuple[Start, ...]:
-        starts = search_starts(averages, self.build, candidates, most=most)
+        starts = search_starts(averages, self.build, candidates, most=most, prior=self.prior)
         if "polarization" in self.free:
             starts = turned_starts(averages, self.build, starts)
         return starts if "phase" in self.free else tuple(map(self._phased, starts))
@@ -279,13 +292,13 @@ class StateSearch:
         def more(fit: Estimate) -> Estimate:
             return fit if fit.converged else self._fit(fit.images, fit.values, _MORE_PASSES)
 
-        fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_likelihood)
+        fits = sorted(self.mapper(first, begun), key=lambda e: -e.log_posterior)
         fits = [
             fit
             for fit in fits
             if not any(
                 fit.values["polarization"] == other.values["polarization"]
-                and fit.log_likelihood < other.log_likelihood
+                and fit.log_posterior < other.log_posterior
                 for other in known
             )
         ]
@@ -295,7 +308,7 @@ class StateSearch:
             if rank < _LEADERS
             or (
                 not any(same_state(fit, better) for better in fits[:rank])
-                and fit.log_likelihood > (1 - _HOPELESS) * fits[0].log_likelihood
+                and fit.log_posterior > (1 - _HOPELESS) * fits[0].log_posterior
             )
         ]
         return list(self.mapper(more, leading))
@@ -303,8 +316,9 @@ class StateSearch:
     def _fit(self, images: Sequence[ParticleImage], start: Settings, passes: int) -> Estimate:
         names = free_names(self.free, start, PRIMARY + SECONDARY)
         return maximise(
-            images, self.build, start, names, limits=self.limits, tolerance=_ROUGH, passes=passes
-        )
+            images, self.build, start, names,
+            prior=self.prior, limits=self.limits, tolerance=_ROUGH, passes=passes,
+        )  # fmt: skip
 
     def _hidden_masks(
         self, averages: Sequence[ParticleImage], refined: Sequence[Estimate]
@@ -312,11 +326,11 @@ class StateSearch:
         """Begin with a mask in every refined pupil that has none."""
         if "mask" not in self.free:
             return []
-        top = max(fit.log_likelihood for fit in refined)
+        top = max(fit.log_posterior for fit in refined)
         plain = [
             fit
             for fit in refined
-            if not fit.values["mask_na"] and fit.log_likelihood > (1 - _HOPELESS) * top
+            if not fit.values["mask_na"] and fit.log_posterior > (1 - _HOPELESS) * top
         ]
         begun = self.mapper(
             lambda fit: self._begin(

@@ -38,10 +38,10 @@ from iscat_analysis.optics.field_map import (
 )
 from iscat_analysis.optics.parameters import (
     FREE,
-    LEAST_IMAGES,
     Settings,
     free_names,
-    prior_range,
+    is_usual,
+    prior_of,
 )
 from iscat_analysis.records import FloatArray, Mapper
 
@@ -330,8 +330,8 @@ def rise_nm(terms: Mapping[str, float], frames: tuple[int, int]) -> float:
 def is_plausible(terms: Mapping[str, float], frames: tuple[int, int]) -> bool:
     """Whether optics can change so much; pictures that no optics describe ask for anything."""
     moves = {name: size for name, size in terms.items() if name in MOVES}
-    return abs(rise_nm(moves, frames)) < prior_range("focus_nm") and all(
-        abs(size) < prior_range(name) for name, size in terms.items() if name not in moves
+    return is_usual("focus_nm", rise_nm(moves, frames)) and all(
+        is_usual(name, size) for name, size in terms.items() if name not in moves
     )
 
 
@@ -416,14 +416,13 @@ def in_uneven_field(
     None where pictures that were not fitted want no change.
     """
     images, config = seen.images, seen.config
-    if len(images) < LEAST_IMAGES:
-        return seen  # too few for any optics, which is said where they are fitted
     build = microscopes(config, max(map(reach_nm, images)))
+    prior = prior_of(config)
     signed = with_masses(images, build, settings)  # what leaves is seen before
     pictures = sorted(view.placed(signed), key=lambda image: -image.snr)
 
     def fitted(some: Sequence[ParticleImage], start: Settings, names: Sequence[str]) -> Estimate:
-        return maximise(some, build, start, names, passes=_PASSES, mapper=mapper)
+        return maximise(some, build, start, names, prior=prior, passes=_PASSES, mapper=mapper)
 
     def tried(
         pictures: Sequence[ParticleImage], start: Settings, names: Sequence[str]

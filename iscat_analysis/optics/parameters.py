@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from iscat_analysis.config import JUMPS, MOVES, Config, field_keys
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.field_map import BASES, BEND, DRIFT, WEIGHTS, moves_in
-from iscat_analysis.records import FloatArray
+from iscat_analysis.records import BoolArray, FloatArray
 
 FOCUS_STEP = "focus_step_nm"
 """Rise of the focus from picture to picture of a scan [nm]; the one parameter that is not a key of
@@ -45,15 +45,12 @@ class Parameter:
     group: str
     """Its name for ``--free``."""
 
-    prior_range: float
-    """How far it may plausibly lie from the configured value; what the data leave wider than this,
-    they do not tell."""
-
     largest_step: float
     """Of one step of the search."""
 
     usual_error: float
-    """Standard deviation of a configured value that nobody has measured."""
+    """Standard deviation of a configured value that nobody has measured: of the prior, unless
+    ``[uncertainty] optics`` has another."""
 
     mirrored: int = 1
     """Its sign in the microscope on the other side of focus that makes the same pictures."""
@@ -62,23 +59,24 @@ class Parameter:
     """The change that makes no difference."""
 
 
-_EVEN, _ODD = (Parameter("zernike", 100.0, 25.0, 5.0, mirrored=sign) for sign in (-1, 1))
+_EVEN, _ODD = (Parameter("zernike", 25.0, 10.0, mirrored=sign) for sign in (-1, 1))
 
 PARAMETERS = {
-    "focus_nm": Parameter("focus", 1000.0, 120.0, 30.0),
-    FOCUS_STEP: Parameter("focus", 50.0, 2.0, 1.0, -1),
-    DRIFT: Parameter("focus", 1000.0, 100.0, 30.0, -1),
-    BEND: Parameter("focus", 4000.0, 500.0, 100.0, -1),
-    **dict.fromkeys(JUMPS, Parameter("focus", 1000.0, 100.0, 30.0, -1)),
-    "na": Parameter("na", 0.05, 0.02, 0.01),
-    "reference_phase_deg": Parameter("phase", 180.0, 40.0, 10.0, -1, period=360.0),
-    "mask_na": Parameter("mask", 0.3, 0.1, 0.02),
-    "attenuation": Parameter("mask", 0.5, 0.1, 0.05),
+    "focus_nm": Parameter("focus", 120.0, 150.0),
+    FOCUS_STEP: Parameter("focus", 2.0, 5.0, -1),
+    DRIFT: Parameter("focus", 100.0, 150.0, -1),
+    BEND: Parameter("focus", 500.0, 500.0, -1),
+    **dict.fromkeys(JUMPS, Parameter("focus", 100.0, 150.0, -1)),
+    "na": Parameter("na", 0.02, 0.01),
+    "reference_phase_deg": Parameter("phase", 40.0, 20.0, -1, period=360.0),
+    "mask_na": Parameter("mask", 0.1, 0.02),
+    "attenuation": Parameter("mask", 0.1, 0.05),
     **{
         name: _ODD if name in ("z7", "z8", "z9", "z10") else _EVEN
         for name in PRIMARY + SECONDARY + HIGHER
     },
-    "polarization_deg": Parameter("polarization", 90.0, 30.0, 5.0, period=180.0),
+    "z11": replace(_EVEN, usual_error=20.0),
+    "polarization_deg": Parameter("polarization", 30.0, 45.0, period=180.0),
 }
 """Every continuous parameter, in the order of results.  A new one is a row here, a value in
 `settings_of`, and a derivative of the forward model."""
@@ -103,7 +101,8 @@ FREE = {
 linear or circular is a choice beside them."""
 
 LEAST_IMAGES = 12
-"""Pictures without which nothing is calibrated: eight to fit and four to judge."""
+"""Pictures of which a third is not fitted but judges, eight and four; of fewer the evidence does.
+"""
 
 MOST_IMAGES = 60
 """Pictures that are used at most, two thirds of them to fit."""
@@ -159,11 +158,6 @@ def is_term(name: str) -> bool:
     return name[0] == "z" and name[1:].isdigit()
 
 
-def prior_range(name: str) -> float:
-    """Give the plausible distance of a parameter from the configured value."""
-    return PARAMETERS[name].prior_range
-
-
 def change_of(before: Settings, after: Settings, names: Sequence[str]) -> FloatArray:
     """Change of parameters, the short way round where they are angles; shape (n,)."""
     out = np.array([after[name] - before[name] for name in names], dtype=float)
@@ -210,42 +204,61 @@ def with_settings(config: Config, settings: Settings) -> Config:
     return config.model_copy(update={"optics": optics})
 
 
-_TAKES_PART = 0.3  # component of a direction, in prior ranges, above which a parameter is named
+_HALF_TURN = 180.0  # of the phase, after which particles look the same with the other sign
+_SOME_MASK = {"mask_na": (0.65, 0.25), "attenuation": (0.4, 0.3)}
+"""Middle and standard deviation of a mask of which the configuration knows nothing."""
+
+_TOLD = 0.5  # of the standard deviation before, to which pictures that tell a parameter bring it
+_PLAUSIBLE = 7.0  # usual errors
 
 
 @dataclass(frozen=True)
-class Hidden:
-    """A parameter that pictures do not determine within its plausible range."""
+class Prior:
+    """What is known of the optics before any particle is seen: a normal density of each parameter.
 
-    name: str
-    others: tuple[str, ...]
-    direction: Mapping[str, float]
-
-    @property
-    def why(self) -> str:
-        """Say it in a few words."""
-        return "not told apart from " + ", ".join(self.others) if self.others else "not visible"
-
-
-def find_hidden(information: FloatArray, names: Sequence[str]) -> Hidden | None:
-    """Find the worst determined direction, if it is wider than what is plausible.
-
-    Shapes: `information` (n, n).
+    Its middle is what is configured, its width the usual error of that.
     """
-    if not names:
-        return None
-    scale = np.array([prior_range(name) for name in names])
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
-    if values[0] >= 1:
-        return None
-    weights = np.abs(vectors[:, 0])
-    name = names[int(np.argmax(weights))]
-    others = tuple(n for n, w in zip(names, weights, strict=True) if w > _TAKES_PART and n != name)
-    with np.errstate(divide="ignore"):
-        width = float(1 / np.sqrt(max(values[0], 0.0)))
-    moves = {
-        n: float(v * s * width)
-        for n, v, s in zip(names, vectors[:, 0], scale, strict=True)
-        if n == name or n in others
-    }
-    return Hidden(name, others, moves)
+
+    middle: Settings
+    own: Mapping[str, float] = field(default_factory=dict[str, float])
+    """Standard deviations that are not the usual ones."""
+
+    def errors(self, names: Sequence[str]) -> FloatArray:
+        """Give the standard deviations of parameters, shape (n,)."""
+        usual = {name: PARAMETERS[name].usual_error for name in names}
+        if not self.middle["mask_na"]:
+            usual |= {name: sigma for name, (_, sigma) in _SOME_MASK.items()}
+        return np.array([self.own.get(name, usual[name]) for name in names], dtype=float)
+
+    def changes(self, values: Settings, names: Sequence[str]) -> FloatArray:
+        """Give how far parameters are from the middle, in standard deviations, shape (n,)."""
+        middle = dict.fromkeys(names, 0.0) | dict(self.middle)
+        if not self.middle["mask_na"]:
+            middle |= {name: centre for name, (centre, _) in _SOME_MASK.items()}
+        out = change_of(middle, values, names)
+        for i, name in enumerate(names):
+            if math.isfinite(PARAMETERS[name].period):
+                out[i] -= _HALF_TURN * np.rint(out[i] / _HALF_TURN)
+        return out / self.errors(names)
+
+    def log_density(self, values: Settings, names: Sequence[str]) -> float:
+        """Give the logarithm of the density over that in the middle."""
+        return -0.5 * float(np.sum(self.changes(values, names) ** 2))
+
+
+def prior_of(config: Config, middle: Settings | None = None) -> Prior:
+    """Give the prior of the optics of a configuration."""
+    return Prior(middle or settings_of(config), config.uncertainty.optics)
+
+
+def are_told(sigma: FloatArray, before: FloatArray) -> BoolArray:
+    """Say which parameters pictures tell, by standard deviations after and before.
+
+    Shapes: `sigma, before`, result (n,).
+    """
+    return np.asarray(sigma < _TOLD * before)
+
+
+def is_usual(name: str, size: float) -> bool:
+    """Tell whether a parameter may change by so much."""
+    return abs(size) < _PLAUSIBLE * PARAMETERS[name].usual_error

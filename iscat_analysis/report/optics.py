@@ -47,7 +47,7 @@ _LABELS = {
 }
 _STATES = {
     "measured": "measured",
-    "held": "not determined, held",
+    "prior": "hardly told, as usual",
     "dropped": "improves nothing, 0",
     "given": "not asked for",
 }

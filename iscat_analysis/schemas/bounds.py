@@ -268,17 +268,9 @@ class OpticsParameter(Closed):
 
     parameter: str
     value: float = key("As configured")
-    sigma: Positive = key("Standard deviation, all fitted together; null where it would be held")
-    prior_range: float = key("What is plausible")
-    determined: bool = key("Whether the images determine it within that range")
-
-
-class HiddenDirection(Closed):
-    """A parameter that would be held, and the combination that images do not determine."""
-
-    name: str
-    others: list[str] = key("Parameters from which it cannot be told apart")
-    direction: dict[str, Number] = key("One standard deviation, each in its own unit")
+    sigma: Positive = key("Standard deviation, all fitted together")
+    usual_error: float = key("Standard deviation without any image")
+    determined: bool = key("Whether the images know it twice as well as that")
 
 
 class EventsNeeded(Closed):
@@ -286,7 +278,7 @@ class EventsNeeded(Closed):
 
     mass_kda: float
     snr: NotNegative = key("Signal-to-noise ratio of one picture")
-    identified: Number = key("Events that identify everything that can be")
+    identified: Number = key("Events that determine everything that can be")
     focus_nm: Number
     mass_rel: Number
 
@@ -298,12 +290,9 @@ class OpticsBounds(Document):
     events: Natural = key("Particles that are fitted together")
     snr: NotNegative = key("Signal-to-noise ratio of one picture")
     parameters: list[OpticsParameter]
-    names: list[str] = key("Parameters that are determined, in the order of covariance")
+    names: list[str] = key("Parameters, in the order of covariance")
     covariance: list[list[Number]] = key("Of these, fitted together")
-    unidentifiable: list[str] = key(
-        "Parameters that the images would not determine, one sentence each"
-    )
-    hidden: list[HiddenDirection] = key("The same in numbers")
+    unidentifiable: list[str] = key("Parameters of which the images tell little, one sentence each")
     common: dict[str, dict[Parameter, Number]] = key(
         "Mode: standard deviation common to all fits, from the error of the optics [nm, kDa]"
     )

@@ -160,9 +160,9 @@ class OpticsParameter(Closed):
     sigma: Number = key("Its standard error, null where it was not measured")
     crb: Number = key("Its Cramér–Rao bound, null where it was not measured")
     configured: float = key("What the configuration says")
-    state: Literal["measured", "held", "dropped", "given"] = key(
-        "measured; held, because the images do not determine it; dropped, because it does not "
-        "improve the fits; or given, because it was not to be learned"
+    state: Literal["measured", "prior", "dropped", "given"] = key(
+        "measured; prior, because images tell little of it beyond its usual error; dropped, "
+        "because it does not improve the fits; or given, because it was not to be learned"
     )
 
 
@@ -223,7 +223,7 @@ class Optics(Document):
     covariance: list[list[float]] = key("Of the measured parameters")
     correlation: list[list[float]] = key("Of the measured parameters")
     settings: dict[str, float | bool | str] = key("Keys of [optics]; aberrations by name [nm]")
-    held: dict[str, str] = key("Parameters that the images do not determine, and why")
+    untold: list[str] = key("Parameters of which the images tell little: state prior")
     dropped: list[str] = key("Aberrations that improve nothing")
     undecided: list[str] = key("Discrete properties that the images do not determine")
     twin: Twin | None = key("A second microscope that is as likely")

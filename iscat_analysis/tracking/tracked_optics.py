@@ -154,7 +154,7 @@ def learn_from_tracks(
             if rounds.best is not None:
                 found = rounds.best.found.less_sure(rounds.error_of(rounds.best))
                 learned, told = adopted(
-                    found, config, tested, left.verdict, pictures_of="pictures of tracks", warn=warn
+                    found, config, tested, left.verdict, picture_of="track picture", warn=warn
                 )
                 return begin(learned), told
             why = next((one.reason for one in reversed(rounds.all) if one.reason), _NO_BETTER)

@@ -56,7 +56,7 @@ def test_an_array_is_a_movie_too(movie: Path, tmp_path: Path) -> None:
     assert found.config == ia.calibrate_optics(movie, **given).config
     assert (tmp_path / "scope" / "optics.toml").exists()
     assert "mine" in (tmp_path / "scope" / "optics.html").read_text(encoding="utf-8")
-    with pytest.raises(DataError, match=r"^dark: shows 0 bright particles"):
+    with pytest.raises(DataError, match=r"^dark: shows no bright particle"):
         ia.calibrate_optics(counts[:40], name="dark", **given)
 
 
@@ -107,7 +107,7 @@ def test_too_few_particles_are_one_clear_line(tmp_path: Path, capsys: Captured) 
     given = ["calibrate", "optics", str(tmp_path / "m.tif"), "--set", "camera.pixel_size_nm=84.4"]
     assert main(given) == 1
     message = capsys.readouterr().err
-    assert "0 bright particles standing alone" in message
+    assert "shows no bright particle that stands alone" in message
     assert "record more" in message
     assert "Traceback" not in message
 

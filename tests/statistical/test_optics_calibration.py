@@ -20,7 +20,13 @@ from iscat_analysis.instrument.microscope import build_microscope
 from iscat_analysis.instrument.particle_image import average_particle_images
 from iscat_analysis.optics.forward import ForwardModel
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.parameters import optics_limits, settings_of
+from iscat_analysis.optics.parameters import (
+    PARAMETERS,
+    are_told,
+    optics_limits,
+    prior_of,
+    settings_of,
+)
 
 SIGMAS = 4.0
 """A parameter farther from the truth than this many standard errors is wrong: 6e-5 by chance."""
@@ -39,9 +45,12 @@ def _measure(
 ) -> Measured:
     config = configuration() if config is None else config
     images, _, build = make_particle_images(changes, count, seed=seed, config=config, **light)
-    return OpticsSearch(settings_of(config), build, free, optics_limits(1.515, 1.515), side=-1).run(
-        images
-    )
+    return _search(config, build, free).run(images)
+
+
+def _search(config: Config, build: Any, free: tuple[str, ...]) -> OpticsSearch:
+    limits = optics_limits(1.515, 1.515)
+    return OpticsSearch(settings_of(config), build, free, limits, prior_of(config), side=-1)
 
 
 def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None:
@@ -63,9 +72,7 @@ def test_a_picture_that_is_registered_far_off_does_not_leave_the_model() -> None
 
     _, placed = average_particle_images(images)
     assert math.hypot(placed[-1].x_nm, placed[-1].y_nm) > 500.0  # the trap is set
-    found = OpticsSearch(
-        settings_of(config), build, ROUND, optics_limits(1.515, 1.515), side=-1
-    ).run(images)  # fmt: skip
+    found = _search(config, build, ROUND).run(images)
     assert len(found.estimate.images) >= 6
 
 
@@ -123,9 +130,8 @@ def test_optics_that_make_other_pictures_worse_are_refused() -> None:
         replace((of_configured if rank % 3 == 1 else images)[k], snr=100.0 - rank)
         for rank, k in enumerate(order)
     ]
-    configured, limits = settings_of(configuration()), optics_limits(1.515, 1.515)
     for pictures, refused in ((mixed, True), (images, False)):
-        found = OpticsSearch(configured, build, ("focus",), limits, side=-1).run(pictures)
+        found = _search(configuration(), build, ("focus",)).run(pictures)
         worse = "the configured optics describe pictures that were not fitted better"
         assert (worse in found.refusals) == refused
 
@@ -145,22 +151,33 @@ def test_light_beyond_the_critical_angle_rules_the_twin_out() -> None:
     assert found.twin is None
 
 
-def test_too_few_particles_are_refused_with_what_to_record() -> None:
-    images, _, _ = make_particle_images({}, 8, seed=17, masses_kda=(300.0,))
-    with pytest.raises(DataError, match=r"8 bright particles.*12 are needed.*record more"):
-        fit_optics(Collected(configuration(), images), ROUND, {"movie": "faint.tif"})
+def test_no_particle_is_refused_with_what_to_record() -> None:
+    with pytest.raises(DataError, match=r"faint.tif: shows no bright particle.*record brighter"):
+        fit_optics(Collected(configuration(), []), ROUND, {"movie": "faint.tif"})
+
+
+@pytest.mark.parametrize("focus_nm", [-400.0, -200.0])
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_few_particles_tell_what_they_tell(count: int, focus_nm: float) -> None:
+    """One is enough for the focus; of what it does not tell the usual error is left."""
+    changes = {"focus_nm": focus_nm}
+    found = _measure(changes, count, seed=30 + count, photons=3e6, masses_kda=(2000.0,))
+    assert not found.refusals
+    assert found.judgement.fitted
+    sigma = dict(
+        zip(found.estimate.names, np.sqrt(np.diag(found.estimate.covariance)), strict=True)
+    )
+    assert set(ROUND) <= {PARAMETERS[name].group for name in sigma}
+    assert sigma["focus_nm"] < 15.0
+    assert np.abs(_pulls(found, changes)).max() < SIGMAS
+    assert all(error <= 1.01 * PARAMETERS[name].usual_error for name, error in sigma.items())
 
 
 def test_a_parameter_at_its_limit_is_refused() -> None:
     config = configuration()
     images, _, build = make_particle_images({"na": 1.33}, 15, seed=19)
-    found = OpticsSearch(
-        settings_of(config),
-        build,
-        ("focus", "na", "phase"),
-        {**optics_limits(1.515, 1.515), "na": (1.36, 1.5)},
-        side=-1,
-    ).run(images)
+    search = _search(config, build, ("focus", "na", "phase"))
+    found = replace(search, limits={**search.limits, "na": (1.36, 1.5)}).run(images)
     assert any(line.startswith("na = 1.36 lies at its limit") for line in found.refusals)
 
 
@@ -193,17 +210,32 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
 
 
-def test_what_the_pictures_do_not_tell_is_held() -> None:
-    """Particles far below the noise do not tell an aperture to 0.05: it is named and held."""
-    _, truth, build = make_particle_images({}, 14, seed=18, photons=150.0)
-    configured = settings_of(configuration())
+def test_what_the_pictures_do_not_tell_stays_as_configured_with_its_usual_error() -> None:
+    """Particles far below the noise tell nothing; control: bright ones do."""
     names = ("focus_nm", "na", "reference_phase_deg", "z11")
-    rough = maximise(truth, build, configured, names, passes=1)
-    search = OpticsSearch(configured, build, ROUND, {}, side=-1)
-    found, held = search._identified(rough)
-    assert held
-    for name in held:
-        assert found.values[name] == configured[name]
-        assert name not in found.names
-    bright = maximise(make_particle_images({}, 14, seed=18)[1], build, configured, names, passes=1)
-    assert not search._identified(bright)[1]
+    usual = np.array([PARAMETERS[name].usual_error for name in names])
+    configured = settings_of(configuration())
+    for photons, told in ((15.0, False), (PHOTONS, True)):
+        _, truth, build = make_particle_images({}, 14, seed=18, photons=photons)
+        found = maximise(truth, build, configured, names)
+        sigma = np.sqrt(np.diag(found.covariance))
+        assert are_told(sigma, usual).all() == told
+        if not told:
+            assert sigma[1] == pytest.approx(usual[1], rel=0.02)
+            assert found.values["na"] == pytest.approx(configured["na"], abs=0.2 * usual[1])
+
+
+def test_the_evidence_is_the_likelihood_averaged_over_the_prior() -> None:
+    """Against a plain sum over the focus, at a prior that the pictures narrow."""
+    _, truth, build = make_particle_images({"focus_nm": -310.0}, 2, seed=22, photons=2e4)
+    configured = settings_of(configuration())
+    found = maximise(truth, build, configured, ("focus_nm",), tolerance=1e-6)
+    foci = np.linspace(-750.0, 150.0, 181)
+    plain = [maximise(found.images, build, {**configured, "focus_nm": f}, ()) for f in foci]
+    usual = PARAMETERS["focus_nm"].usual_error
+    prior = np.exp(-0.5 * ((foci - configured["focus_nm"]) / usual) ** 2)
+    values = np.array([fit.log_likelihood for fit in plain])
+    top = values.max()
+    mean = top + math.log(float(np.sum(np.exp(values - top) * prior) / prior.sum()))
+    assert found.log_evidence == pytest.approx(mean, abs=0.3)
+    assert math.sqrt(found.bound[0, 0]) < 0.5 * usual

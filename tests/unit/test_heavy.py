@@ -23,7 +23,7 @@ SETTINGS = {
     "calibration.gradient_per_kda": GRADIENT,
     "optics.calibrate": "never",
     "posterior.enabled": False,
-    **{f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields},
+    **{f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields if key != "optics"},
 }
 
 

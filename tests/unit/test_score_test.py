@@ -11,7 +11,7 @@ from calibrations import configuration, make_particle_images
 from iscat_analysis.instrument.joint_fit import maximise
 from iscat_analysis.instrument.microscope import REJECTED_P, goodness, median_p, microscopes
 from iscat_analysis.instrument.score_test import ScoreTest, score_test
-from iscat_analysis.optics.parameters import settings_of
+from iscat_analysis.optics.parameters import Prior, prior_of, settings_of
 
 COUNT = 8
 PHOTONS = 1.5e5  # so few that single pictures of optics that are a little off are described
@@ -24,10 +24,10 @@ def _tested(changes: dict[str, Any], seed: int, count: int = COUNT) -> tuple[Sco
         changes, count, seed=seed, photons=PHOTONS, masses_kda=(2000.0,)
     )
     if not images:
-        return score_test((), build, settings), np.nan
+        return score_test((), build, settings, Prior(settings)), np.nan
     fitted = maximise(images, build, settings, ()).images
     median = float(np.median([goodness(image, build(settings))[1] for image in fitted]))
-    return score_test(fitted, build, settings), median
+    return score_test(fitted, build, settings, Prior(settings)), median
 
 
 @pytest.mark.parametrize("changes", [{"focus_nm": -330.0}, {"z11": 10.0}])
@@ -41,21 +41,23 @@ def test_pictures_that_pass_alone_reject_the_optics_together(changes: dict[str, 
     assert abs(found.change[index] - (value - settings_of(configuration())[name])) < 4 * sigma
 
 
-def test_right_optics_are_confirmed_and_leave_no_doubt() -> None:
+def test_right_optics_are_confirmed_and_what_is_not_told_keeps_its_usual_error() -> None:
     prior = np.diag(np.array(_tested({}, 0, 0)[0].doubt.matrix))
     for seed in range(4):
         found, _ = _tested({}, seed)
         assert not found.rejected
         assert found.log_bayes_factor < 0
-        assert np.all(np.diag(np.array(found.doubt.matrix)) < 0.1 * prior)
+        left = dict(zip(found.names, np.diag(np.array(found.doubt.matrix)) / prior, strict=True))
+        assert 0.3 < left.pop("na") < 1.0
+        assert max(left.values()) < 0.25
 
 
-def test_without_pictures_optics_are_as_likely_off_as_right() -> None:
+def test_without_pictures_optics_have_their_usual_errors() -> None:
     found, _ = _tested({}, 0, 0)
     assert not found.rejected
     assert found.log_bayes_factor == 0
     focus = found.names.index("focus_nm")
-    assert np.sqrt(found.doubt.matrix[focus][focus]) == pytest.approx(30 / np.sqrt(2))
+    assert np.sqrt(found.doubt.matrix[focus][focus]) == pytest.approx(150.0)
 
 
 @pytest.mark.parametrize(("height", "is_right"), [("auto", True), (5.0, False)])
@@ -70,6 +72,6 @@ def test_a_common_height_is_no_other_optics_if_heights_are_open(
         {}, COUNT, seed=5, photons=10 * PHOTONS, masses_kda=(2000.0,), height_nm=17.0
     )
     median, fitted = median_p(images, config)
-    found = score_test(fitted, microscopes(config, 2600.0), settings_of(config))
+    found = score_test(fitted, microscopes(config, 2600.0), settings_of(config), prior_of(config))
     assert (median > REJECTED_P and not found.rejected) == is_right
     assert (abs(fitted[0].z_nm - 17.0) < 1.0) == is_right

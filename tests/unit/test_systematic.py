@@ -38,7 +38,7 @@ LINE = Calibration(
 )
 """Of standards whose optics are known without error."""
 
-SURE = {f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields}
+SURE = {f"uncertainty.{key}": 0.0 for key in Uncertainty.model_fields if key != "optics"}
 
 
 def _config(covariance: np.ndarray[Any, Any] = COVARIANCE, **settings: Any) -> Config:
