@@ -348,7 +348,7 @@ def learned_from(
     """Learn the optics from particles that stand alone, or where these do not suffice from all."""
     scan, way = seen.focus_step_nm is not None, background_mode(config)
     crowded = way == "fixed" and not scan
-    if not crowded or len(seen.images) >= min(LEAST_IMAGES, len(seen.others)):
+    if not crowded or len(seen.images) >= LEAST_IMAGES:
         asked = not scan and not heights_free(config) and set(groups) == set(FREE)
         view = FieldOfView.of(movie, config, in_time=way == "sliding") if asked else None
         found = learn(StandingAlone(seen, pool, view), config, groups, origin, pool.map).outcome

@@ -39,6 +39,7 @@ from iscat_analysis.optics.parameters import (
 )
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.threads import one_thread_algebra
+from iscat_analysis.trust.systematic import REJECTED_SHARE
 
 HELD_OUT = 3
 """One picture in so many is not fitted."""
@@ -72,6 +73,9 @@ class Judgement:
     p_values: FloatArray
     chi2_reduced: FloatArray
     uniform_p: float
+    left_over: float
+    """What it leaves over of them beyond the noise, over the pictures (root mean square)."""
+
     fitted: bool = False
     """Whether they were fitted with it, because they are few."""
 
@@ -82,8 +86,8 @@ class Judgement:
 
     @property
     def good(self) -> bool:
-        """Whether they agree."""
-        return bool(self.uniform_p >= HELD_OUT_P)
+        """Whether they agree, or what is left over is too little to matter."""
+        return bool(self.uniform_p >= HELD_OUT_P or self.left_over < REJECTED_SHARE)
 
 
 @dataclass(frozen=True)
@@ -123,8 +127,11 @@ def judge(
         return goodness(image, build(image.seen_with(settings)))
 
     found = np.array(list(mapper(one, images))).reshape(-1, 2)
-    p_values = found[:, 1]
-    return Judgement(p_values, found[:, 0], float(kstest(p_values, "uniform").pvalue))
+    chi2, p_values = found.T
+    pixels = np.array([math.prod(image.grid.shape) for image in images])
+    power = math.fsum(image.snr**2 for image in images)
+    left_over = math.sqrt(max(float(pixels @ (chi2 - 1)), 0.0) / power) if power else math.inf
+    return Judgement(p_values, chi2, float(kstest(p_values, "uniform").pvalue), left_over)
 
 
 def _fitted(images: Sequence[ParticleImage]) -> list[ParticleImage]:
