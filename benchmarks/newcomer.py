@@ -1,6 +1,7 @@
 """Five lines of a new user beside the full configuration, on ten movies of different microscopes.
 
-    python benchmarks/newcomer.py [--quick] [NAME…]
+    python benchmarks/newcomer.py [--quick] [--bright 4,8,16] [NAME…]
+    python benchmarks/newcomer.py --focus [--never]
 
 A new user says pixel size, wavelength and NA, and nothing else::
 
@@ -15,6 +16,12 @@ kDa.  Movies of 128 × 128 × 700 frames with 36 landings of 160 and 480 kDa on 
 differ in format, counts, scale, noise, focus and polarity.  A landing counts as found where the
 table has one within 2 pixels and a quarter window.  Without standards there are no masses: pulls
 and species are of contrasts, pulls over rows that are ok and were found.
+With ``--bright`` so many of the landings are of 480 kDa, and the others of 66 kDa, too dim to learn
+from.  ``--focus`` moves the focus instead, with 1, 2, 4 or 8 such particles, or 5 dim ones alone:
+how many of the found landings are ok, how far contrasts are from the truth together, by the errors
+of the rows and with the stated common error, and the focus that was learned.  With ``--never`` none
+is learned, and rows of movies out of focus must fail.
+
 Status 1 where a new user finds less than 95 % of what the full configuration finds, has a species
 that is off by more than 3 %, or pulls that are wider by a fifth.
 """
@@ -27,6 +34,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +46,8 @@ import iscat_analysis as ia
 
 RESULTS = Path(__file__).resolve().parent / "results"
 SIDE, FRAMES, SPECIES = 128, 700, (160.0, 480.0)
+BRIGHT, DIM = 480.0, 66.0
+OFF_NM, FEW = (0.0, 100.0, -100.0, -60.0, 150.0), (0, 1, 2, 4, 8)
 NEAR_PX = 2.0
 RECALL, MASS, PULLS = 0.95, 0.03, 1.2
 
@@ -154,18 +164,24 @@ def full(case: Case) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def simulate(case: Case, folder: Path, seed: int) -> tuple[Path, pd.DataFrame]:
+def simulate(
+    case: Case, folder: Path, seed: int, bright: int | None = None, number: int = 36
+) -> tuple[Path, pd.DataFrame]:
     """Write a movie; give its path and its truth."""
     rng = np.random.default_rng(seed)
-    number = 36
     places = [
         (14 + 20 * (k % 6) + rng.uniform(-4, 4), 14 + 20 * (k // 6) + rng.uniform(-4, 4))
-        for k in range(number)
+        for k in range(36)
+    ]
+    if bright is not None:
+        rng.shuffle(places)
+    masses = [
+        SPECIES[k % 2] if bright is None else BRIGHT if k < bright else DIM for k in range(number)
     ]
     frames = rng.permutation(np.linspace(60, FRAMES - 60, number).astype(int))
     events = [
-        {"frame": int(frame), "x_px": float(x), "y_px": float(y), "mass_kda": SPECIES[k % 2]}
-        for k, (frame, (x, y)) in enumerate(zip(frames, places, strict=True))
+        {"frame": int(frame), "x_px": float(x), "y_px": float(y), "mass_kda": mass}
+        for frame, (x, y), mass in zip(frames, places[:number], masses, strict=True)
     ]
     simulation = {
         "simulation.shape": [SIDE, SIDE], "simulation.frames": FRAMES,
@@ -177,26 +193,20 @@ def simulate(case: Case, folder: Path, seed: int) -> tuple[Path, pd.DataFrame]:
     path = case.save(folder / case.name, tifffile.imread(raw))
     truth = pd.read_csv(raw.with_suffix(".truth.csv"))
     raw.unlink()
+    raw.with_suffix(".truth.csv").unlink()
     return path, truth
 
 
 def measured(result: Any, truth: pd.DataFrame) -> dict[str, Any]:
     """Set what was found against the truth."""
     table = result.table[result.table["status"] != "sidelobe"]
-    window = result.summary["landing"]["window_frames"]
-    pulls, found, used = [], 0, set()
-    for _, step in truth.iterrows():
-        near = np.hypot(table["x_px"] - step["x_px"], table["y_px"] - step["y_px"]) < NEAR_PX
-        near &= (table["frame"] - step["frame"]).abs() <= max(window // 4, 3)
-        rows = table[near & ~table.index.isin(used)]
-        if not len(rows):
-            continue
-        row = rows.iloc[0]
-        used.add(row.name)
-        found += 1
-        if row["status"] == "ok":
-            sigma = abs(row["contrast"] * row["sigma_mass_kda"] / row["mass_kda"])
-            pulls.append((row["contrast"] - step["contrast"]) / sigma)
+    pairs = paired(result, truth)
+    found = len(pairs)
+    pulls = [
+        (row["contrast"] - step["contrast"]) / sigma_of(row)
+        for row, step in pairs
+        if row["status"] == "ok"
+    ]
     distribution = result.summary.get("distribution") or {"species": []}
     scale = 1e3 * float(np.median(np.abs(table["contrast"] / table["mass_kda"])))
     species = [scale * one["mass_kda"] for one in distribution["species"] if not one["outlier"]]
@@ -210,6 +220,63 @@ def measured(result: Any, truth: pd.DataFrame) -> dict[str, Any]:
         "gain": result.summary["camera"]["gain_e_per_adu"]["value"],
         "warnings": list(result.warnings),
     }
+
+
+def paired(result: Any, truth: pd.DataFrame) -> list[tuple[pd.Series, pd.Series]]:
+    """Give the row of every landing that was found."""
+    table = result.table[result.table["status"] != "sidelobe"]
+    window = result.summary["landing"]["window_frames"]
+    pairs, used = [], set()
+    for _, step in truth.iterrows():
+        near = np.hypot(table["x_px"] - step["x_px"], table["y_px"] - step["y_px"]) < NEAR_PX
+        near &= (table["frame"] - step["frame"]).abs() <= max(window // 4, 3)
+        rows = table[near & ~table.index.isin(used)]
+        if len(rows):
+            used.add(rows.iloc[0].name)
+            pairs.append((rows.iloc[0], step))
+    return pairs
+
+
+def sigma_of(row: pd.Series) -> float:
+    """Give the standard error of a contrast."""
+    return abs(float(row["contrast"] * row["sigma_mass_kda"] / row["mass_kda"]))
+
+
+def out_of_focus(seed: int, *, never: bool) -> bool:
+    """Print what becomes of few particles out of focus; tell whether all is well."""
+    well = True
+    print("off [nm]  bright   ok   contrasts       common error   pull   focus [nm]", flush=True)
+    with tempfile.TemporaryDirectory() as folder:
+        for number, (off, bright) in enumerate((o, b) for o in OFF_NM for b in FEW):
+            truth = {"camera.gain_e_per_adu": 4.0, "optics.focus_nm": -300.0 + off}
+            case = Case("focus", truth=truth)
+            landings = max(bright + 6, 5) if bright else 5
+            path, steps = simulate(case, Path(folder), seed + number, bright, landings)
+            settings = {**KNOWN, "optics.calibrate": "never" if never else "auto"}
+            result = ia.fit_movie(path, settings=settings)
+            pairs = paired(result, steps)
+            share = np.array([row["contrast"] / step["contrast"] - 1 for row, step in pairs])
+            error = np.array([sigma_of(r) / abs(step["contrast"]) for r, step in pairs])
+            weight = error**-2.0 / np.sum(error**-2.0)
+            mean, own = float(weight @ share), float(np.sum(error**-2.0)) ** -0.5
+            common = 0.0
+            if "systematic_contrast" in result.table:
+                stated = [abs(r["systematic_contrast"] / r["contrast"]) for r, _ in pairs]
+                common = float(np.median(stated))
+            ok = sum(row["status"] == "ok" for row, _ in pairs)
+            pull = mean / np.hypot(own, common)
+            optics = result.summary.get("optics", {})
+            rows = {row["parameter"]: row for row in optics.get("parameters", [])}
+            focus = rows.get("focus_nm") if optics.get("calibrated") else None
+            learned = "–" if focus is None else f"{focus['value']:.1f} ± {focus['sigma']:.1f}"
+            well &= ok >= 0.9 * len(pairs) and abs(pull) < 4
+            print(
+                f"{off:+8.0f}{bright:8d}{ok:4d}/{len(pairs)} {mean:+8.1%} ± {own:5.1%}"
+                f"{common:11.1%}{pull:+11.1f}   {learned}",
+                flush=True,
+            )
+            path.unlink()
+    return well
 
 
 def kept(new: dict[str, Any], whole: dict[str, Any]) -> bool:
@@ -227,15 +294,24 @@ def main() -> int:
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(c.name for c in CASES))
     parser.add_argument("--quick", action="store_true", help="two of the movies")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--bright", default="", help="how many are bright, as 4,8,16")
+    parser.add_argument("--focus", action="store_true", help="few particles out of focus")
+    parser.add_argument("--never", action="store_true", help="the same, and nothing is learned")
     options = parser.parse_args()
+    if options.focus:
+        return 0 if out_of_focus(options.seed, never=options.never) else 1
     names = options.names or [case.name for case in (CASES[:2] if options.quick else CASES)]
     told, broken = {}, []
-    print("movie      found        ok      pulls              species [contrast, 1e-3]", flush=True)
+    print(
+        "movie        found        ok      pulls              species [contrast, 1e-3]", flush=True
+    )
+    several = [int(text) for text in options.bright.split(",") if text] or [None]
     with tempfile.TemporaryDirectory() as folder:
-        for number, case in enumerate(CASES):
+        for (number, case), bright in product(enumerate(CASES), several):
             if case.name not in names:
                 continue
-            path, truth = simulate(case, Path(folder), options.seed + number)
+            name = case.name if bright is None else f"{case.name}{bright}"
+            path, truth = simulate(case, Path(folder), options.seed + number, bright)
             new = {**KNOWN, **{key: case.truth[key] for key in KNOWN if key in case.truth}}
             both = {}
             for who, settings in (("full", full(case)), ("new", new)):
@@ -245,17 +321,19 @@ def main() -> int:
                     settings = {**settings, "camera.offset_adu": 32768.0}
                 both[who] = one = measured(ia.fit_movie(path, settings=settings), truth)
                 print(
-                    f"{case.name:9}{who:5}{one['recall']:5.0%} +{one['false']:<3}{one['ok']:5d}"
+                    f"{name:11}{who:5}{one['recall']:5.0%} +{one['false']:<3}{one['ok']:5d}"
                     f"   {one['pull_mean'] or 0:+.2f} ± {one['pull_std'] or 0:.2f}   "
                     f"{', '.join(f'{mass:g}' for mass in one['species'])}",
                     flush=True,
                 )
-            told[case.name] = both
+            told[name] = both
             path.unlink()
             if not kept(both["new"], both["full"]):
-                broken.append(case.name)
+                broken.append(name)
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "newcomer.json").write_text(json.dumps(told, indent=1))
+    (RESULTS / f"newcomer{'_bright' if options.bright else ''}.json").write_text(
+        json.dumps(told, indent=1)
+    )
     if broken:
         print(f"a new user gets less: {', '.join(broken)}", file=sys.stderr)
     return 1 if broken else 0

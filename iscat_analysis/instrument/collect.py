@@ -27,7 +27,13 @@ from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
-from iscat_analysis.optics.parameters import FAINTEST, MOST_IMAGES, heights_free, settings_of
+from iscat_analysis.optics.parameters import (
+    FAINTEST,
+    LEAST_IMAGES,
+    MOST_IMAGES,
+    heights_free,
+    settings_of,
+)
 from iscat_analysis.records import FloatArray, Windows
 from iscat_analysis.search.bright import (
     ALONE_NM,
@@ -52,7 +58,7 @@ SAME_NM = 800.0
 
 _KNOWN_APART_NM = (APART_NM, 1600.0, 1300.0, 1000.0, 700.0)
 _STANDS_OUT = 5.0
-"""Times the median signal-to-noise ratio of the bright particles from which one is no standard."""
+"""Times the median signal-to-noise ratio of the brightest, from which one is no standard."""
 
 _PARTS = 8  # of a movie, that are searched where all of it is asked for
 
@@ -191,9 +197,12 @@ def _neighbours(
 def _standards(bright: Sequence[BrightStep]) -> list[BrightStep]:
     """Leave out what is far brighter than the others: a vesicle or an aggregate is no point.
 
-    A few of these would outweigh all particles, as the square of the brightness.
+    A few of these would outweigh all particles, as the square of the brightness.  Of few particles
+    each counts.
     """
-    middle = float(np.median([step.snr for step in bright])) if bright else 0.0
+    if len(bright) < LEAST_IMAGES:
+        return list(bright)
+    middle = float(np.median([step.snr for step in bright[:LEAST_IMAGES]]))
     return [step for step in bright if step.snr <= _STANDS_OUT * middle]
 
 
