@@ -108,7 +108,7 @@ def test_too_few_particles_are_one_clear_line(tmp_path: Path, capsys: Captured) 
     assert main(given) == 1
     message = capsys.readouterr().err
     assert "shows no bright particle that stands alone" in message
-    assert "record more" in message
+    assert "record brighter ones" in message
     assert "Traceback" not in message
 
 
