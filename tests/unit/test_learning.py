@@ -107,7 +107,7 @@ def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage
 def test_pairs_that_land_at_once_do_not_condemn_the_optics(
     changes: dict[str, Any], fits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Six of eleven bright places are two particles; control: optics that are wrong, and learned."""
+    """Six of eleven bright places are two particles; control: wrong optics, which are learned."""
     config = _config("auto")
     singles, _, _ = make_particle_images(changes, 5, seed=3)
     images = [*_pairs(changes, 6, 4), *singles]
@@ -124,7 +124,7 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
 
 
 def _sigma(summary: dict[str, Any], name: str) -> float:
-    """Standard deviation that the doubt about configured optics has."""
+    """Give the standard deviation that the doubt about configured optics has."""
     doubt = summary["doubt"]
     k = doubt["names"].index(name)
     return float(doubt["matrix"][k][k]) ** 0.5
