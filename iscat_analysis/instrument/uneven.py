@@ -415,7 +415,8 @@ def in_uneven_field(
 
     None where pictures that were not fitted want no change.
     """
-    images, config = seen.images, seen.config
+    config = seen.config
+    images = [image.placed(image.x_nm, image.y_nm) for image in seen.images]
     build = microscopes(config, max(map(reach_nm, images)))
     prior = prior_of(config)
     signed = with_masses(images, build, settings)  # what leaves is seen before

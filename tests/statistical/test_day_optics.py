@@ -85,8 +85,11 @@ def test_the_optics_are_learned_once_and_serve_the_day(tmp_path: Path) -> None:
             assert used[key] == first[key]
     rows = day.movies.set_index("movie")["optics"]
     assert rows[["first", "second", "sample"]].tolist() == 3 * ["of the day, confirmed"]
-    # control: a movie of another focus rejects what serves the others
-    assert rows["moved"].startswith("rejected by this movie (of the day)")
+    # control: a movie of another focus rejects what serves the others, and its four particles tell
+    assert rows["moved"] == "learned from this movie"
+    moved = _summary(out / "movies" / "moved.iscat")
+    focus = {row["parameter"]: row for row in moved["parameters"]}["focus_nm"]
+    assert abs(focus["value"] - SETUP["optics.focus_nm"]) < SIGMAS * focus["sigma"]
     page = day.page.read_text(encoding="utf-8")
     assert "learned by first" in page
     assert ia.batch(table, out=out, config=SETUP).analysed == ()
