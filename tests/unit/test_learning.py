@@ -20,10 +20,13 @@ from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
 from iscat_analysis.instrument import learning
+from iscat_analysis.instrument.fit_optics import Collected
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.instrument.microscope import REJECTED_P, median_p, not_alone
 from iscat_analysis.instrument.particle_image import ParticleImage
+from iscat_analysis.instrument.uneven import FieldOfView, in_uneven_field
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.optics.parameters import settings_of
 
 MOVIE: Any = SimpleNamespace(name="movie.tif", shape=(1000, 64, 64))
 
@@ -82,6 +85,14 @@ def test_a_place_far_from_the_centre_of_its_picture_stops_nothing() -> None:
     pairs, median = not_alone([*images[2:], *far], config)
     assert not pairs
     assert median > REJECTED_P
+
+
+def test_nor_does_it_stop_the_test_of_an_uneven_field() -> None:
+    config = configuration()
+    images, _, _ = make_particle_images({}, 6, seed=5, config=config)
+    far = [replace(images[0], x_nm=900.0, y_nm=-900.0), *images[1:]]
+    view = FieldOfView((15.0, 15.0, 15.0), GRID.pixel_nm, (0, 1000), in_time=False, movie=MOVIE)
+    assert in_uneven_field(Collected(config, far), settings_of(config), view) is None
 
 
 def _pairs(changes: dict[str, Any], count: int, seed: int) -> list[ParticleImage]:
