@@ -323,8 +323,8 @@ def _optics(
     )
     found = table("optics, all fitted together", "value", "±", "without images")
     for row in report["parameters"]:
-        cells = f"{row['value']:g}", short(row["sigma"]), f"±{row['usual_error']:g}"
-        found.add_row(row["parameter"], *cells)
+        value, usual = f"{row['value']:g}", f"±{row['usual_error']:g}"
+        found.add_row(row["parameter"], value, short(row["sigma"]), usual)
     print_result(found)
     found = table("error common to all fits", *("x_nm", "y_nm", "z_nm", "mass_kda"))
     for name, common in report["common"].items():
