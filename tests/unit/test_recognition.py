@@ -30,7 +30,8 @@ from tests.rays import picture_of_rays
 FloatArray = NDArray[np.float64]
 
 OPTICS = {"na": 1.42, "focus_nm": -300.0, "attenuation": 0.5, "calibrate": "never"}
-CONFIG = configure({"optics": OPTICS, "camera": {"pixel_size_nm": 90.0}})
+# Rays are summed at the centres of pixels.
+CONFIG = configure({"optics": OPTICS, "camera": {"pixel_size_nm": 90.0, "samples_per_pixel": 1}})
 GRID = PixelGrid.centred(23, 90.0)
 GOLD = 0.5921258 + 2.1358682j
 MODEL = forward_model(CONFIG, 2200.0)
