@@ -1,8 +1,8 @@
 """Arrays in MATLAB's ``.mat`` files of versions 5 to 7; version 7.3 is HDF5.
 
 MATLAB's movies have the axes (y, x, t) and are stored column by column.  Arrays are found here and
-mapped where they lie, or unpacked into a temporary file.  SciPy would hold them in memory whole, and
-ends the process with a segmentation fault on one in some hundred files with a changed byte.
+mapped where they lie, or unpacked into a temporary file.  SciPy would hold them in memory whole,
+and ends the process with a segmentation fault on some files in which a byte has changed.
 Format: MATLAB, "MAT-File Format", level 5 (The MathWorks).
 """
 

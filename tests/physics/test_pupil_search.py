@@ -30,10 +30,13 @@ def setup(**sections: dict[str, Any]) -> Config:
 
 
 def flat() -> Config:
-    """Close the pupil until particle and reference are two plane waves."""
+    """Close the pupil until particle and reference are two plane waves.
+
+    Pixels are points, in which nothing is lost: a mean over 800 nm loses 8 % of the information.
+    """
     return setup(
         optics={"na": 0.15, "focus_nm": 5.0},
-        camera={"pixel_size_nm": 800.0},
+        camera={"pixel_size_nm": 800.0, "samples_per_pixel": 1},
         bounds={"pixels": 101},
     )
 
