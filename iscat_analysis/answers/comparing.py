@@ -207,7 +207,7 @@ def compare_tables(
 
     def pair(other: EventTable) -> Comparison:
         nonlocal done
-        found = compare(read[0].events, other.events, start=chosen.best)
+        found = compare(read[0].events, other.events, chosen.best)
         done += 1
         progress("compare", done, len(read) - 1)
         return found

@@ -18,8 +18,7 @@ from iscat_analysis.species.search import ascend, height, joined_starts, peaks, 
 from iscat_analysis.species.structure import fit_jointly, polish
 
 _SUPPORT_DRAWS = 20
-_RIVAL_STEPS, _RIVAL_EVALUATIONS = 10, 150
-_TOLERANCE = 1e-6  # of the log-likelihood per event: a tenth of a standard error for hundreds
+_RIVAL_STEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +52,7 @@ def bootstrap(
         events, best = one.events, one.mixture
         drawn = draw_events(events, best, max(least, int(rng.poisson(events.x.size))), rng)
         # from the estimate, so that species keep their places
-        fit = fit_jointly(drawn, best, found.structure, one.limits, tolerance=_TOLERANCE)
+        fit = fit_jointly(drawn, best, one.structure, one.curvature)
         repeats.append(
             Repeat(
                 fit, fit.shares(drawn).sum(axis=0), fit.came * fit.arrived(drawn),
@@ -98,12 +97,7 @@ def _rivals(events: Events, fit: Mixture) -> list[Mixture]:
     """Fit one species more and, where there are two or more, one less."""
     more = [ascend(events, start, _RIVAL_STEPS) for start in split_starts(events, fit)]
     return [
-        polish(
-            events,
-            max(starts, key=lambda start: height(events, start)),
-            evaluations=_RIVAL_EVALUATIONS,
-            tolerance=_TOLERANCE,
-        )
+        polish(events, max(starts, key=lambda start: height(events, start)))
         for starts in (more, joined_starts(fit))
         if starts
     ]

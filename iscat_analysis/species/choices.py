@@ -39,7 +39,6 @@ from iscat_analysis.species.search import (
     without_background,
 )
 from iscat_analysis.species.structure import (
-    Limits,
     Structure,
     fit_jointly,
     free_structure,
@@ -84,7 +83,6 @@ class Chosen:
     tried: tuple[Mixture, ...]
     best: Mixture
     structure: Structure
-    limits: Limits
     held: bool = False
     steps: tuple[int, ...] = ()
     searched: bool = False
@@ -104,7 +102,7 @@ class Searched:
         if not events.plain:
             best = by_peaks(events, without_background(events, best).by_mass())
             fits.append(best)
-        return Chosen(tuple(fits), best, *free_structure(events, best), searched=True)
+        return Chosen(tuple(fits), best, free_structure(events, best), searched=True)
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class Number:
         """Fit this number of species."""
         fits = fit_species(events, self.k, least=self.k)
         best = fits[-1].by_mass()
-        return Chosen(tuple(fits), best, *free_structure(events, best))
+        return Chosen(tuple(fits), best, free_structure(events, best))
 
 
 @dataclass(frozen=True)
@@ -130,7 +128,7 @@ class Begun:
         """Climb from the given masses to the nearest maximum of the likelihood."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         best = polish(events, ascend(events, _near(events, masses))).by_mass()
-        return Chosen((best,), best, *free_structure(events, best))
+        return Chosen((best,), best, free_structure(events, best))
 
 
 @dataclass(frozen=True)
@@ -145,12 +143,12 @@ class Given:
         """Fit fractions and widths."""
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         start = _start(events, masses, self.background)
-        structure, limits = _rungs(
+        structure = _rungs(
             events, start, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
             widths=self.widths, unit_kda=float(masses[0]),
         )  # fmt: skip
-        best = fit_jointly(events, start, structure, limits)
-        return Chosen((best,), best, structure, limits, held=True)
+        best = fit_jointly(events, start, structure)
+        return Chosen((best,), best, structure, held=True)
 
 
 @dataclass(frozen=True)
@@ -227,13 +225,13 @@ class Ladder:
         begin = [1.0] if self.held else _SEARCH
         starts = [_start(events, n * monomer * s, self.background) for s in begin]
         start = max(starts, key=lambda one: height(events, one))
-        structure, limits = _rungs(
+        structure = _rungs(
             events, start, monomer * n if self.held else np.zeros(n.size), slopes,
             np.array(ranges).reshape(-1, 2).T, np.array(units),
             widths=self.widths, unit_kda=monomer,
         )  # fmt: skip
-        best = fit_jointly(events, start, structure, limits)
-        return Chosen((best,), best, structure, limits, held=True, steps=tuple(steps))
+        best = fit_jointly(events, start, structure)
+        return Chosen((best,), best, structure, held=True, steps=tuple(steps))
 
     def _against_free(self, events: Events, found: Chosen) -> float:
         """Test whether free masses describe the events better than those of the ladder."""
@@ -244,12 +242,12 @@ class Ladder:
         unit = float(np.median(events.sigma))
         monomer = self.monomer_kda or self.values(found)[0]
         centres = found.best.mean[:k]
-        structure, limits = _rungs(
+        structure = _rungs(
             events, found.best, np.zeros(k), np.eye(k),
             np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]), np.full(k, unit),
             widths=self.widths, unit_kda=monomer,
         )  # fmt: skip
-        free = fit_jointly(events, found.best, structure, limits)
+        free = fit_jointly(events, found.best, structure)
         gain = max(2 * (free.log_likelihood - found.best.log_likelihood), 0.0)
         return float(chdtrc(k - means, gain))
 
@@ -267,7 +265,7 @@ def _rungs(
     *,
     widths: Widths,
     unit_kda: float,
-) -> tuple[Structure, Limits]:
+) -> Structure:
     """Make the structure of a ladder: means that are linear in m₁ and b.
 
     Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,).

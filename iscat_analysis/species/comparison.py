@@ -34,17 +34,15 @@ import pandas as pd
 from scipy.special import chdtrc
 
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.species.choices import Choice, Searched
 from iscat_analysis.species.events import Events
+from iscat_analysis.species.maximum import Maximum
 from iscat_analysis.species.mixture import BACKGROUND, Mixture
 from iscat_analysis.species.search import peaks
 from iscat_analysis.species.structure import (
     LOGIT_REACH,
     Limits,
-    Optimum,
     Structure,
-    information,
-    maximise,
+    maximise_jointly,
 )
 from iscat_analysis.species.widths import width_prior
 
@@ -62,9 +60,7 @@ other's less the first's, intervals are 95 %, fractions are of the particles tha
 
 _TWO_SIDED_95 = 1.959964
 _MOST_RELATIVE_WIDTH = 0.3  # width over mass
-_LEAST_WEIGHT = 1e-6  # of a species that a sample lacks
 _WIDTH_STEP = 0.3  # of ln T
-_TOLERANCE = 1e-9  # of the log-likelihood per event: 2·10⁻⁵ of χ² for 10 000 events
 
 
 @dataclass(frozen=True)
@@ -121,24 +117,15 @@ class Comparison:
         }
 
 
-def compare(
-    first: Events, other: Events, *, choice: Choice | None = None, start: Mixture | None = None
-) -> Comparison:
-    """Compare the species of two samples."""
-    pooled = Events(
-        np.concatenate([first.x, other.x]),
-        np.concatenate([first.sigma, other.sigma]),
-        first.efficiency,
-    )
-    if start is None:
-        start = (Searched() if choice is None else choice).choose(pooled).best
+def compare(first: Events, other: Events, start: Mixture) -> Comparison:
+    """Compare two samples that hold the species of `start`."""
     known, samples = start.species, (first, other)
     seen = np.array([start.shares(events).sum(axis=0)[:known] for events in samples])
     narrow = start.widths()[:known] < _MOST_RELATIVE_WIDTH * start.means()[:known]
     moves = (seen.min(axis=0) >= LEAST_COMPARED) & narrow
-    noise = pooled.usual_variance
+    noise = float(np.median(np.concatenate([events.variance for events in samples])))
     free = _Hypothesis(samples, start, moves, noise, own_fractions=True)
-    full = free.fit(start)
+    full = maximise_jointly(free.structures, [start, start])
 
     def against(*, shift: bool, own: bool) -> Test:
         narrow = _Hypothesis(samples, start, moves & shift, noise, own_fractions=own)
@@ -146,7 +133,7 @@ def compare(
 
     shares = [
         float(structure.mixture(full.theta).shares(events)[:, known:].sum() / events.x.size)
-        for structure, events in zip(free.structures, samples, strict=True)
+        for events, structure in free.structures
     ]
     return Comparison(
         species=free.table(full, moves),
@@ -177,7 +164,7 @@ class _Hypothesis:
         *,
         own_fractions: bool,
     ) -> None:
-        self.samples, self.known = samples, start.species
+        self.known = start.species
         self.moves = np.flatnonzero(moves)
         every, k, of = start.weight.size, start.narrow, start.kinds
         first_of = {int(kind): int(np.flatnonzero(of == kind)[-1]) for kind in np.unique(of)}
@@ -188,7 +175,7 @@ class _Hypothesis:
         self.places = np.cumsum([0, *sizes])
         p = int(self.places[-1])
         at_a, at_b, at_back, at_inner, at_mean, at_shift, at_width = self.places[:-1]
-        structures = []
+        structures, limits = [], self._limits(start, noise)
         for sample in (0, 1):
             design, origin = np.zeros((3, every, p)), np.zeros((3, every))
             begin = at_b if sample and self.own else at_a
@@ -204,9 +191,8 @@ class _Hypothesis:
                 for number, moved in enumerate(self.moves):
                     design[1, of == moved, at_shift + number] = 1.0
             design[2, :k, at_width:] = np.eye(k)
-            structures.append(Structure(design, origin, noise, start.broad, start.kind))
-        self.structures = tuple(structures)
-        self.limits = self._limits(start, noise)
+            structures.append(Structure(design, origin, noise, limits, start.broad, start.kind))
+        self.structures = list(zip(samples, structures, strict=True))
 
     def _limits(self, start: Mixture, noise: float) -> Limits:
         """Limits of parameters: a mean may go halfway to its neighbours, a shift as far."""
@@ -240,55 +226,31 @@ class _Hypothesis:
         found[order] = np.maximum(np.minimum(reach[:-1], reach[1:]), unit)
         return found
 
-    def theta(self, first: Mixture, other: Mixture) -> FloatArray:
-        """Parameters of species that are nearly this hypothesis's, by least squares.
+    def mixtures(self, theta: FloatArray) -> list[Mixture]:
+        """Make the components of both samples."""
+        return [structure.mixture(theta) for _, structure in self.structures]
 
-        Of what it shares, each sample counts as its number of events.
-        """
-        rows, values = [], []
-        for mixture, structure, events in zip(
-            (first, other), self.structures, self.samples, strict=True
-        ):
-            logits = np.log(np.maximum(mixture.weight, _LEAST_WEIGHT))
-            width = np.log(mixture.variance + structure.noise) / 2
-            value = np.array([logits - logits[0], mixture.mean, width]) - structure.origin
-            size = math.sqrt(events.x.size)
-            rows.append(size * structure.design.reshape(value.size, -1))
-            values.append(size * value.ravel())
-        found = np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0]
-        return np.asarray(found)
-
-    def fit(self, first: Mixture, other: Mixture | None = None) -> Optimum:
-        """Maximise the likelihood of both samples."""
-        return maximise(
-            list(zip(self.samples, self.structures, strict=True)),
-            self.theta(first, first if other is None else other),
-            self.limits,
-            tolerance=_TOLERANCE,
-        )
-
-    def against(self, full: Optimum, narrow: _Hypothesis) -> Test:
+    def against(self, full: Maximum, narrow: _Hypothesis) -> Test:
         """Test a hypothesis that this one contains, whose optimum is known."""
         dof = full.theta.size - int(narrow.places[-1])
         if not dof:
             return Test(0.0, 0, math.nan)
-        nearly = narrow.fit(*(structure.mixture(full.theta) for structure in self.structures))
-        chi2 = max(2 * (full.log_likelihood - nearly.log_likelihood), 0.0)
+        nearly = maximise_jointly(narrow.structures, self.mixtures(full.theta))
+        chi2 = max(2 * (full.value - nearly.value), 0.0)
         return Test(chi2, dof, float(chdtrc(dof, chi2)))
 
-    def table(self, full: Optimum, moves: BoolArray) -> pd.DataFrame:
+    def table(self, full: Maximum, moves: BoolArray) -> pd.DataFrame:
         """Lay out shifts and differences with their errors."""
         k, theta = self.known, full.theta
         at_mean, at_shift = (int(place) for place in self.places[4:6])
-        covariance = self._covariance(theta)
-        mixtures = [structure.mixture(theta) for structure in self.structures]
+        covariance, mixtures = full.covariance(), self.mixtures(theta)
         fractions, slopes = zip(*(self._fractions(i, theta) for i in (0, 1)), strict=True)
         slope = slopes[1] - slopes[0]
         error = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, covariance, slope), 0.0))
         shift, shift_se = np.full(k, math.nan), np.full(k, math.nan)
         relative_se = np.full(k, math.nan)
         first = mixtures[0]
-        mean = peaks(self.samples[0], first)
+        mean = peaks(self.structures[0][0], first)
         for number, i in enumerate(self.moves):
             place = at_shift + number
             shift[i] = theta[place]
@@ -305,7 +267,7 @@ class _Hypothesis:
         difference = fractions[1] - fractions[0]
         counts = [
             mixture.shares(events).sum(axis=0)[:k]
-            for mixture, events in zip(mixtures, self.samples, strict=True)
+            for mixture, (events, _) in zip(mixtures, self.structures, strict=True)
         ]
         columns = {
             "mass_kda": mean,
@@ -324,24 +286,13 @@ class _Hypothesis:
 
     def _fractions(self, sample: int, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Fractions among the species of a sample, and their derivatives."""
-        structure = self.structures[sample]
+        structure = self.structures[sample][1]
         mixture = structure.mixture(theta)
         belongs = mixture.belongs[:, : self.known] * mixture.weight[:, None]
         part = belongs.sum(axis=0)
         logits = (belongs / part).T @ structure.design[0]
         part = part / part.sum()
         return part, part[:, None] * (logits - part @ logits)
-
-    def _covariance(self, theta: FloatArray) -> FloatArray:
-        """Inverse of the observed information, without parameters at a limit."""
-        samples = list(zip(self.samples, self.structures, strict=True))
-        known = information(samples, theta, self.limits)
-        margin = 1e-6 * (self.limits.high - self.limits.low)
-        inside = (theta > self.limits.low + margin) & (theta < self.limits.high - margin)
-        free = np.flatnonzero(inside & (np.diag(known) > 0))
-        covariance = np.zeros(known.shape)
-        covariance[np.ix_(free, free)] = np.linalg.pinv(known[np.ix_(free, free)])
-        return covariance
 
 
 def _interval(

@@ -194,7 +194,7 @@ def describe(
 
     choice = Searched(max_species) if choice is None else choice
     found = choice.choose(events)
-    possible_limits = [Possible(1.0, events, found.best, found.limits)]
+    possible_limits = [Possible(1.0, events, found.best, found.structure)]
     if not limit_known:
         found, possible_limits = with_edges(events, found, choice, LEAST_SPECIES - 0.5)
     events, best = possible_limits[0].events, possible_limits[0].mixture

@@ -134,7 +134,7 @@ def describe_sizes(
         found = choice.choose(events)
     best = found.best
     repeats, support = bootstrap(
-        [Possible(1.0, events, best, found.limits)],
+        [Possible(1.0, events, best, found.structure)],
         found,
         draws=draws,
         least=LEAST_EVENTS,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -20,7 +21,13 @@ from iscat_analysis.records import FloatArray
 from iscat_analysis.species.choices import Choice, Chosen
 from iscat_analysis.species.events import Edge, Events
 from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.structure import Limits, fit_jointly, free_structure
+from iscat_analysis.species.structure import (
+    Structure,
+    fit_jointly,
+    free_structure,
+    information,
+    parameters,
+)
 
 _STEP = 0.25  # of the places: as fine as the likelihood of hundreds of events tells
 _PLACES = np.arange(-2.5, 1.51, _STEP)  # of T from the peak, in widths
@@ -31,7 +38,6 @@ _LOWEST = 10  # events that tell how far below the lightest a cut may be
 _JUST_BELOW = 1e-9  # of the lightest event
 _ENDS = (0.025, 0.975)
 _LEAST = 1e-3  # probability of a limit that is kept
-_EVALUATIONS, _TOLERANCE = 100, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +47,13 @@ class Possible:
     probability: float
     events: Events
     mixture: Mixture
-    limits: Limits
+    structure: Structure
+
+    @cached_property
+    def curvature(self) -> FloatArray:
+        """Give how the likelihood bends at the species (p, p)."""
+        samples = [(self.events, self.structure)]
+        return information(samples, parameters(samples, [self.mixture]))
 
 
 def with_edges(
@@ -64,7 +76,7 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
 
     `events` say nothing of a limit.
     """
-    best = fit_jointly(events, found.best, found.structure, found.limits)
+    best = fit_jointly(events, found.best, found.structure)
     seen = best.shares(events).sum(axis=0)[: best.species]
     light = np.flatnonzero(seen >= least)
     first = int(light[np.argmin(best.means()[light])]) if light.size else 0
@@ -72,16 +84,15 @@ def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible
     width = math.hypot(float(best.widths()[first]), math.sqrt(events.usual_variance))
     lowest = np.sort(events.x)[:_LOWEST]
     gap = float(np.ptp(lowest)) / max(lowest.size - 1, 1)
-    tried = [(math.log(_FAR), best, events, found.limits)]
+    tried = [(math.log(_FAR), best, events, found.structure)]
+    near = Possible(1.0, events, best, found.structure).curvature
 
     def at(limit: float, soft: float, part: float, start: Mixture) -> tuple[float, Mixture]:
         edge = replace(events, efficiency=Edge.at(limit, soft))
-        limits = found.limits if found.held else free_structure(edge, best)[1]
-        fit = fit_jointly(
-            edge, start, found.structure, limits, evaluations=_EVALUATIONS, tolerance=_TOLERANCE
-        )
+        structure = found.structure if found.held else free_structure(edge, best)
+        fit = fit_jointly(edge, start, structure, near)
         prior = math.log((1 - _FAR) * max(part, 1e-9) / (_PLACES.size * len(_SOFT)))
-        tried.append((prior, fit, edge, limits))
+        tried.append((prior, fit, edge, structure))
         return prior + fit.log_likelihood, fit
 
     if gap > 0:

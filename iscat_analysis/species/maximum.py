@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
@@ -50,13 +50,18 @@ class Problem:
 class Maximum:
     """Where a function is largest, and how it bends there.
 
-    Shapes: `theta` (p,), `curvature` (p, p), `free` (p,), which parameters are at no limit.
+    Shapes: `theta` (p,), `free` (p,), which parameters are at no limit.
     """
 
     theta: FloatArray
     value: float
-    curvature: FloatArray
     free: BoolArray
+    bends: Callable[[FloatArray], FloatArray]
+
+    @cached_property
+    def curvature(self) -> FloatArray:
+        """Give minus the second derivatives (p, p)."""
+        return self.bends(self.theta)
 
     def covariance(self) -> FloatArray:
         """Give the inverse of the curvature among free parameters, 0 for the others."""
@@ -100,17 +105,18 @@ def maximise(problem: Problem, start: FloatArray, near: FloatArray | None = None
     search.errordef, search.strategy, search.tol = Minuit.LIKELIHOOD, _FAST, _TOLERANCE
     search.errors = _STEP * problem.scale
     search.print_level = _SILENT
-    held = reach == 0
     for place, (low, high) in enumerate(zip(problem.low, problem.high, strict=True)):
-        if held[place]:
+        if low == high:
             search.fixed[place] = True
         else:
             search.limits[place] = low, high
     search.migrad()
     theta = np.array(search.values)
     edge = _AT_LIMIT * reach
-    free = ~held & (theta > problem.low + edge) & (theta < problem.high - edge)
-    return Maximum(theta, -float(search.fval), curvature(theta), free)
+    lowest, highest = theta <= problem.low + edge, theta >= problem.high - edge
+    theta = np.where(lowest, problem.low, np.where(highest, problem.high, theta))
+    free = ~(lowest | highest)
+    return Maximum(theta, -float(search.fval), free, curvature)
 
 
 def _positive(curvature: FloatArray, scale: FloatArray) -> FloatArray:

@@ -17,59 +17,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-import scipy
 
 from iscat_analysis._kernels.mixture import detection_score, mixture_score
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Edge, Events
+from iscat_analysis.species.maximum import Maximum, Problem, maximise
 from iscat_analysis.species.mixture import Kinds, Mixture
 from iscat_analysis.species.widths import width_prior
 
 LOGIT_REACH = 12.0
 """Weights stay within a factor of e to this power of that of the first species."""
-
-
-@dataclass(frozen=True, eq=False)
-class Structure:
-    """Linear map from parameters to the components of one sample."""
-
-    design: FloatArray
-    origin: FloatArray
-    noise: float
-    broad: int = 0
-    kind: Kinds | None = None
-
-    def mixture(self, theta: FloatArray) -> Mixture:
-        """Make the components of some parameters.
-
-        Shapes: `theta` (p,).
-        """
-        logits, mean, width = self.origin + self.design @ theta
-        weight = np.exp(logits - logits.max())
-        variance = np.maximum(np.exp(2 * width) - self.noise, 0.0)
-        return Mixture(weight / weight.sum(), mean, variance, broad=self.broad, kind=self.kind)
-
-    def parameters(self, mixture: Mixture) -> FloatArray:
-        """Parameters of components that this structure made.
-
-        Shapes: result (p,).
-        """
-        logits = np.log(np.maximum(mixture.weight, 1e-300))
-        width = np.log(mixture.variance + self.noise) / 2
-        values = np.array([logits - logits[0], mixture.mean, width]) - self.origin
-        rows = self.design.reshape(-1, self.design.shape[2])
-        return np.asarray(np.linalg.lstsq(rows, values.ravel(), rcond=None)[0])
-
-    def slope(self, mixture: Mixture, slopes: FloatArray) -> FloatArray:
-        """Turn slopes in ln w, μ and τ² into such in the parameters.
-
-        Shapes: `slopes` (3, k), result (p,).
-        """
-        slopes = slopes.copy()
-        slopes[2] *= 2 * (mixture.variance + self.noise)
-        return np.asarray(slopes.ravel() @ self.design.reshape(slopes.size, -1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,11 +47,34 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Optimum:
-    """The maximum of the likelihood."""
+class Structure:
+    """Linear map from parameters, within limits, to the components of one sample."""
 
-    theta: FloatArray
-    log_likelihood: float
+    design: FloatArray
+    origin: FloatArray
+    noise: float
+    limits: Limits
+    broad: int = 0
+    kind: Kinds | None = None
+
+    def mixture(self, theta: FloatArray) -> Mixture:
+        """Make the components of some parameters.
+
+        Shapes: `theta` (p,).
+        """
+        logits, mean, width = self.origin + self.design @ theta
+        weight = np.exp(logits - logits.max())
+        variance = np.maximum(np.exp(2 * width) - self.noise, 0.0)
+        return Mixture(weight / weight.sum(), mean, variance, broad=self.broad, kind=self.kind)
+
+    def slope(self, mixture: Mixture, slopes: FloatArray) -> FloatArray:
+        """Turn slopes in ln w, μ and τ² into such in the parameters.
+
+        Shapes: `slopes` (3, k), result (p,).
+        """
+        slopes = slopes.copy()
+        slopes[2] *= 2 * (mixture.variance + self.noise)
+        return np.asarray(slopes.ravel() @ self.design.reshape(slopes.size, -1))
 
 
 def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
@@ -114,12 +97,13 @@ def score(events: Events, mixture: Mixture) -> tuple[float, FloatArray]:
 
 
 def log_likelihood(
-    samples: Sequence[tuple[Events, Structure]], theta: FloatArray, limits: Limits
+    samples: Sequence[tuple[Events, Structure]], theta: FloatArray
 ) -> tuple[float, FloatArray]:
     """Log-likelihood of several samples with the prior, and its slope.
 
     Shapes: `theta` (p,), `slope` (p,).
     """
+    limits = samples[0][1].limits
     away = limits.rows @ theta - limits.middle
     total, slope = -0.5 * float(away @ away), -limits.rows.T @ away
     for events, structure in samples:
@@ -130,37 +114,44 @@ def log_likelihood(
     return total, slope
 
 
-def maximise(
-    samples: Sequence[tuple[Events, Structure]],
-    start: FloatArray,
-    limits: Limits,
-    *,
-    evaluations: int = 400,
-    tolerance: float = 1e-9,
-) -> Optimum:
-    """Maximise the likelihood of the events of all samples.
+def parameters(
+    samples: Sequence[tuple[Events, Structure]], mixtures: Sequence[Mixture]
+) -> FloatArray:
+    """Parameters of mixtures that these structures made, or nearly so, by least squares.
 
-    Shapes: `start` (p,).
+    Of what it shares, each sample counts as its number of events.
+
+    Shapes: result (p,).
     """
-    n = sum(events.x.size for events, _ in samples)
-    if not start.size:
-        return Optimum(start, log_likelihood(samples, start, limits)[0])
+    rows, values = [], []
+    for (events, structure), mixture in zip(samples, mixtures, strict=True):
+        logits = np.log(np.maximum(mixture.weight, _LEAST_WEIGHT))
+        width = np.log(mixture.variance + structure.noise) / 2
+        value = np.array([logits - logits[0], mixture.mean, width]) - structure.origin
+        size = math.sqrt(events.x.size)
+        rows.append(size * structure.design.reshape(value.size, -1))
+        values.append(size * value.ravel())
+    return np.asarray(np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0])
 
-    def loss(scaled: FloatArray) -> tuple[float, FloatArray]:
-        value, slope = log_likelihood(samples, scaled * limits.scale, limits)
-        return -value / n, -slope * limits.scale / n
 
-    low, high = limits.low / limits.scale, limits.high / limits.scale
-    # TNC and not L-BFGS-B, whose calls of a threaded BLAS take longer than all the rest.
-    found = scipy.optimize.minimize(
-        loss, np.clip(start / limits.scale, low, high), jac=True, method="TNC",
-        bounds=list(zip(low, high, strict=True)),
-        options={"maxfun": evaluations, "ftol": tolerance, "gtol": 1e-6},
+def maximise_jointly(
+    samples: Sequence[tuple[Events, Structure]],
+    start: Sequence[Mixture],
+    near: FloatArray | None = None,
+) -> Maximum:
+    """Maximise the likelihood of the events of all samples; `near` as for `maximise`.
+
+    Shapes: `near` (p, p).
+    """
+    limits = samples[0][1].limits
+    problem = Problem(
+        partial(log_likelihood, samples), partial(information, samples),
+        limits.low, limits.high, limits.scale,
     )  # fmt: skip
-    return Optimum(np.asarray(found.x) * limits.scale, -float(found.fun) * n)
+    return maximise(problem, parameters(samples, start), near)
 
 
-def free_structure(events: Events, start: Mixture) -> tuple[Structure, Limits]:
+def free_structure(events: Events, start: Mixture) -> Structure:
     """Free weights and widths, and free means where the detector can see the components."""
     k, top = start.narrow, float(events.x.max())
     lightest = min(_lightest(events, start), 0.9 * top)
@@ -186,7 +177,7 @@ def structure_of(
     widest: FloatArray,
     *,
     prior: bool,
-) -> tuple[Structure, Limits]:
+) -> Structure:
     """Make a structure of free weights, of means that are linear in p, of widths linear in q.
 
     The background of `start` stays as it is, but for its share; a prior of widths is of components
@@ -221,7 +212,7 @@ def structure_of(
         of_widths,
         middle,
     )
-    return Structure(design, fixed, events.usual_variance, start.broad, start.kind), limits
+    return Structure(design, fixed, events.usual_variance, limits, start.broad, start.kind)
 
 
 def _lightest(events: Events, start: Mixture) -> float:
@@ -240,61 +231,42 @@ def _lightest(events: Events, start: Mixture) -> float:
     return max(min(events.efficiency.threshold_kda + _HARDLY_SEEN * spread, seen), 0.0)
 
 
-def polish(
-    events: Events, start: Mixture, *, evaluations: int = 400, tolerance: float = 1e-9
-) -> Mixture:
+def polish(events: Events, start: Mixture) -> Mixture:
     """Maximise the likelihood of the events seen over all mixtures of as many species."""
-    structure, limits = free_structure(events, start)
-    return fit_jointly(
-        events, start, structure, limits, evaluations=evaluations, tolerance=tolerance
-    )
+    return fit_jointly(events, start, free_structure(events, start))
 
 
 def fit_jointly(
-    events: Events,
-    start: Mixture,
-    structure: Structure,
-    limits: Limits,
-    *,
-    evaluations: int = 400,
-    tolerance: float = 1e-9,
+    events: Events, start: Mixture, structure: Structure, near: FloatArray | None = None
 ) -> Mixture:
-    """Maximise the likelihood of one sample's events over the mixtures of a structure."""
-    begun = replace(start, weight=np.maximum(start.weight, _SIZE_FLOOR))
-    found = maximise(
-        [(events, structure)], structure.parameters(begun), limits,
-        evaluations=evaluations, tolerance=tolerance,
-    )  # fmt: skip
+    """Maximise the likelihood of one sample's events over the mixtures of a structure.
+
+    Shapes: `near` (p, p), as for `maximise`.
+    """
+    found = maximise_jointly([(events, structure)], [start], near)
     return replace(
         structure.mixture(found.theta),
-        log_likelihood=found.log_likelihood,
+        log_likelihood=found.value,
         parameters=structure.design.shape[2],
     )
 
 
-def information(
-    samples: Sequence[tuple[Events, Structure]], theta: FloatArray, limits: Limits
-) -> FloatArray:
+def information(samples: Sequence[tuple[Events, Structure]], theta: FloatArray) -> FloatArray:
     """Observed information: minus the second derivatives of the log-likelihood.
 
     Shapes: `theta` (p,), result (p, p).
     """
+    limits = samples[0][1].limits
     n = sum(events.x.size for events, _ in samples)
-    step = limits.scale / math.sqrt(n) * _STEP
-    rows = []
-    for i, h in enumerate(step):
-        shift = np.zeros(theta.shape)
-        shift[i] = h
-        above = np.minimum(theta + shift, limits.high)
-        below = np.maximum(theta - shift, limits.low)
-        rise = log_likelihood(samples, above, limits)[1]
-        rise = rise - log_likelihood(samples, below, limits)[1]
-        rows.append(-rise / (above[i] - below[i]))
-    found = np.array(rows).reshape(theta.size, theta.size)
+    steps = _STEP * limits.scale / math.sqrt(n)
+    steps = np.where(theta + steps > limits.high, -steps, steps)
+    here = log_likelihood(samples, theta)[1]
+    rise = [log_likelihood(samples, theta + step)[1] - here for step in np.diag(steps)]
+    found = -np.array(rise) / steps[:, None]
     return np.asarray((found + found.T) / 2)
 
 
 _HARDLY_SEEN = -1.88  # standard deviations above the threshold, where 3 % are seen
-_SIZE_FLOOR = 1e-3  # of a component's share of the events
 _WIDTH_STEP = 0.3  # of ln T
-_STEP = 0.1  # of the scale over √n, about a tenth of a standard error
+_STEP = 1e-3  # of about a standard error: steps for second derivatives
+_LEAST_WEIGHT = 1e-6  # of a component that a sample lacks, at a start

@@ -15,7 +15,7 @@ import iscat_analysis as ia
 from iscat_analysis.species import Efficiency, Given, Ladder, Number, describe
 from iscat_analysis.species.choices import Chosen
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.structure import information, log_likelihood
+from iscat_analysis.species.structure import information, log_likelihood, parameters
 from iscat_analysis.species.tables import UNKNOWN_SIGMA_KDA, event_table, sentences
 
 EFFICIENCY = Efficiency(5.0, 13.0)
@@ -41,19 +41,19 @@ def test_shared_parameters_have_the_slope_that_differences_give(
 ) -> None:
     events = events_of(oligomers)
     found = choice.choose(events)
-    theta = found.structure.parameters(found.best) + 0.3 * found.limits.scale
-    theta = np.minimum(theta, found.limits.high - found.limits.scale)
-    sample = [(events, found.structure)]
-    value, slope = log_likelihood(sample, theta, found.limits)
-    numerical = approx_fprime(theta, lambda t: log_likelihood(sample, t, found.limits)[0], 1e-5)
+    sample, limits = [(events, found.structure)], found.structure.limits
+    theta = parameters(sample, [found.best]) + 0.3 * limits.scale
+    theta = np.minimum(theta, limits.high - limits.scale)
+    value, slope = log_likelihood(sample, theta)
+    numerical = approx_fprime(theta, lambda t: log_likelihood(sample, t)[0], 1e-5)
     assert np.isfinite(value)
     assert np.allclose(slope, numerical, rtol=1e-3, atol=1e-2)
-    curved = information(sample, theta, found.limits)
+    curved = information(sample, theta)
     for i in range(theta.size):
         shift = np.zeros(theta.size)
-        shift[i] = 1e-4 * found.limits.scale[i]
-        rise = log_likelihood(sample, theta + shift, found.limits)[1]
-        rise = rise - log_likelihood(sample, theta - shift, found.limits)[1]
+        shift[i] = 1e-4 * limits.scale[i]
+        rise = log_likelihood(sample, theta + shift)[1]
+        rise = rise - log_likelihood(sample, theta - shift)[1]
         assert np.allclose(
             -rise / (2 * shift[i]), curved[i], rtol=0.02, atol=0.02 * abs(curved[i, i])
         )
@@ -62,11 +62,11 @@ def test_shared_parameters_have_the_slope_that_differences_give(
 def test_a_maximum_is_flat_inside_its_range(oligomers: pd.DataFrame) -> None:
     events = events_of(oligomers)
     found = Ladder(66.0, (1, 2, 4)).choose(events)
-    theta = found.structure.parameters(found.best)
     sample = [(events, found.structure)]
-    _, slope = log_likelihood(sample, theta, found.limits)
-    step = np.linalg.solve(information(sample, theta, found.limits), slope)
-    error = np.sqrt(np.diag(np.linalg.inv(information(sample, theta, found.limits))))
+    theta = parameters(sample, [found.best])
+    _, slope = log_likelihood(sample, theta)
+    step = np.linalg.solve(information(sample, theta), slope)
+    error = np.sqrt(np.diag(np.linalg.inv(information(sample, theta))))
     assert np.all(np.abs(step) < 0.05 * error)
 
 
