@@ -275,7 +275,7 @@ def _rungs(
     mean = start.mean[:k]
     widest = _MOST_RELATIVE_WIDTH * unit_kda * np.sqrt(mean / mean.min())
     return structure_of(
-        events, start, origin, slopes, ranges, units, of_widths,
+        start, events.usual_variance, origin, slopes, ranges, units, of_widths,
         np.full(k, widest[0]) if common else widest, prior=not common,
     )  # fmt: skip
 

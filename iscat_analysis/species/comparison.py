@@ -36,15 +36,12 @@ from scipy.special import chdtrc
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import Maximum
-from iscat_analysis.species.mixture import BACKGROUND, Mixture
+from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import peaks
 from iscat_analysis.species.structure import (
-    LOGIT_REACH,
-    Limits,
-    Structure,
     maximise_jointly,
+    structure_of,
 )
-from iscat_analysis.species.widths import width_prior
 
 LEAST_COMPARED = 20
 """Events of a species in each sample, without which its masses are not compared."""
@@ -60,7 +57,6 @@ other's less the first's, intervals are 95 %, fractions are of the particles tha
 
 _TWO_SIDED_95 = 1.959964
 _MOST_RELATIVE_WIDTH = 0.3  # width over mass
-_WIDTH_STEP = 0.3  # of ln T
 
 
 @dataclass(frozen=True)
@@ -152,7 +148,7 @@ class _Hypothesis:
 
     θ holds the logits of the species of A, of B where they are its own, the logits of both
     backgrounds, those of components within their species, μ, the δ of species that may move, and
-    ln T.
+    ln T.  A mean may go halfway to its neighbours, a shift as far.
     """
 
     def __init__(
@@ -164,54 +160,30 @@ class _Hypothesis:
         *,
         own_fractions: bool,
     ) -> None:
-        self.known = start.species
-        self.moves = np.flatnonzero(moves)
-        every, k, of = start.weight.size, start.narrow, start.kinds
-        first_of = {int(kind): int(np.flatnonzero(of == kind)[-1]) for kind in np.unique(of)}
-        inner = [i for i in range(k) if first_of[int(of[i])] != i]
-        logits, back = self.known - 1, int(start.background)
-        self.own = logits if own_fractions else 0
-        sizes = [logits, self.own, 2 * back, len(inner), k, self.moves.size, k]
-        self.places = np.cumsum([0, *sizes])
-        p = int(self.places[-1])
-        at_a, at_b, at_back, at_inner, at_mean, at_shift, at_width = self.places[:-1]
-        structures, limits = [], self._limits(start, noise)
-        for sample in (0, 1):
-            design, origin = np.zeros((3, every, p)), np.zeros((3, every))
-            begin = at_b if sample and self.own else at_a
-            for species in range(1, self.known):
-                design[0, of == species, begin + species - 1] = 1.0
-            if back:
-                design[0, of == BACKGROUND, at_back + sample] = 1.0
-            design[0, inner, at_inner + np.arange(len(inner))] = 1.0
-            origin[1, k:] = start.mean[k:]
-            origin[2, k:] = np.log(start.variance[k:] + noise) / 2
-            design[1, :k, at_mean : at_mean + k] = np.eye(k)
-            if sample:
-                for number, moved in enumerate(self.moves):
-                    design[1, of == moved, at_shift + number] = 1.0
-            design[2, :k, at_width:] = np.eye(k)
-            structures.append(Structure(design, origin, noise, limits, start.broad, start.kind))
-        self.structures = list(zip(samples, structures, strict=True))
-
-    def _limits(self, start: Mixture, noise: float) -> Limits:
-        """Limits of parameters: a mean may go halfway to its neighbours, a shift as far."""
-        at_mean, at_shift, at_width, p = (int(place) for place in self.places[4:])
-        low = np.full(p, -LOGIT_REACH)
-        high, scale = -low, np.ones(low.shape)
-        unit, k = math.sqrt(noise), start.narrow
+        self.known, self.moves = start.species, np.flatnonzero(moves)
+        k, of, belongs, unit = start.narrow, start.kinds, start.belongs, math.sqrt(noise)
+        inner = [i for i in range(k) if of[i] in of[i + 1 :]]
         reach = self._reach(start.mean[:k], unit)
-        low[at_mean:at_shift] = start.mean[:k] - reach
-        high[at_mean:at_shift] = start.mean[:k] + reach
         shift = self._reach(start.means()[: self.known], unit)[self.moves]
-        low[at_shift:at_width], high[at_shift:at_width] = -shift, shift
-        low[at_width:] = math.log(unit)
-        high[at_width:] = np.log(3 * (np.sqrt(start.variance[:k]) + unit))
-        scale[at_mean:at_width], scale[at_width:] = unit, _WIDTH_STEP
-        rows, middle = width_prior(start.mean[:k])
-        prior = np.zeros((k, p))
-        prior[:, at_width:] = rows
-        return Limits(low, high, scale, prior, middle)
+        at = np.append(start.mean[:k], np.zeros(shift.size))
+        reach = np.append(reach, shift)
+        self.structures = []
+        for number, events in enumerate(samples):
+            own = np.eye(2)[[number]]
+            logits = np.hstack(
+                [
+                    np.kron(own if own_fractions else np.ones((1, 1)), belongs[:, 1 : self.known]),
+                    np.kron(own, belongs[:, self.known :]),
+                    np.eye(of.size)[:, inner],
+                ]
+            )
+            structure = structure_of(
+                start, noise, np.zeros(k), np.hstack([np.eye(k), number * belongs[:k, self.moves]]),
+                np.array([at - reach, at + reach]), np.full(at.size, unit),
+                np.eye(k), 3 * (np.sqrt(start.variance[:k]) + unit), logits=logits,
+            )  # fmt: skip
+            self.structures.append((events, structure))
+        self.at_mean = logits.shape[1]
 
     @staticmethod
     def _reach(mean: FloatArray, unit: float) -> FloatArray:
@@ -232,7 +204,7 @@ class _Hypothesis:
 
     def against(self, full: Maximum, narrow: _Hypothesis) -> Test:
         """Test a hypothesis that this one contains, whose optimum is known."""
-        dof = full.theta.size - int(narrow.places[-1])
+        dof = full.theta.size - narrow.structures[0][1].limits.low.size
         if not dof:
             return Test(0.0, 0, math.nan)
         nearly = maximise_jointly(narrow.structures, self.mixtures(full.theta))
@@ -242,7 +214,6 @@ class _Hypothesis:
     def table(self, full: Maximum, moves: BoolArray) -> pd.DataFrame:
         """Lay out shifts and differences with their errors."""
         k, theta = self.known, full.theta
-        at_mean, at_shift = (int(place) for place in self.places[4:6])
         covariance, mixtures = full.covariance(), self.mixtures(theta)
         fractions, slopes = zip(*(self._fractions(i, theta) for i in (0, 1)), strict=True)
         slope = slopes[1] - slopes[0]
@@ -250,6 +221,7 @@ class _Hypothesis:
         shift, shift_se = np.full(k, math.nan), np.full(k, math.nan)
         relative_se = np.full(k, math.nan)
         first = mixtures[0]
+        at_mean, at_shift = self.at_mean, self.at_mean + first.narrow
         mean = peaks(self.structures[0][0], first)
         for number, i in enumerate(self.moves):
             place = at_shift + number

@@ -153,22 +153,18 @@ def maximise_jointly(
 
 def free_structure(events: Events, start: Mixture) -> Structure:
     """Free weights and widths, and free means where the detector can see the components."""
-    k, top = start.narrow, float(events.x.max())
+    k, top, unit = start.narrow, float(events.x.max()), math.sqrt(events.usual_variance)
     lightest = min(_lightest(events, start), 0.9 * top)
+    ranges = np.array([np.full(k, lightest), np.full(k, 1.05 * top)])
     return structure_of(
-        events, start, np.zeros(k), np.eye(k),
-        np.array([np.full(k, lightest), np.full(k, 1.05 * top)]), np.full(k, _unit(events)),
+        start, events.usual_variance, np.zeros(k), np.eye(k), ranges, np.full(k, unit),
         np.eye(k), np.full(k, top), prior=not events.plain,
     )  # fmt: skip
 
 
-def _unit(events: Events) -> float:
-    return math.sqrt(events.usual_variance)
-
-
 def structure_of(
-    events: Events,
     start: Mixture,
+    noise: float,
     origin: FloatArray,
     slopes: FloatArray,
     ranges: FloatArray,
@@ -176,43 +172,40 @@ def structure_of(
     widths: FloatArray,
     widest: FloatArray,
     *,
-    prior: bool,
+    prior: bool = True,
+    logits: FloatArray | None = None,
 ) -> Structure:
-    """Make a structure of free weights, of means that are linear in p, of widths linear in q.
+    """Make a structure of means that are linear in p, of widths linear in q.
 
-    The background of `start` stays as it is, but for its share; a prior of widths is of components
-    near those of `start`.
+    Weights are linear in l, or free.  The background of `start` stays as it is, but for its share;
+    a prior of widths is of components near those of `start`.
 
-    Shapes: `origin, widest` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,), `widths` (k, q).
+    Shapes: `origin, widest` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,), `widths` (k, q),
+    `logits` (every, l).
     """
-    (k, p), q = slopes.shape, widths.shape[1]
-    logits = k - 1 + int(start.broad > 0)
-    every = start.weight.size
-    design = np.zeros((3, every, logits + p + q))
-    fixed = np.zeros((3, every))
-    design[0, 1:k, : k - 1] = np.eye(k - 1)
-    design[1, :k, logits : logits + p] = slopes
-    design[2, :k, logits + p :] = widths
-    fixed[1, :k] = origin
-    if start.broad:
-        design[0, k:, k - 1] = 1.0
-        fixed[1, k:] = start.mean[k:]
-        fixed[2, k:] = np.log(start.variance[k:] + events.usual_variance) / 2
+    (k, p), q, every = slopes.shape, widths.shape[1], start.weight.size
+    if logits is None:
+        logits = np.eye(every)[:, 1 : k + int(start.broad > 0)]
+        logits[k:, k - 1 :] = 1.0
+    of_mean = logits.shape[1]
+    of_width = of_mean + p
+    design, fixed = np.zeros((3, every, of_width + q)), np.zeros((3, every))
+    design[0, :, :of_mean] = logits
+    design[1, :k, of_mean:of_width] = slopes
+    design[2, :k, of_width:] = widths
+    fixed[1] = np.append(origin, start.mean[k:])
+    fixed[2, k:] = np.log(start.variance[k:] + noise) / 2
     rows, middle = width_prior(start.mean[:k]) if prior else (np.zeros((0, k)), np.zeros(0))
-    of_widths = np.zeros((rows.shape[0], logits + p + q))
-    of_widths[:, logits + p :] = rows @ widths
-    narrowest = np.full(q, math.log(_unit(events)))
-    most = np.maximum(
-        np.array([widest[column > 0].max() for column in widths.T]), 2 * _unit(events)
-    )
+    unit, reach = math.sqrt(noise), np.full(of_mean, LOGIT_REACH)
+    most = np.array([widest[column > 0].max() for column in widths.T])
     limits = Limits(
-        np.concatenate([np.full(logits, -LOGIT_REACH), ranges[0], narrowest]),
-        np.concatenate([np.full(logits, LOGIT_REACH), ranges[1], np.log(most)]),
-        np.concatenate([np.ones(logits), units, np.full(q, _WIDTH_STEP)]),
-        of_widths,
+        np.concatenate([-reach, ranges[0], np.full(q, math.log(unit))]),
+        np.concatenate([reach, ranges[1], np.log(np.maximum(most, 2 * unit))]),
+        np.concatenate([np.ones(of_mean), units, np.full(q, _WIDTH_STEP)]),
+        np.hstack([np.zeros((middle.size, of_width)), rows @ widths]),
         middle,
     )
-    return Structure(design, fixed, events.usual_variance, limits, start.broad, start.kind)
+    return Structure(design, fixed, noise, limits, start.broad, start.kind)
 
 
 def _lightest(events: Events, start: Mixture) -> float:
