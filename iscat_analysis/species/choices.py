@@ -31,6 +31,7 @@ from iscat_analysis.species.background import broad
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import (
+    FIRST_SHARE,
     ascend,
     by_peaks,
     fit_species,
@@ -53,7 +54,6 @@ MOST_RUNGS = 12
 
 _BIC_TIE = 6.0  # of BIC
 _MOST_FREE_MULTIPLES = 4  # multiples that a free species may be
-_FIRST_SHARE = 0.05  # of the background
 _REACH = 0.97  # quantile of the masses that the ladder must reach
 _MOST_RELATIVE_WIDTH = 0.35  # of the mass, or of a ladder's monomer: wider is no rung
 _SEARCH = np.linspace(0.85, 1.15, 31)  # of the monomer that was named
@@ -144,7 +144,7 @@ class Given:
         masses = np.sort(np.array(self.masses_kda, dtype=np.float64))
         start = _start(events, masses, self.background)
         structure = _rungs(
-            events, start, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)), np.zeros(0),
+            events, start, masses, np.zeros((masses.size, 0)), np.zeros((2, 0)),
             widths=self.widths, unit_kda=float(masses[0]),
         )  # fmt: skip
         best = fit_jointly(events, start, structure)
@@ -189,15 +189,12 @@ class Ladder:
         while not self.steps and len(found.steps) > 1:
             seen = found.best.shares(events).sum(axis=0)[: len(found.steps)]
             left = tuple(n for i, n in enumerate(found.steps) if i != int(np.argmin(seen)))
-            fewer = self._fit(events, self._monomer(found, monomer), left)
+            fewer = self._fit(events, self.values(found)[0], left)
             tried.append(fewer.best)
             if fewer.best.bic(events.x.size) > found.best.bic(events.x.size):
                 break
             found = fewer
         return replace(found, tried=tuple(tried), p_value=self._against_free(events, found))
-
-    def _monomer(self, found: Chosen, given: float) -> float:
-        return given if self.held else self.values(found)[0]
 
     def values(self, found: Chosen, mixture: Mixture | None = None) -> tuple[float, float]:
         """Monomer mass m₁ and offset b of a ladder."""
@@ -212,22 +209,13 @@ class Ladder:
 
     def _fit(self, events: Events, monomer: float, steps: Sequence[int]) -> Chosen:
         n = np.array(steps, dtype=np.float64)
-        columns, ranges, units = [], [], []
-        if not self.held:
-            columns.append(n)
-            ranges.append((0.5 * monomer, 2.0 * monomer))
-            units.append(float(np.median(events.sigma)))
-        if self.offset and (self.held or n.size > 1):
-            columns.append(np.ones(n.size))
-            ranges.append((-0.5 * monomer, 0.5 * monomer))
-            units.append(float(np.median(events.sigma)))
-        slopes = np.array(columns).T.reshape(n.size, len(columns))
+        free = [not self.held, self.offset and (self.held or n.size > 1)]
         begin = [1.0] if self.held else _SEARCH
         starts = [_start(events, n * monomer * s, self.background) for s in begin]
         start = max(starts, key=lambda one: height(events, one))
         structure = _rungs(
-            events, start, monomer * n if self.held else np.zeros(n.size), slopes,
-            np.array(ranges).reshape(-1, 2).T, np.array(units),
+            events, start, monomer * n * self.held, np.stack([n, np.ones(n.size)], axis=1)[:, free],
+            monomer * np.array([[0.5, -0.5], [2.0, 0.5]])[:, free],
             widths=self.widths, unit_kda=monomer,
         )  # fmt: skip
         best = fit_jointly(events, start, structure)
@@ -236,20 +224,19 @@ class Ladder:
     def _against_free(self, events: Events, found: Chosen) -> float:
         """Test whether free masses describe the events better than those of the ladder."""
         k = len(found.steps)
-        means = (0 if self.held else 1) + int(self.offset and (self.held or k > 1))
-        if k <= means:
-            return math.nan
-        unit = float(np.median(events.sigma))
         monomer = self.monomer_kda or self.values(found)[0]
         centres = found.best.mean[:k]
         structure = _rungs(
             events, found.best, np.zeros(k), np.eye(k),
-            np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]), np.full(k, unit),
+            np.array([centres - 0.5 * monomer, centres + 0.5 * monomer]),
             widths=self.widths, unit_kda=monomer,
         )  # fmt: skip
+        more = structure.limits.low.size - found.best.parameters
+        if more <= 0:
+            return math.nan
         free = fit_jointly(events, found.best, structure)
         gain = max(2 * (free.log_likelihood - found.best.log_likelihood), 0.0)
-        return float(chdtrc(k - means, gain))
+        return float(chdtrc(more, gain))
 
 
 Choice = Searched | Number | Begun | Given | Ladder
@@ -261,17 +248,17 @@ def _rungs(
     origin: FloatArray,
     slopes: FloatArray,
     ranges: FloatArray,
-    units: FloatArray,
     *,
     widths: Widths,
     unit_kda: float,
 ) -> Structure:
     """Make the structure of a ladder: means that are linear in m₁ and b.
 
-    Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p), `units` (p,).
+    Shapes: `origin` (k,), `slopes` (k, p), `ranges` (2, p).
     """
     k, common = start.narrow, widths == "common"
     of_widths = np.ones((k, 1)) if common else np.eye(k)
+    units = np.full(slopes.shape[1], float(np.median(events.sigma)))
     mean = start.mean[:k]
     widest = _MOST_RELATIVE_WIDTH * unit_kda * np.sqrt(mean / mean.min())
     return structure_of(
@@ -283,7 +270,7 @@ def _rungs(
 def _start(events: Events, mean: FloatArray, background: bool) -> Mixture:
     """Start from the species near each mass, and a faint background."""
     near = _near(events, mean)
-    return near.on_background(*broad(events), _FIRST_SHARE) if background else near
+    return near.on_background(*broad(events), FIRST_SHARE) if background else near
 
 
 def _near(events: Events, mean: FloatArray) -> Mixture:

@@ -35,6 +35,7 @@ from scipy.special import chdtrc
 
 from iscat_analysis.records import BoolArray, FloatArray
 from iscat_analysis.species.events import Events
+from iscat_analysis.species.intervals import TWO_SIDED_95
 from iscat_analysis.species.maximum import Maximum
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import peaks
@@ -55,7 +56,6 @@ COMPARISON_COLUMNS = (
 """Columns of `Comparison.species`: the second sample is the other, shift and difference are the
 other's less the first's, intervals are 95 %, fractions are of the particles that came."""
 
-_TWO_SIDED_95 = 1.959964
 _MOST_RELATIVE_WIDTH = 0.3  # width over mass
 
 
@@ -246,8 +246,8 @@ class _Hypothesis:
             "mass_other_kda": np.where(moves, mean + shift, math.nan),
             **_interval("shift", "shift_kda", shift, shift_se),
             "shift_percent": 100 * relative,
-            "shift_percent_low": 100 * (relative - _TWO_SIDED_95 * relative_se),
-            "shift_percent_high": 100 * (relative + _TWO_SIDED_95 * relative_se),
+            "shift_percent_low": 100 * (relative - TWO_SIDED_95 * relative_se),
+            "shift_percent_high": 100 * (relative + TWO_SIDED_95 * relative_se),
             "fraction": fractions[0],
             "fraction_other": fractions[1],
             **_interval("difference", "difference", difference, error),
@@ -273,6 +273,6 @@ def _interval(
     return {
         value_name: value,
         f"{name}_se": error,
-        f"{name}_low": value - _TWO_SIDED_95 * error,
-        f"{name}_high": value + _TWO_SIDED_95 * error,
+        f"{name}_low": value - TWO_SIDED_95 * error,
+        f"{name}_high": value + TWO_SIDED_95 * error,
     }

@@ -23,6 +23,7 @@ from iscat_analysis.species.curves import (
 )
 from iscat_analysis.species.edges import Possible, ratio_of_doubt, with_edges
 from iscat_analysis.species.events import Efficiency, Events, possible
+from iscat_analysis.species.intervals import TWO_SIDED_95
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import peaks
 from iscat_analysis.units import count
@@ -63,7 +64,6 @@ more than `MOST_DOUBT` of it, is not determined: the mass is where its events li
 interval, and what came of it is NaN, as is its fraction; those of the others are among the
 others."""
 
-_TWO_SIDED_95 = 1.959964
 _INTERVAL_ENDS = (0.025, 0.975)
 _UNBIASED: Literal["weibull"] = "weibull"  # of few draws other quantiles lie too far inside
 _MOST_RELATIVE_WIDTH = 0.4  # width over mass
@@ -200,10 +200,12 @@ def describe(
     events, best = possible_limits[0].events, possible_limits[0].mixture
     repeats, support = bootstrap(possible_limits, found, draws=draws, least=LEAST_EVENTS, seed=seed)
     mass_kda = peaks(events, best)
-    scale = np.zeros(mass_kda.shape) if scale_error is None else scale_error(mass_kda)
+    scale_error = scale_error or np.zeros_like
     doubtful = ratio_of_doubt(possible_limits) > MOST_DOUBT
     found = replace(found, best=best)
-    species = _table(events, found, repeats, mass[usable] > 0, scale, window_frames, doubtful)
+    species = _table(
+        events, found, repeats, mass[usable] > 0, scale_error(mass_kda), window_frames, doubtful
+    )
     ladder = _ladder(choice, found, repeats, scale_error) if isinstance(choice, Ladder) else None
     bandwidth = bandwidth_of(events, max(best.species, 1))
     return Distribution(
@@ -250,21 +252,19 @@ def _table(
     undetermined[:known] |= doubtful
     some = is_species & ~undetermined
     some &= ~outlier | outlier[some].all()
-    mass_low, mass_high = interval_of([r.mass for r in repeats], known)
+    masses = [r.mass for r in repeats]
+    mass_low, mass_high = interval_of(masses, known)
     width_low, width_high = interval_of([r.mixture.widths() for r in repeats], k)
     part_low, part_high = interval_of([_fractions(r.mixture.came, some) for r in repeats], k)
     count_low, count_high = interval_of([r.count for r in repeats], k)
     came_low, came_high = interval_of([r.corrected for r in repeats], k)
-    masses = np.array([r.mass for r in repeats])
     mass = peaks(events, best)
     searched = events.efficiency.searched if events.efficiency else 1.0
     nothing = np.full(k - known, math.nan)
     table = pd.DataFrame(
         {
             "mass_kda": np.append(mass, nothing),
-            "mass_se": np.append(masses.std(axis=0, ddof=1), nothing)
-            if len(repeats) > 1
-            else math.nan,
+            "mass_se": np.append(_error(masses, known), nothing),
             "mass_low": np.append(mass_low - widening(mass - mass_low, scale), nothing),
             "mass_high": np.append(mass_high + widening(mass_high - mass, scale), nothing),
             "mass_systematic": np.append(scale, nothing),
@@ -315,6 +315,13 @@ def interval_of(values: Sequence[FloatArray], species: int) -> tuple[FloatArray,
     return low, high
 
 
+def _error(values: Sequence[FloatArray], species: int) -> FloatArray:
+    """Give the standard deviation of a number of each species, NaN without two repetitions."""
+    if len(values) < 2:
+        return np.full(species, math.nan)
+    return np.asarray(np.std(values, axis=0, ddof=1))
+
+
 def selection_of(found: Chosen, events: int) -> pd.DataFrame:
     """Lay out the numbers of species that were tried."""
     bic = [fit.bic(events) for fit in found.tried]
@@ -337,16 +344,13 @@ def _ladder(
     choice: Ladder,
     found: Chosen,
     repeats: Sequence[Repeat],
-    scale_error: Callable[[FloatArray], FloatArray] | None,
+    scale_error: Callable[[FloatArray], FloatArray],
 ) -> LadderFit:
     """Describe the mass of the monomer."""
     monomer, offset = choice.values(found)
-    drawn = np.array([choice.values(found, r.mixture) for r in repeats]).reshape(-1, 2)
-    error, low, high = (np.full(2, math.nan) for _ in range(3))
-    if len(drawn) > 1:
-        error = drawn.std(axis=0, ddof=1)
-        low, high = np.quantile(drawn, _INTERVAL_ENDS, axis=0, method=_UNBIASED)
-    scale = np.zeros(1) if scale_error is None else scale_error(np.array([monomer]))
+    drawn = [np.array(choice.values(found, r.mixture)) for r in repeats]
+    error, (low, high) = _error(drawn, 2), interval_of(drawn, 2)
+    scale = scale_error(np.array([monomer]))
     below, above = (float(widening(np.array([r]), scale)[0]) for r in
                     (monomer - low[0], high[0] - monomer))  # fmt: skip
     return LadderFit(
@@ -380,7 +384,7 @@ def _residence(events: Events, mass: FloatArray, window_frames: int | None) -> F
 def widening(reach: FloatArray, scale: FloatArray) -> FloatArray:
     """Distance by which the error of the scale moves an end of a 95 % interval."""
     reach = np.maximum(reach, 0.0)
-    return np.asarray(np.hypot(reach, _TWO_SIDED_95 * scale) - reach)
+    return np.asarray(np.hypot(reach, TWO_SIDED_95 * scale) - reach)
 
 
 def _skews(best: Mixture, species: pd.DataFrame) -> list[str]:

@@ -41,7 +41,7 @@ from scipy.special import chdtrc, expit
 
 from iscat_analysis.records import FloatArray
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.intervals import interval
+from iscat_analysis.species.intervals import TWO_SIDED_95, interval
 from iscat_analysis.species.mass_action import (
     COMPOSITION,
     LANDING_POWER,
@@ -54,7 +54,6 @@ from iscat_analysis.species.series import Series
 
 _REACH = math.log(1e4)  # of ln K_D beyond the concentrations
 _GRID, _POWERS = 25, 9  # of ln K_D and of the exponent: where a start is sought
-_SIGMAS = 1.959964
 _TURNED = 0.6  # of a peak's width: tails from which other maxima are sought
 _HIGHER = 1e-3  # of log-likelihood: another maximum than the one that was found
 _SAME = 1e-4  # of log-likelihood: two ways to one maximum
@@ -120,7 +119,7 @@ def fit_equilibrium(
     logits, errors, complexes = _observed(series, free)
     shared, landed = series.shared(full), series.logits(full)
     predicted = expit(landed[:, -1] - np.logaddexp.reduce(landed[:, :-1], axis=1))
-    reach = _SIGMAS * errors
+    reach = TWO_SIDED_95 * errors
     constants = equilibrium.constants(found.theta)
     constant_errors = equilibrium.constants(found.errors())
     return EquilibriumFit(
@@ -334,7 +333,7 @@ def _interval(
                 climbed.append((place, nearest, branch[ln_kd]))
         return 2 * max(found.value - max(branch[ln_kd].value for branch in branches), 0.0)
 
-    first = _SIGMAS * float(found.errors()[at])
+    first = TWO_SIDED_95 * float(found.errors()[at])
     low, high = interval(deviance, best, least, most, step=max(first, _FIRST_STEP))
     grid = np.unique(np.append(np.linspace(low, high, _PROFILE), best))
     points = np.column_stack([grid, [deviance(float(value)) for value in grid]])

@@ -14,7 +14,9 @@ from functools import cache
 
 import scipy
 
-_SIGMAS = 1.959964
+TWO_SIDED_95 = 1.959964
+"""Standard errors from an estimate to an end of its 95 % interval."""
+
 _TOLERANCE = 1e-5  # of the parameter
 
 
@@ -28,7 +30,7 @@ def interval(
 
     @cache
     def beyond(value: float) -> float:
-        return math.sqrt(max(deviance(value), 0.0)) - _SIGMAS
+        return math.sqrt(max(deviance(value), 0.0)) - TWO_SIDED_95
 
     def end(limit: float) -> float:
         reach, inner, outer = math.copysign(step, limit - best), best, best

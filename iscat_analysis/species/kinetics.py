@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, kolmogorov
 
 from iscat_analysis.records import FloatArray
-from iscat_analysis.species.intervals import interval
+from iscat_analysis.species.intervals import TWO_SIDED_95, interval
 
 IndexArray: TypeAlias = NDArray[np.int64]
 """Rows of a table."""
@@ -39,7 +39,6 @@ IndexArray: TypeAlias = NDArray[np.int64]
 LEAST_LANDINGS = 10
 """Fewer landings have no rate that depends on time."""
 
-_TWO_SIDED_95 = 1.959964
 _LARGEST_RATE_TIME = 200.0  # of kT
 _GRID = 400  # rates among which the maximum is looked for
 _RATE_TOLERANCE = 1e-7  # of its logarithm
@@ -110,8 +109,8 @@ def landing_rate(times_s: FloatArray, seconds: float) -> LandingRate:
         landings=n,
         seconds=seconds,
         per_second=rate,
-        per_second_low=rate * math.exp(-_TWO_SIDED_95 * error),
-        per_second_high=rate * math.exp(_TWO_SIDED_95 * error),
+        per_second_low=rate * math.exp(-TWO_SIDED_95 * error),
+        per_second_high=rate * math.exp(TWO_SIDED_95 * error),
         depletion_per_s=best / seconds,
         depletion_low=ends[0] / seconds,
         depletion_high=ends[1] / seconds,

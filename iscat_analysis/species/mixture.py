@@ -91,15 +91,6 @@ class Mixture:
             broad=mean.size,
         )
 
-    def with_free(self, weight: FloatArray, mean: FloatArray, variance: FloatArray) -> Mixture:
-        """Give other free components on the same background.
-
-        Shapes: `weight, mean, variance` (free,).
-        """
-        own, rest = Mixture(weight, mean, variance), slice(self.narrow, None)
-        share = float(self.weight[rest].sum())
-        return own.on_background(self.mean[rest], self.variance[rest], share)
-
     def log_terms(self, events: Events) -> FloatArray:
         """Logarithm of w_k N(x_i; μ_k, τ_k² + σ_i²), shape (n, k)."""
         total = self.variance + events.variance[:, np.newaxis]

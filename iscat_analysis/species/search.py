@@ -7,11 +7,11 @@ protein, and neither is what a skewed peak has beside a normal one.
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
 from iscat_analysis._kernels.mixture import mixture_score, mixture_sums
@@ -23,7 +23,9 @@ from iscat_analysis.species.structure import polish
 from iscat_analysis.species.widths import width_prior
 
 _POLISHED = 2  # starts, the best after climbing
-_FIRST_SHARE = 0.05  # of the background
+FIRST_SHARE = 0.05
+"""Of the background, at a start."""
+
 _BROAD = 4.0  # whole widths that the others would have
 _REACH, _POINTS = 4.0, 81  # of a component: widths to both sides that are searched for maxima
 _ZOOMS, _ZOOM_POINTS = 4, 41  # towards the highest point of a peak
@@ -40,7 +42,7 @@ def fit_species(
     for k in range(1, most + 1):
         starts = [_spread_start(events, k)]
         if background:
-            starts[0] = starts[0].on_background(*broad(events), _FIRST_SHARE)
+            starts[0] = starts[0].on_background(*broad(events), FIRST_SHARE)
         if fits:
             starts += split_starts(events, fits[-1])
         climbed = sorted(
@@ -179,57 +181,55 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
     starts = []
     sigma = float(np.median(events.sigma))
     places = np.sort(events.x)
-    own = slice(0, fit.narrow)
-    k, weights, means, variances = fit.narrow, fit.weight[own], fit.mean[own], fit.variance[own]
+    every = np.arange(fit.narrow)
+    whole = np.sqrt(fit.variance + sigma**2)
     widths = [sigma, 4 * sigma]
     if not events.plain:  # the errors may be unknown, and those of the peaks are not
-        widths.append(float(np.sqrt(variances + sigma**2).min()) / 2)
+        widths.append(float(whole[every].min()) / 2)
     for h in widths:
         near = np.searchsorted(places, places + h) - np.searchsorted(places, places - h)
         expected = np.zeros(places.size)
-        for w, m, v in zip(fit.weight, fit.mean, fit.variance, strict=True):
-            total = math.sqrt(v + sigma**2)
+        for w, m, total in zip(fit.weight, fit.mean, whole, strict=True):
             expected += w * (ndtr((places + h - m) / total) - ndtr((places - h - m) / total))
         excess = (near - places.size * expected) / np.sqrt(places.size * expected + 1)
         place = float(places[int(np.argmax(excess))])
-        starts.append(
-            fit.with_free(
-                np.append(weights * (1 - 1 / (2 * k + 2)), 1 / (2 * k + 2)),
-                np.append(means, place),
-                np.append(variances, (h / 2) ** 2),
-            )
-        )
-    widest = int(np.argmax(weights * np.sqrt(variances + sigma**2)))
-    half = 0.7 * math.sqrt(variances[widest] + sigma**2)
-    weight, mean, variance = weights.copy(), means.copy(), variances.copy()
-    weight[widest] /= 2
-    mean[widest] -= half
-    variance[widest] /= 4
+        starts.append(_with(fit, every, 1 / (2 * fit.narrow + 1), place, (h / 2) ** 2))
+    widest = int(np.argmax((fit.weight * whole)[every]))
+    both, half = np.ones(2), 0.7 * whole[widest] * np.array([-1.0, 1.0])
     starts.append(
-        fit.with_free(
-            np.append(weight, weight[widest]),
-            np.append(mean, means[widest] + half),
-            np.append(variance, variance[widest]),
+        _with(
+            fit, np.delete(every, widest), fit.weight[widest] / 2 * both, fit.mean[widest] + half,
+            fit.variance[widest] / 4 * both,
         )
-    )
+    )  # fmt: skip
     return starts
 
 
 def joined_starts(fit: Mixture) -> list[Mixture]:
     """Merge two neighbouring species."""
     starts = []
-    k = fit.narrow
-    for i in range(k - 1):
+    for i in range(fit.narrow - 1):
         pair = slice(i, i + 2)
-        weight = fit.weight[pair] / fit.weight[pair].sum()
-        mean = float(weight @ fit.mean[pair])
-        variance = float(weight @ (fit.variance[pair] + (fit.mean[pair] - mean) ** 2))
-        rest = np.r_[0:i, i + 2 : k]
-        starts.append(
-            fit.with_free(
-                np.append(fit.weight[rest], fit.weight[pair].sum()),
-                np.append(fit.mean[rest], mean),
-                np.append(fit.variance[rest], variance),
-            )
-        )
+        size = fit.weight[pair].sum()
+        mean = float(fit.weight[pair] @ fit.mean[pair]) / size
+        square = fit.variance[pair] + (fit.mean[pair] - mean) ** 2
+        rest = np.delete(np.arange(fit.narrow), pair)
+        starts.append(_with(fit, rest, size, mean, float(fit.weight[pair] @ square) / size))
     return starts
+
+
+def _with(
+    fit: Mixture, kept: NDArray[np.intp], weight: ArrayLike, mean: ArrayLike, variance: ArrayLike
+) -> Mixture:
+    """Give some of the free components of a mixture, and others, on the same background.
+
+    Shapes: `kept` (k,).
+    """
+    rest = slice(fit.narrow, None)
+    own = Mixture(
+        np.append(fit.weight[kept], weight),
+        np.append(fit.mean[kept], mean),
+        np.append(fit.variance[kept], variance),
+    )
+    share = float(fit.weight[rest].sum())
+    return own.on_background(fit.mean[rest], fit.variance[rest], share)
