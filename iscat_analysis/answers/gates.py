@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.special import betaincinv, gammaincinv
+from scipy.special import betaincinv
 
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.records import BoolArray, FloatArray, is_event
+from iscat_analysis.species.curves import poisson_interval, round_width
 from iscat_analysis.species.describe import Branch
 from iscat_analysis.species.tables import EventTable, event_table
 
@@ -110,8 +111,7 @@ def usual_bin(table: pd.DataFrame) -> float:
     spread = float(np.median(sigma)) if sigma.size else float(np.median(mass)) / 10
     wanted = 3.49 * spread * max(mass.size / 3, 1.0) ** (-1 / 3)
     wanted = max(wanted, float(np.quantile(mass, _REACH)) / _MOST_USUAL, 1e-3)
-    power = 10.0 ** math.floor(math.log10(wanted))
-    return min((power, 2 * power, 5 * power, 10 * power), key=lambda w: abs(w / wanted - 1))
+    return round_width(wanted)
 
 
 def mass_histogram(
@@ -150,12 +150,13 @@ def gate(masses_kda: FloatArray, low_kda: float, high_kda: float) -> Gate:
     inside = mass[(mass >= low) & (mass < high)]
     k, n = inside.size, mass.size
     width = float(np.std(inside, ddof=1)) if k > 1 else math.nan
+    least, most = poisson_interval(k)
     return Gate(
         low_kda=float(low),
         high_kda=float(high),
         count=k,
-        count_low=float(gammaincinv(k, _ENDS[0])) if k else 0.0,
-        count_high=float(gammaincinv(k + 1, _ENDS[1])),
+        count_low=float(least),
+        count_high=float(most),
         mean_kda=float(inside.mean()) if k else math.nan,
         mean_se=width / math.sqrt(k) if k > 1 else math.nan,
         width_kda=width,

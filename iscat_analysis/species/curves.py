@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv, logsumexp, ndtr
 
 from iscat_analysis.records import FloatArray
@@ -31,20 +32,25 @@ def bandwidth_of(events: Events, species: int) -> float:
     return float(1.06 * np.median(events.sigma) * each**-0.2)
 
 
+def poisson_interval(counts: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Give 95 % intervals of counts (Garwood, Biometrika 28, 437, 1936)."""
+    n = np.asarray(counts)
+    low = np.where(n > 0, gammaincinv(np.maximum(n, 1), 0.025), 0.0)
+    return low, np.asarray(gammaincinv(n + 1, 0.975))
+
+
+def round_width(wanted: float) -> float:
+    """Give the width of a bar that is 1, 2 or 5 times a power of ten."""
+    power = 10.0 ** math.floor(math.log10(wanted))
+    return min((power, 2 * power, 5 * power, 10 * power), key=lambda w: abs(w / wanted - 1))
+
+
 def histogram_of(events: Events) -> pd.DataFrame:
-    """Count, with 95 % Poisson intervals (Garwood, Biometrika 28, 437, 1936)."""
+    """Count, with 95 % intervals."""
     edges = _edges(events)
     counts = np.histogram(events.x, edges)[0]
-    low = np.where(counts > 0, gammaincinv(np.maximum(counts, 1), 0.025), 0.0)
-    return pd.DataFrame(
-        {
-            "low_kda": edges[:-1],
-            "high_kda": edges[1:],
-            "count": counts,
-            "count_low": low,
-            "count_high": gammaincinv(counts + 1, 0.975),
-        }
-    )
+    columns = edges[:-1], edges[1:], counts, *poisson_interval(counts)
+    return pd.DataFrame(dict(zip(HISTOGRAM_COLUMNS, columns, strict=True)))
 
 
 def curves_of(events: Events, best: Mixture, bandwidth: float) -> pd.DataFrame:
@@ -76,14 +82,13 @@ def _reach(events: Events) -> float:
 
 
 def _edges(events: Events) -> FloatArray:
-    """Edges of bins about as wide as the errors allow: 1, 2 or 5 times a power of ten."""
+    """Edges of bins about as wide as the errors allow."""
     reach = _reach(events)
     wanted = max(
         2.0 * float(np.median(events.sigma)) * (events.x.size / 3) ** (-1 / 3) * 1.7,
         reach / _MOST_BINS,
     )
-    power = 10.0 ** math.floor(math.log10(wanted))
-    width = min((power, 2 * power, 5 * power, 10 * power), key=lambda w: abs(w / wanted - 1))
+    width = round_width(wanted)
     return np.asarray(np.arange(math.ceil(reach / width) + 1) * width)
 
 

@@ -149,7 +149,6 @@ def describe(
     sigmas: ArrayLike,
     *,
     efficiency: Efficiency | None = None,
-    max_species: int = 6,
     seed: int,
     branch: Branch = "magnitude",
     draws: int = 100,
@@ -174,11 +173,6 @@ def describe(
     mass, sigma = (np.asarray(v, dtype=np.float64).reshape(-1) for v in (masses, sigmas))
     if mass.shape != sigma.shape:
         raise ValueError(f"{mass.size} masses but {sigma.size} sigmas")
-    if max_species < 1 or draws < 0 or branch not in ("magnitude", "landing", "leaving"):
-        raise ValueError(
-            f"max_species = {max_species} and draws = {draws} must be positive, and branch = "
-            f"{branch!r} one of magnitude, landing, leaving"
-        )
     usable = possible(mass, sigma)
     if branch != "magnitude":
         usable &= (mass > 0) == (branch == "landing")
@@ -192,7 +186,7 @@ def describe(
         notes.append(f"{held}, too few for species; {LEAST_EVENTS} are needed")
         return _undescribed(events, branch, draws, seed, notes)
 
-    choice = Searched(max_species) if choice is None else choice
+    choice = choice or Searched()
     found = choice.choose(events)
     possible_limits = [Possible(1.0, events, found.best, found.structure)]
     if not limit_known:

@@ -111,7 +111,6 @@ def describe_sizes(
     *,
     seed: int,
     common: float = 0.0,
-    max_populations: int = 6,
     draws: int = 100,
     notes: Sequence[str] = (),
 ) -> Sizes | None:
@@ -127,7 +126,7 @@ def describe_sizes(
         return None
     power = _power(diameter, sigma)
     events = Events(np.log(diameter / UNIT_NM), sigma / diameter, None, plain=True)
-    measured, choice = events, Searched(max_populations)
+    measured, choice = events, Searched()
     found = choice.choose(events)
     for _ in range(_TURNS):
         events = _beside(measured, power, found.best)

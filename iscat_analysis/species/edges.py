@@ -37,6 +37,7 @@ _FAR = 0.35  # prior: that T lies below all of these, where it makes no differen
 _LOWEST = 10  # events that tell how far below the lightest a cut may be
 _JUST_BELOW = 1e-9  # of the lightest event
 _ENDS = (0.025, 0.975)
+_BETTER = 0.1  # of BIC: other species, and not the same found again
 _LEAST = 1e-3  # probability of a limit that is kept
 
 
@@ -64,11 +65,10 @@ def with_edges(
     if possible[0].events.efficiency is None or not found.searched:
         return found, possible
     again = choice.choose(possible[0].events)
-    others = possible_edges(events, again, least)
     n = events.x.size
-    if others[0].mixture.bic(n) < possible[0].mixture.bic(n):
-        return again, others
-    return found, possible
+    if again.best.bic(n) > possible[0].mixture.bic(n) - _BETTER:
+        return found, possible
+    return again, possible_edges(events, again, least)
 
 
 def possible_edges(events: Events, found: Chosen, least: float) -> list[Possible]:

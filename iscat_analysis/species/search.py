@@ -30,7 +30,6 @@ _BROAD = 4.0  # whole widths that the others would have
 _REACH, _POINTS = 4.0, 81  # of a component: widths to both sides that are searched for maxima
 _ZOOMS, _ZOOM_POINTS = 4, 41  # towards the highest point of a peak
 _APART = 1e-3  # of a width: points that are nearer would have maxima of rounding between them
-_NOISES = np.linspace(0.1, 0.9, 5)  # quantiles that stand for the events' own noise
 
 
 def fit_species(
@@ -98,8 +97,8 @@ def height(events: Events, start: Mixture) -> float:
 def by_peaks(events: Events, fit: Mixture) -> Mixture:
     """Say which components are one species, and which are background."""
     own = slice(0, fit.narrow)
-    weight, mean, variance = fit.weight[own], fit.mean[own], fit.variance[own]
-    whole = np.sqrt(variance + events.usual_variance)
+    weight, mean = fit.weight[own], fit.mean[own]
+    whole = np.sqrt(fit.variance[own] + events.usual_variance)
     usual = [  # of widths that grow with the root of the mass, and of such that do not
         np.exp(np.average(np.log(whole / form), weights=weight)) * form
         for form in (np.sqrt(mean), np.ones(mean.shape))
@@ -109,21 +108,18 @@ def by_peaks(events: Events, fit: Mixture) -> Mixture:
         wide[:] = False
     kind = np.full(fit.narrow, BACKGROUND)
     kept = np.flatnonzero(~wide)
-    valleys = _valleys(events, weight[kept], mean[kept], variance[kept])
+    valleys = _valleys(weight[kept], mean[kept], whole[kept])
     kind[kept] = np.unique(np.searchsorted(valleys, mean[kept]), return_inverse=True)[1]
     return replace(fit, kind=tuple(kind.tolist()))
 
 
 def peaks(events: Events, fit: Mixture) -> FloatArray:
     """Mass at which the peak of each species is highest (s,)."""
-    found = fit.means()[: fit.species].copy()
-    noise = np.quantile(events.variance, _NOISES)
+    found, total = fit.means()[: fit.species].copy(), fit.variance + events.usual_variance
     for number in range(fit.species):
         own = np.flatnonzero(fit.kinds == number)
         if own.size > 1:
-            total = (fit.variance[own][:, None] + noise).ravel()
-            weight, mean = (np.repeat(v[own], noise.size) for v in (fit.weight, fit.mean))
-            found[number] = top_of(weight, mean, total)
+            found[number] = top_of(fit.weight[own], fit.mean[own], total[own])
     return found
 
 
@@ -137,35 +133,27 @@ def top_of(weight: FloatArray, mean: FloatArray, total: FloatArray) -> float:
         if high <= low:
             break
         grid = np.linspace(low, high, _ZOOM_POINTS)
-        away = grid[:, None] - mean
-        density = (np.exp(-0.5 * away**2 / total) / np.sqrt(total)) @ weight
-        top, step = grid[int(np.argmax(density))], grid[1] - grid[0]
+        top = grid[int(np.argmax(_density(grid, weight, mean, total)))]
+        step = grid[1] - grid[0]
         low, high = max(low, top - step), min(high, top + step)
     return (low + high) / 2
 
 
 def _density(
-    events: Events, weight: FloatArray, mean: FloatArray, variance: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Sum components where there is any of them, with the errors that events have."""
-    noise = np.quantile(events.variance, _NOISES)
-    whole = np.sqrt(variance + events.usual_variance)
+    grid: FloatArray, weight: FloatArray, mean: FloatArray, total: FloatArray
+) -> FloatArray:
+    return np.asarray(
+        (np.exp(-0.5 * (grid[:, None] - mean) ** 2 / total) / np.sqrt(total)) @ weight
+    )
+
+
+def _valleys(weight: FloatArray, mean: FloatArray, whole: FloatArray) -> FloatArray:
+    """Give the minima between the maxima of a sum of components."""
     grid = np.sort((mean + np.outer(np.linspace(-_REACH, _REACH, _POINTS), whole)).ravel())
     grid = grid[np.diff(grid, prepend=-np.inf) > _APART * whole.min()]
-    total = variance[:, None] + noise
-    away = grid[:, None, None] - mean[:, None]
-    density = weight[:, None] * np.exp(-0.5 * away**2 / total) / np.sqrt(total)
-    return grid, np.asarray(density.sum(axis=(1, 2)))
-
-
-def _valleys(
-    events: Events, weight: FloatArray, mean: FloatArray, variance: FloatArray
-) -> FloatArray:
-    """Give the minima between the maxima of a sum of components."""
-    grid, density = _density(events, weight, mean, variance)
+    density = _density(grid, weight, mean, whole**2)
     high = np.flatnonzero((density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])) + 1
-    low = [grid[i + int(np.argmin(density[i:j]))] for i, j in pairwise(high)]
-    return np.array(low)
+    return np.array([grid[i + int(np.argmin(density[i:j]))] for i, j in pairwise(high)])
 
 
 def _spread_start(events: Events, k: int) -> Mixture:

@@ -342,14 +342,8 @@ def _cut(found: EventTable, above_kda: float) -> EventTable:
     kept = np.abs(found.mass_kda) > above_kda
     if not kept.any():
         raise DataError(f"{found.name}: no event lies above `above_kda` = {above_kda:g}")
-    return replace(
-        found,
-        mass_kda=found.mass_kda[kept],
-        sigma_kda=found.sigma_kda[kept],
-        frame=found.frame[kept],
-        x_px=found.x_px[kept],
-        y_px=found.y_px[kept],
-    )
+    columns = ("mass_kda", "sigma_kda", "frame", "x_px", "y_px")
+    return replace(found, **{name: getattr(found, name)[kept] for name in columns})
 
 
 def _edge(values: FloatArray) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from iscat_analysis.species import Distribution, Efficiency, describe
+from iscat_analysis.species import Distribution, Efficiency, Searched, describe
 
 Array = NDArray[np.float64]
 
@@ -81,8 +81,10 @@ def test_each_events_own_error_matters_and_a_pooled_one_is_biased() -> None:
         rng = np.random.default_rng(1000 + seed)
         sigma = np.where(np.arange(300) % 2 == 0, 4.0, 20.0)
         x = rng.normal(200.0, sigma)
-        mine = describe(x, sigma, seed=1, draws=0, max_species=3)
-        same = describe(x, np.full(300, float(np.median(sigma))), seed=1, draws=0, max_species=3)
+        mine = describe(x, sigma, seed=1, draws=0, choice=Searched(3))
+        same = describe(
+            x, np.full(300, float(np.median(sigma))), seed=1, draws=0, choice=Searched(3)
+        )
         own.append(mine.species["width_kda"].max())
         species = same.species
         wrong.append(species["width_kda"].max() > 5 or species["outlier"].any())
@@ -119,7 +121,7 @@ def test_missed_particles_are_accounted_for_and_ignoring_them_is_biased() -> Non
 def test_intervals_hold_the_truth() -> None:
     inside, pulls = [], []
     for seed in range(12):
-        found = describe(*draw(3000 + seed, n=200), seed=seed, draws=30, max_species=3)
+        found = describe(*draw(3000 + seed, n=200), seed=seed, draws=30, choice=Searched(3))
         if len(found.species) != 3:
             continue
         species = {name: column.to_numpy() for name, column in found.species.items()}

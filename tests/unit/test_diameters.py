@@ -44,7 +44,7 @@ def test_median_and_width_are_those_of_the_population(light: bool) -> None:
     found, plain = [], []
     for seed in range(TRIALS):
         diameter, sigma = draw(seed, light=light)
-        sizes = describe_sizes(diameter, sigma, seed=1, draws=0, max_populations=1)
+        sizes = describe_sizes(diameter, sigma, seed=1, draws=0)
         assert sizes is not None
         one = sizes.populations.iloc[0]
         found.append([np.log(one["diameter_nm"] / MEDIAN_NM), np.log(one["geometric_sd"])])

@@ -18,6 +18,7 @@ from iscat_analysis.species import (
     SPECIES_COLUMNS,
     Efficiency,
     Number,
+    Searched,
     describe,
 )
 from iscat_analysis.species.bootstrap import draw_events
@@ -258,8 +259,6 @@ def test_missing_values_are_left_out() -> None:
 def test_impossible_options_are_refused() -> None:
     with pytest.raises(ValueError, match="masses but"):
         describe([1.0], [1.0, 2.0], seed=1)
-    with pytest.raises(ValueError, match="max_species = 0"):
-        describe([1.0], [1.0], max_species=0, seed=1)
     with pytest.raises(ValueError, match="efficiency needs"):
         Efficiency(5.0, 0.0)
 
@@ -308,7 +307,7 @@ def test_efficiency_is_stated_for_stays_as_long_as_the_window() -> None:
     mass = np.abs(rng.normal(480.0, 8.0, 200))
     efficiency = Efficiency(threshold, noise)
     found = describe(
-        mass, np.full(200, 6.0), efficiency=efficiency, seed=1, draws=0, max_species=1,
+        mass, np.full(200, 6.0), efficiency=efficiency, seed=1, draws=0, choice=Searched(1),
         window_frames=window,
     )  # fmt: skip
     (species,) = found.species.to_dict("records")
@@ -319,7 +318,7 @@ def test_efficiency_is_stated_for_stays_as_long_as_the_window() -> None:
     (note,) = [note for note in found.notes if "stay" in note]
     assert "stay 40 frames or longer" in note
     assert "480 kDa from 3 frames" in note
-    without = describe(mass, np.full(200, 6.0), seed=1, draws=0, max_species=1)
+    without = describe(mass, np.full(200, 6.0), seed=1, draws=0, choice=Searched(1))
     assert not any("stay" in note for note in without.notes)
 
 
@@ -332,7 +331,7 @@ def test_events_that_only_crowd_the_threshold_stop_nothing() -> None:
     mass = 5 * noise + np.random.default_rng(3).exponential(noise / 8, 200)
     found = describe(
         mass, np.full(200, noise), efficiency=Efficiency(5.0, noise), seed=1, draws=0,
-        max_species=1, window_frames=40,
+        choice=Searched(1), window_frames=40,
     )  # fmt: skip
     (species,) = found.species.to_dict("records")
     assert 15 < species["mass_kda"] < 5 * noise

@@ -26,7 +26,7 @@ from iscat_analysis.calibration.mass import (
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration
-from iscat_analysis.species import describe
+from iscat_analysis.species import Searched, describe
 from iscat_analysis.species.tables import event_table
 
 STANDARDS = (66.0, 146.0, 480.0)
@@ -415,9 +415,9 @@ def test_the_error_of_the_line_is_keys_that_are_read_back() -> None:
 def test_the_error_of_the_scale_widens_the_intervals_of_species() -> None:
     rng = np.random.default_rng(13)
     mass, sigma = 480 + 20 * rng.standard_normal(200), np.full(200, 20.0)
-    plain = describe(mass, sigma, seed=1, max_species=1, draws=40).species.iloc[0]
+    plain = describe(mass, sigma, seed=1, choice=Searched(1), draws=40).species.iloc[0]
     wider = describe(
-        mass, sigma, seed=1, max_species=1, draws=40, scale_error=lambda m: 0.015 * m
+        mass, sigma, seed=1, choice=Searched(1), draws=40, scale_error=lambda m: 0.015 * m
     ).species.iloc[0]
     assert plain["mass_systematic"] == 0
     assert wider["mass_systematic"] == pytest.approx(0.015 * plain["mass_kda"])

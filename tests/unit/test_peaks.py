@@ -177,3 +177,11 @@ def test_a_peak_that_a_program_cut_is_completed(cut: float) -> None:
         assert one.fraction_low < share < one.fraction_high
     assert found["count_corrected"][0] == pytest.approx(500, rel=0.35)
     assert found["count"][0] < 400
+
+
+def test_what_is_left_of_a_peak_that_a_program_cut_is_one_species() -> None:
+    """It was two, one of them all that the cut left of the flank."""
+    random = np.random.default_rng([5, 9])
+    mass = random.normal(np.repeat([66.0, 146.0], [2000, 500]), 9.0)
+    found = ia.find_species(pd.DataFrame({"mass_kda": mass[mass > 58]}), draws=0).species
+    assert found["mass_kda"].to_numpy() == pytest.approx([66, 146], abs=1.5)
