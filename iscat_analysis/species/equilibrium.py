@@ -276,12 +276,9 @@ def _observed(series: Series, free: Maximum) -> tuple[FloatArray, FloatArray, Fl
     logits, errors = np.empty(series.number), np.empty(series.number)
     for number, one in enumerate(part):
         logits[number] = math.log(one[-1] / (1 - one[-1]))
-        slope = np.zeros(free.theta.size)
-        begin = series.own + number * (series.kinds - 1)
-        # d logit(f_k)/dl_k = 1; of another: −f_j/(1 − f_k)
-        slope[begin : begin + series.kinds - 1] = -one[1:] / (1 - one[-1])
-        slope[begin + series.kinds - 2] = 1.0
-        errors[number] = math.sqrt(max(float(slope @ covariance @ slope), 1e-12))
+        slope = np.append(-one[1:-1] / (1 - one[-1]), 1.0)  # d logit(f_k)/dl_j
+        own = slice(series.own + number * slope.size, series.own + (number + 1) * slope.size)
+        errors[number] = math.sqrt(max(float(slope @ covariance[own, own] @ slope), 1e-12))
     return logits, errors, expit(logits)
 
 

@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from iscat_analysis._kernels.mixture import mixture_score, mixture_sums
@@ -165,13 +165,13 @@ def _spread_start(events: Events, k: int) -> Mixture:
 
 
 def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
-    """Add a narrow species at the largest excess of events, or split the widest species."""
+    """Add a narrow species at the largest excess of events."""
     starts = []
     sigma = float(np.median(events.sigma))
     places = np.sort(events.x)
     every = np.arange(fit.narrow)
     whole = np.sqrt(fit.variance + sigma**2)
-    widths = [sigma, 4 * sigma]
+    widths = [sigma]
     if not events.plain:  # the errors may be unknown, and those of the peaks are not
         widths.append(float(whole[every].min()) / 2)
     for h in widths:
@@ -182,14 +182,6 @@ def split_starts(events: Events, fit: Mixture) -> list[Mixture]:
         excess = (near - places.size * expected) / np.sqrt(places.size * expected + 1)
         place = float(places[int(np.argmax(excess))])
         starts.append(_with(fit, every, 1 / (2 * fit.narrow + 1), place, (h / 2) ** 2))
-    widest = int(np.argmax((fit.weight * whole)[every]))
-    both, half = np.ones(2), 0.7 * whole[widest] * np.array([-1.0, 1.0])
-    starts.append(
-        _with(
-            fit, np.delete(every, widest), fit.weight[widest] / 2 * both, fit.mean[widest] + half,
-            fit.variance[widest] / 4 * both,
-        )
-    )  # fmt: skip
     return starts
 
 
@@ -207,7 +199,7 @@ def joined_starts(fit: Mixture) -> list[Mixture]:
 
 
 def _with(
-    fit: Mixture, kept: NDArray[np.intp], weight: ArrayLike, mean: ArrayLike, variance: ArrayLike
+    fit: Mixture, kept: NDArray[np.intp], weight: float, mean: float, variance: float
 ) -> Mixture:
     """Give some of the free components of a mixture, and others, on the same background.
 

@@ -244,39 +244,28 @@ class Series:
 
     def _priors(self) -> None:
         """Mean and width of the prior of combinations of parameters."""
-        lightest = float(self.masses.min())
-        rows: list[tuple[dict[int, float], float, float]] = []
-        place = self.parts
-        rows.append(({place: 1.0}, 0.0, _OFFSET * lightest))
-        rows.append(({self.tail: 1.0}, 0.0, _TAIL_SPREAD))
-        last = self.shares - (2 if self.learned else 0) - 1
-        rows.append(({last: 1.0}, 0.0, _SLOPE_SPREAD))
-        for knot in range(1, self.knots.size - 1):
-            at = self.tail + knot  # the first knot's logarithm is 0 and no parameter
-            below = {at - 1: -0.5} if knot > 1 else {}
-            rows.append(({**below, at: 1.0, at + 1: -0.5}, 0.0, _BEND_SPREAD))
+        one, place, lightest = np.eye(self.own), self.parts, float(self.masses.min())
+        bends = slice(self.tail + 1, self.tail + self.knots.size)
+        shape = np.vstack([np.zeros(self.own), one[bends]])  # the first knot's logarithm is 0
+        rows = [one[place] / (_OFFSET * lightest), one[self.tail] / _TAIL_SPREAD]
+        rows += [shape[-1] / _SLOPE_SPREAD]
+        rows += list((shape[1:-1] - (shape[:-2] + shape[2:]) / 2) / _BEND_SPREAD)
+        middle = [0.0] * len(rows)
         if self.learned:
-            at = self.shares - 2
-            rows.append(({at: 1.0}, float(self.first[at]), _LIMIT_SPREAD * lightest))
-            rows.append(({at + 1: 1.0}, _SOFT * self.width, _SOFTNESS * self.width))
-        self.prior_design = np.zeros((len(rows), self.own))
-        for row, (parts, _, width) in enumerate(rows):
-            for at, value in parts.items():
-                self.prior_design[row, at] = value / width
-        self.prior_middle = np.array([middle / width for _, middle, width in rows])
-        of_widths, middle = width_prior(self.masses)
-        design = np.zeros((self.kinds, self.own))
-        design[:, place + 1 : place + 1 + self.kinds] = of_widths
-        self.prior_design = np.vstack([self.prior_design, design])
-        self.prior_middle = np.append(self.prior_middle, middle)
+            at, spread = self.shares - 2, _LIMIT_SPREAD * lightest
+            rows += [one[at] / spread, one[at + 1] / (_SOFTNESS * self.width)]
+            middle += [float(self.first[at]) / spread, _SOFT / _SOFTNESS]
+        widths, usual = width_prior(self.masses)
         # Shares of background scatter about a level that they have in common.
         covariance = np.full((self.number, self.number), _BACKGROUND**2)
         covariance += _SHARE_SPREAD**2 * np.eye(self.number)
-        apart = np.zeros((self.number, self.own))
-        apart[:, self.shares :] = np.linalg.inv(np.linalg.cholesky(covariance))
-        self.prior_design = np.vstack([self.prior_design, apart])
-        level = np.full(self.number, _FIRST_BACKGROUND)
-        self.prior_middle = np.append(self.prior_middle, apart[:, self.shares :] @ level)
+        apart = np.linalg.inv(np.linalg.cholesky(covariance))
+        self.prior_design = np.vstack(
+            [*rows, widths @ one[place + 1 : self.tail], apart @ one[self.shares :]]
+        )
+        self.prior_middle = np.concatenate(
+            [middle, usual, apart @ np.full(self.number, _FIRST_BACKGROUND)]
+        )
 
     def shared(self, theta: FloatArray) -> Shared:
         """Convert parameters to masses, widths and the shape of the background."""
