@@ -64,7 +64,6 @@ _LIMIT_SPREAD = 0.5
 _EDGE_QUANTILE = 0.02  # quantile of the events where their edge is sought
 _ABOVE_RISE = 3.0  # of a peak's width: how far above that edge the limit may lie
 _NODES = 64
-_NOISE_KINDS = 8  # of noise, in each table
 _PEAK_REACH = 0.4  # of the lightest mass: events of a peak
 _SIGMA_PER_MAD = 1.4826
 _TINY = 1e-290
@@ -98,12 +97,11 @@ def _cut(table: Events, softest: float) -> float:
 class Window:
     """The events of one table inside the mass window, and its detector.
 
-    Shapes: `x, noise` (n,), `size` (c,), `seen` (c, g).
+    Shapes: `x, noise` (n,), `seen` (g,).
     """
 
     x: FloatArray
     noise: FloatArray
-    size: FloatArray
     seen: FloatArray
     learned: bool
 
@@ -143,20 +141,15 @@ class Series:
         noise = np.concatenate([self._within(table, table.variance) for table in tables])
         self.events = everything.size
         total = self._width(everything) ** 2 if self.events else (0.1 * lightest) ** 2
-        self.noise = float(np.median(noise)) if self.events else 1.0
+        self.noise, self.mean_noise = 1.0, 1.0
+        if self.events:
+            self.noise, self.mean_noise = float(np.median(noise)), float(noise.mean())
         self.width = math.sqrt(max(total, self.noise))
         self.noise = min(self.noise, self.width**2)
         self.knots = self._middles()
         points, steps = np.polynomial.legendre.leggauss(_NODES)
         half = (self.ends[1] - self.ends[0]) / 2
         self.nodes, self.steps = self.ends[0] + half * (points + 1), half * steps
-        self.noise_ends = np.unique(
-            np.quantile(noise, np.linspace(0, 1, _NOISE_KINDS + 1)[1:-1]) if self.events else []
-        )
-        kind = np.searchsorted(self.noise_ends, noise)
-        count = np.bincount(kind, minlength=self.noise_ends.size + 1)
-        mean = np.bincount(kind, noise, self.noise_ends.size + 1) / np.maximum(count, 1)
-        self.kind_noise = np.where(count > 0, mean, self.noise)
         self.tables = [self._window(table) for table in tables]
         self.learned = any(table.learned for table in self.tables)
         self.back_mean, self.back_variance, self.back_share = self._background()
@@ -229,18 +222,15 @@ class Series:
         return mean, width**2, share / (share.sum(axis=0) * inside[:, None])
 
     def _window(self, table: Events) -> Window:
-        """Take a table's events within the window, in kinds of noise."""
+        """Take a table's events within the window."""
         low, high = self.ends
         inside = (table.x >= low) & (table.x < high)
-        x, noise = table.x[inside], table.variance[inside]
-        kind = np.searchsorted(self.noise_ends, noise)
-        size = np.bincount(kind, minlength=self.kind_noise.size).astype(np.float64)
-        seen, known = np.tile(self.steps, (size.size, 1)), table.efficiency
+        seen, known = self.steps, table.efficiency
         softest = (high - low) / _NODES
         if known is not None and not _cut(table, softest):
-            reach = np.maximum(known.extra_sigma(np.sqrt(self.kind_noise)), softest)[:, None]
+            reach = np.maximum(known.extra_sigma(np.sqrt([self.mean_noise])), softest)
             seen = seen * ndtr((self.nodes - known.threshold_kda) / reach)
-        return Window(x, noise, size, seen, known is None)
+        return Window(table.x[inside], table.variance[inside], seen, known is None)
 
     def _priors(self) -> None:
         """Mean and width of the prior of combinations of parameters."""
@@ -357,26 +347,25 @@ class Series:
                 values[number], by_part[number] = mixture_score(
                     table.x, table.noise, weight[number], mean, variance
                 )
-        # The chance that a particle of a part is seen within the window, (tables, kinds, parts).
+        # The chance that a particle of a part is seen within the window, (tables, parts).
         limit, spread = now.limit
         seen = np.array([table.seen for table in self.tables])
         at_nodes = (self.nodes - limit) / spread
         if self.learned:
             seen[[table.learned for table in self.tables]] = self.steps * ndtr(at_nodes)
-        total = variance + self.kind_noise[:, None, None]
+        total = variance + self.mean_noise
         away = self.nodes[:, None] - mean
         density = np.exp(-0.5 * away**2 / total) / np.sqrt(2 * math.pi * total)
         rise = away / total * density
         bend = 0.5 * (away**2 / total - 1) / total * density
-        chance = np.einsum("tcg,cgj->tcj", seen, density)
-        size = np.array([table.size for table in self.tables])
-        norm = np.maximum(np.einsum("tcj,tj->tc", chance, weight), _TINY)
-        values -= (size * np.log(norm)).sum(axis=1)
-        over = size / norm
-        by_part[:, 0] -= weight * np.einsum("tc,tcj->tj", over, chance)
-        pulled = np.einsum("tc,tcg->tcg", over, seen).reshape(self.number, -1)
-        by_part[:, 1] -= weight * (pulled @ rise.reshape(-1, mean.size))
-        by_part[:, 2] -= weight * (pulled @ bend.reshape(-1, mean.size))
+        chance = seen @ density
+        size = np.array([table.x.size for table in self.tables])
+        norm = np.maximum((chance * weight).sum(axis=1), _TINY)
+        values -= size * np.log(norm)
+        over = (size / norm)[:, None]
+        by_part -= weight[:, None] * np.stack(
+            [over * chance, over * seen @ rise, over * seen @ bend], axis=1
+        )
         slopes = np.zeros((self.number, self.shares + self.kinds))
         own, place = by_part[:, :, : k * q].reshape(self.number, 3, k, q), self.parts
         by_mean, by_variance = own[:, 1].sum(axis=2), own[:, 2].sum(axis=2)
@@ -399,7 +388,7 @@ class Series:
         slopes[:, self.shares + 1 :] = (by_kind - species[:, None] * part)[:, 1:]
         if self.learned:
             bell = self.steps * np.exp(-0.5 * at_nodes**2) / math.sqrt(2 * math.pi)
-            by_node = np.einsum("tc,cgj,tj->tg", over, density, weight) * bell
+            by_node = over * (weight @ density.T) * bell
             for number, table in enumerate(self.tables):
                 if not table.learned:
                     continue
