@@ -24,17 +24,17 @@ components has the least BIC; a parametric bootstrap gives the intervals and say
 choose that number again.
 
 `describe` is the whole of it.  `events` says what is seen and what is missed, `mixture` holds the
-components and says which are one species, `structure` maximises the likelihood above where species
-or samples share parameters, `search` tries numbers of components, `choices` are a number, given
-masses or a ladder, `bootstrap` repeats the measurement, and `curves` holds what is drawn.  `tables`
-reads events of any program.
+components and says which are one species, `structure` has the likelihood above where species or
+samples share parameters, `maximum` maximises every likelihood of masses, `search` tries numbers of
+components, `choices` are a number, given masses or a ladder, `bootstrap` repeats the measurement,
+and `curves` holds what is drawn.  `tables` reads events of any program.
 
 `diameters` runs the same mixture on the logarithms of the diameters of spheres, whose errors depend
 on the diameter.
 
 `comparison` asks whether two samples are one.  `equilibrium` fits a constant to a series of
-concentrations, with the law of `mass_action` and the likelihood of `series`, which `maximum`
-maximises; `kinetics` has the rates of landing and leaving.
+concentrations, with the law of `mass_action` and the likelihood of `series`; `kinetics` has the
+rates of landing and leaving.
 
 A track tells a diffusion coefficient: `displacements` has the likelihood of its steps, with errors
 and motion blur, `diffusion` the estimate and the size that follows, and `motion` asks whether the
