@@ -49,7 +49,7 @@ _NAMES: Mapping[str, Mapping[str, float]] = {
     },
     "sigma_mass_kda": {f"sigma_mass_{unit}": each for unit, each in _KDA.items()},
     **{name: {name: 1.0} for name in (
-        "systematic_mass_kda", "systematic_contrast", "snr", "n_after", *TEXTS
+        "systematic_mass_kda", "systematic_contrast", "snr", "n_after", "p_value", "track", *TEXTS
     )},
 }  # fmt: skip
 """What each column is called in the files, the first first, and what its values are times."""

@@ -35,10 +35,10 @@ from iscat_analysis.records import (
     Status,
     TrackStatus,
     flagged,
+    is_rejected,
     make_rows,
     silent,
 )
-from iscat_analysis.report.spread import rejection
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.trust.budget import explained_kda, width_warning
@@ -108,7 +108,7 @@ def make_analysis(
         had = ("mass_kda",) if seen else ()  # by σ
         verdict = spread_verdict(
             {name: one for name, one in achieved.items() if name not in had}, found.summary,
-            scaled=scaled, rejected=bool(rejection(table)),
+            scaled=scaled, rejected=is_rejected(table),
             sliding=ready.background_mode == "sliding",
         )  # fmt: skip
         further["repeats"] = verdict

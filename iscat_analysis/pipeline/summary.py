@@ -20,10 +20,10 @@ from iscat_analysis.records import (
     Status,
     TrackStatus,
     free_parameters,
+    species_rows,
     tally,
 )
 from iscat_analysis.report.numbers import number
-from iscat_analysis.report.spread import rejection
 from iscat_analysis.species import LEAST_EVENTS, describe
 from iscat_analysis.species.diameters import Sizes, describe_sizes
 from iscat_analysis.species.tables import filter_efficiency, shared_error
@@ -133,20 +133,11 @@ def species_of(
             "across_particles": [],
             "sizes": None if found is None else found.to_dict(),
         }
-    used = species_rows(table)
+    used, notes = species_rows(table)
     distribution = _distribution(context, used, searched or 1.0)
-    if distribution is not None and (used["status"] == Status.POOR_FIT).any():
-        distribution["notes"].append("poor fits are counted too, because the model is rejected")
+    if distribution is not None:
+        distribution["notes"].extend(notes)
     return {"distribution": distribution, "across_particles": species_width(used, distribution)}
-
-
-def species_rows(table: pd.DataFrame) -> pd.DataFrame:
-    """Select the rows that species are found among: ok, and poor fits if the model is rejected.
-
-    Then a poor fit is no other kind of row: the bright particles are poor, all the same.
-    """
-    judged = [Status.OK, Status.POOR_FIT] if rejection(table) else [Status.OK]
-    return table[table["status"].isin(judged)]
 
 
 def _sizes(context: AnalysisContext, table: pd.DataFrame) -> Sizes | None:

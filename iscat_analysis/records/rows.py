@@ -8,11 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from scipy.special import bdtrc
 
 from iscat_analysis.records.arrays import BoolArray
 from iscat_analysis.records.columns import EVENTS
 from iscat_analysis.records.verdicts import NO_EVENT, SEVERITY, Status, TrackStatus
 from iscat_analysis.units import count, sphere_diameter_nm
+
+POOR_P = 0.01
+"""A p-value that one good fit in 100 has."""
+
+_CHANCE = 1e-4  # that so many fits are poor, below which the model is rejected
 
 
 def make_rows(
@@ -104,6 +110,42 @@ def tally(table: pd.DataFrame) -> Tally:
         for part in (events, ~events)
     )
     return Tally(int(events.sum()), by_status, left_out)
+
+
+def is_rejected(table: pd.DataFrame) -> bool:
+    """Tell whether more fits are poor than a right model of the image leaves to chance.
+
+    Notes
+    -----
+    What disturbs a particle that moves, as one outside of the field does, disturbs it in many
+    frames, and says nothing of the microscope.  An error of the microscope is in every track: of
+    tracks those with the smallest shares of poor fits, which have half of all fits, are judged.
+    """
+    table = counted(table)
+    table = table[np.isfinite(table["p_value"].to_numpy(float))]
+    poor = table["p_value"] < POOR_P
+    fits, misses = len(table), int(poor.sum())
+    if "track" in table:
+        tracks = poor.groupby(table["track"], dropna=False).agg(["size", "sum", "mean"])
+        tracks = tracks.sort_values("mean")
+        before = tracks["size"].cumsum() - tracks["size"]
+        fits, misses = (int(n) for n in tracks.loc[before < fits / 2, ["size", "sum"]].sum())
+    return bool(fits) and float(bdtrc(misses - 1, fits, POOR_P)) <= _CHANCE
+
+
+def species_rows(table: pd.DataFrame) -> tuple[pd.DataFrame, tuple[str, ...]]:
+    """Select the rows that species are found among, and say so where they are not the ok ones.
+
+    Where the model is rejected a poor fit is no other kind of row: the bright particles are poor,
+    all the same.
+    """
+    judged = {Status.OK.value}
+    if "p_value" in table and is_rejected(table):
+        judged.add(Status.POOR_FIT.value)
+    used = table[table["status"].isin(judged)]
+    if (used["status"] == Status.OK.value).all():
+        return used, ()
+    return used, ("poor fits are counted too, because the model is rejected",)
 
 
 def has_only(table: pd.DataFrame, known: frozenset[str]) -> BoolArray:

@@ -1,7 +1,8 @@
 """What a table of events or tracks says in one line: for the page, stdout, a notebook and a batch.
 
-Where species were found, they are the answer: of several there is no median.  Otherwise the median
-of the main quantity is, over the rows whose status is ok.  Where more than a fifth of the rows is
+Where species were found, they are the answer: of several there is no median.  Where events are too
+few for species and are not alike, their range is.  Otherwise the median of the main quantity is,
+over the rows whose status is ok.  Where more than a fifth of the rows is
 flagged, the rest is a selection rather than a sample, and there is no answer.
 """
 
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from scipy.special import chdtrc
 
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import (
@@ -32,6 +34,8 @@ MOST_FLAGGED = 0.2
 """Share of flagged rows above which no answer is given."""
 
 _BETWEEN = " · "  # species
+_WIDTH = 0.1  # of a species, over its mass
+_UNLIKE = 1e-3  # p-value below which events are of more than one species
 
 
 @dataclass(frozen=True)
@@ -119,10 +123,22 @@ def _of_events(
     if several := _species(main, summary, table):
         return (several,)
     low, middle, high = quantiles(values)
+    if (summary.get("distribution") or {}).get("species") == [] and _differ(table):
+        value = f"{number(values.min())} to {number(values.max())}"
+        note = "in events that are not alike and too few to tell species"
+        return (Answer(main.label.capitalize(), value, main.unit, note),)
     if values.size == 1:
         return (Answer(main.label.capitalize(), number(middle), main.unit),)
     note = f"middle half {number(low)} to {number(high)} {main.unit}".rstrip()
     return (Answer(f"Median {main.label}", number(middle), main.unit, note),)
+
+
+def _differ(table: pd.DataFrame) -> bool:
+    """Tell whether masses differ by more than their errors and what one species may be wide."""
+    rows = table[table["status"] == Status.OK.value]
+    mass, sigma = rows["mass_kda"].abs().to_numpy(), rows["sigma_mass_kda"].to_numpy()
+    off = (mass - np.median(mass)) / np.hypot(sigma, _WIDTH * np.median(mass))
+    return float(chdtrc(max(mass.size - 1, 1), float(np.nansum(off**2)))) < _UNLIKE
 
 
 def _species(main: Quantity, summary: Mapping[str, Any], table: pd.DataFrame) -> Answer | None:

@@ -31,7 +31,7 @@ from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import named, read_events, unit_note
 from iscat_analysis.reading import read_json
-from iscat_analysis.records import FloatArray, Status
+from iscat_analysis.records import FloatArray, species_rows
 from iscat_analysis.species.events import POSSIBLE_KDA, Efficiency, Events, possible
 from iscat_analysis.units import count
 
@@ -286,12 +286,12 @@ def _checked(table: pd.DataFrame) -> pd.DataFrame:
 
 def _usable(table: pd.DataFrame, name: str, sigma_kda: float | None) -> EventTable:
     """Select rows with a mass and without a disqualifying flag."""
-    good = table
+    good, notes = table, []
     if "status" in table:
-        good = table[table["status"] == Status.OK.value]
+        good, said = species_rows(table)
+        notes += [Note(name, sentence) for sentence in said]
         if good.empty:
             raise DataError(f"{name}: holds no event with status ok")
-    notes = []
     if _REJECTED in good and (by_hand := int(good[_REJECTED].sum())):
         good = good[~good[_REJECTED]]
         notes.append(Note(name, "that somebody rejected left out", count(by_hand, "event")))
@@ -359,7 +359,7 @@ def _sharp(edge_kda: float) -> Efficiency:
 
 def _from_snr(table: pd.DataFrame, path: Path | None) -> Efficiency | None:
     """Estimate threshold and noise of the filter from a table of this program."""
-    good = table[table["status"] == Status.OK.value] if "status" in table else table
+    good = species_rows(table)[0] if "status" in table else table
     snr = good["snr"].to_numpy(dtype=float)
     snr = snr[np.isfinite(snr) & (snr > 0)]
     if not snr.size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,6 +35,8 @@ from iscat_analysis.report.headline import headline
 from iscat_analysis.report.spread import rejection, species_widths
 from iscat_analysis.report.tables import event_table
 from iscat_analysis.search.empty import CONTRASTS, EmptyField
+from iscat_analysis.species.tables import event_table as events_of
+from iscat_analysis.species.tables import sentences
 from iscat_analysis.trust.empirical_spread import likely_noise, measured_scale, spread_verdict
 
 SIGMAS = 4.0
@@ -402,7 +405,7 @@ def test_the_width_of_a_species_is_told_with_its_interval() -> None:
     assert species_widths({}) == []
 
 
-def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
+def test_species_of_poor_fits_are_judged_where_the_model_is_rejected(tmp_path: Path) -> None:
     """Masses scatter by 5 % beyond σ = 2 kDa: the page says so though every fit is poor."""
     rng = np.random.default_rng(10)
     table = make_analysis(120).table
@@ -418,11 +421,17 @@ def test_species_of_poor_fits_are_judged_where_the_model_is_rejected() -> None:
     assert (one["mass_kda"], one["count"]) == (species["mass_kda"], species["count"])
     assert species["count"] == pytest.approx(120)
     assert "poor fits are counted too" in found["distribution"]["notes"][-1]
+    table.to_csv(tmp_path / "fits.csv")
+    listed = events_of(tmp_path / "fits.csv")  # as `iscat species` and `iscat kd` read it
+    assert listed.mass_kda.size == 120
+    assert any("poor fits are counted too" in note for note in sentences(listed.notes))
     assert one["width_low"] < 7.5 < one["width_high"]
     assert one["spread_over_sigma"] == pytest.approx(np.hypot(1, 7.5 / 2), rel=0.2)
     fair = table.assign(status="ok", flags="", p_value=rng.uniform(size=120))
     fair.loc[fair.index[:6], "status"] = "poor_fit"
     found = species_of(context, fair)
+    fair.to_csv(tmp_path / "fits.csv")
+    assert events_of(tmp_path / "fits.csv").mass_kda.size == 114
     assert found["distribution"]["events"] == 114
     assert not any("poor fits" in note for note in found["distribution"]["notes"])
 

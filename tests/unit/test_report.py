@@ -377,6 +377,17 @@ def test_several_species_are_one_answer_everywhere_and_have_no_median(
     assert only.label == f"Median {quantity}"
 
 
+@pytest.mark.parametrize(("spread", "said"), [(0.5, "Mass 50.0 to 150"), (0.03, "Median mass 100")])
+def test_few_events_that_are_not_alike_have_no_median(spread: float, said: str) -> None:
+    analysis = make_analysis(5)
+    mass = 100 * (1 + spread * np.array([-1, 1, 0, -1, 1]))
+    table = analysis.table.assign(mass_kda=mass, sigma_mass_kda=2.0, status="ok")
+    few = describe(mass, np.full(5, 2.0), seed=1).to_dict()
+    summary = {**analysis.summary, "distribution": few, "mass_scale": "calibration"}
+    (only,) = answers(replace(analysis, table=table, summary=summary), table)
+    assert only.text.startswith(said)
+
+
 def test_side_lobes_are_no_events() -> None:
     """Thirty of forty rows are side lobes with absurd masses: ten events remain, and all count."""
     analysis = with_flagged(make_analysis(40), 30)
