@@ -208,6 +208,9 @@ _HALF_TURN = 180.0  # of the phase, after which particles look the same with the
 _SOME_MASK = {"mask_na": (0.65, 0.25), "attenuation": (0.4, 0.3)}
 """Middle and standard deviation of a mask of which the configuration knows nothing."""
 
+_DIM_SHARE = 0.2
+"""Largest usual error of a mask's transmission, over it: contrasts are as its inverse."""
+
 _TOLD = 0.5  # of the standard deviation before, to which pictures that tell a parameter bring it
 _PLAUSIBLE = 7.0  # usual errors
 
@@ -228,6 +231,9 @@ class Prior:
         usual = {name: PARAMETERS[name].usual_error for name in names}
         if not self.middle["mask_na"]:
             usual |= {name: sigma for name, (_, sigma) in _SOME_MASK.items()}
+        elif "attenuation" in usual:
+            dim = _DIM_SHARE * float(self.middle["attenuation"])
+            usual["attenuation"] = min(usual["attenuation"], dim)
         return np.array([self.own.get(name, usual[name]) for name in names], dtype=float)
 
     def changes(self, values: Settings, names: Sequence[str]) -> FloatArray:

@@ -154,6 +154,14 @@ def fit_rois(
     ...                     n_before=200, n_after=200)
     >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
     np.True_
+
+    Contrast images, with the noise of a pixel of a difference of 200 frames from 200:
+
+    >>> images = counts[1:] / counts[:1] - 1
+    >>> table = ia.fit_rois(optics=optics, particle=protein, camera=camera, calibration=line,
+    ...                     contrast=images, sigma=(2 / (200 * 1e4)) ** 0.5)
+    >>> abs(table.mass_kda[0] - 480) < 4 * table.sigma_mass_kda[0]
+    np.True_
     """
     config = config_of(
         optics, particle, camera, mode=mode, z_range_nm=z_range_nm, calibration=calibration

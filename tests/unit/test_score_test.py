@@ -75,3 +75,16 @@ def test_a_common_height_is_no_other_optics_if_heights_are_open(
     found = score_test(fitted, microscopes(config, 2600.0), settings_of(config), prior_of(config))
     assert (median > REJECTED_P and not found.rejected) == is_right
     assert (abs(fitted[0].z_nm - 17.0) < 1.0) == is_right
+
+
+@pytest.mark.parametrize(
+    ("mask_na", "attenuation", "own", "error"),
+    [(0.6, 0.03, {}, 0.006), (0.6, 0.4, {}, 0.05), (0.0, 1.0, {}, 0.3),
+     (0.6, 0.03, {"attenuation": 0.01}, 0.01)],
+)  # fmt: skip
+def test_the_transmission_of_a_dim_mask_is_known_to_a_share_of_it(
+    mask_na: float, attenuation: float, own: dict[str, float], error: float
+) -> None:
+    """Masses are as its inverse: ±0.05 of 0.03 moved those of a mass photometer by a third."""
+    prior = Prior({"mask_na": mask_na, "attenuation": attenuation}, own)
+    np.testing.assert_allclose(prior.errors(["attenuation"]), [error])
