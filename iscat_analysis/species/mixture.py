@@ -127,8 +127,9 @@ class Mixture:
 
     def widths(self) -> FloatArray:
         """Give the standard deviation of the masses of each species, beyond errors (s,)."""
-        belongs, mean = self.belongs, self.means()
-        square = self.variance + (self.mean - belongs @ mean) ** 2
+        belongs, mean = self.belongs, self.belongs @ self.means()
+        apart = np.where(np.isclose(self.mean, mean, rtol=1e-9, atol=0), 0.0, self.mean - mean)
+        square = self.variance + apart**2
         return np.sqrt((self.weight * square) @ belongs / np.maximum(self.came, 1e-300))
 
     def arrived(self, events: Events) -> float:

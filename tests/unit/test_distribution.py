@@ -248,6 +248,12 @@ def test_a_drawn_event_is_one_that_was_drawn_and_then_detected(
         assert ks_2samp(found.x, np.abs(x)).pvalue > 1e-3
 
 
+def test_rounding_makes_no_width() -> None:
+    mean = np.array([60.75, 2.1 * 60.75, 7.3 * 60.75])
+    mixture = Mixture(np.array([0.333, 0.4, 0.267]), mean, np.zeros(3))
+    assert mixture.widths().tolist() == [0.0, 0.0, 0.0]
+
+
 def test_missing_values_are_left_out() -> None:
     mass, sigma = sample()
     mass[0], sigma[1], sigma[2] = math.nan, math.nan, 0.0

@@ -14,33 +14,15 @@ import numpy as np
 import pytest
 import scipy.io
 import tifffile
+from small_files import COUNTS, SHAPE, assert_whole, refused
 
 from iscat_analysis.day.table import read_table
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack, path_beside
 from iscat_analysis.movie.folders import SUFFIXES, files_of, find_movies, is_movie
 
-SHAPE = (7, 6, 5)
-COUNTS = np.random.default_rng(1).integers(0, 60000, SHAPE).astype(np.uint16)
 MATLAB = COUNTS.transpose(1, 2, 0)
 """As MATLAB has it: (y, x, t)."""
-
-
-def assert_whole(address: Path | str, expected: np.ndarray = COUNTS) -> None:
-    with open_stack(address) as stack:
-        assert stack.shape == expected.shape
-        assert stack.dtype == expected.dtype.newbyteorder("=")
-        assert np.array_equal(stack.read(0, len(expected)), expected)
-        assert np.array_equal(stack.read(2, 5), expected[2:5])
-        assert stack.read(3, 3).shape == (0, *expected.shape[1:])
-
-
-def refused(address: Path | str, *parts: str) -> None:
-    with pytest.raises(DataError) as raised:
-        open_stack(address)
-    for part in parts:
-        assert part in str(raised.value)
-    assert "\n" not in str(raised.value)
 
 
 def write_mat(path: Path, **arrays: Any) -> None:

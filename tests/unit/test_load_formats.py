@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tifffile
 import zarr
+from small_files import COUNTS, assert_whole, refused
 from tiff_files import write_ome_set
 
 from iscat_analysis.camera.counts import refuse_overflow
@@ -17,27 +18,6 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.movie import open_stack, path_beside
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.mapped_frames import MappedFrames
-
-SHAPE = (7, 6, 5)
-COUNTS = np.random.default_rng(1).integers(0, 60000, SHAPE).astype(np.uint16)
-
-
-def assert_whole(address: Path | str, expected: np.ndarray = COUNTS) -> None:
-    with open_stack(address) as stack:
-        assert stack.shape == expected.shape
-        assert stack.dtype == expected.dtype.newbyteorder("=")
-        assert np.array_equal(stack.read(0, len(expected)), expected)
-        assert np.array_equal(stack.read(2, 5), expected[2:5])
-        assert stack.read(3, 3).shape == (0, *expected.shape[1:])
-
-
-def refused(address: Path | str, *parts: str) -> None:
-    with pytest.raises(DataError) as raised:
-        open_stack(address)
-    for part in parts:
-        assert part in str(raised.value)
-    assert "\n" not in str(raised.value)
-
 
 # ---- NumPy and plain numbers -----------------------------------------------------------------
 
