@@ -51,6 +51,9 @@ class Instruments(dict[str, Instrument]):
         return "\n".join([*lines, 'as in configure(instrument="iscat")'])
 
 
+_LIGHT = {"simulation.background": "speckle", "simulation.power_noise": 0.01}
+"""Glass is rough and lasers flicker, which tells the camera's gain and offset."""
+
 # In mode mass, the focus is where dark particles have the largest contrast.
 instruments = Instruments(
     {
@@ -65,6 +68,7 @@ instruments = Instruments(
                 "camera.pixel_size_nm": 84.4,
                 "bounds.photons_per_pixel": 1e6,
                 "simulation.photons_per_pixel": 1e6,
+                **_LIGHT,
             },
             "Cole, ACS Photonics 4, 211 (2017); Young, Science 360, 423 (2018)",
             110.0,
@@ -82,6 +86,7 @@ instruments = Instruments(
                 "camera.pixel_size_nm": 77.2,
                 "bounds.photons_per_pixel": 1e5,
                 "simulation.photons_per_pixel": 1e5,
+                **_LIGHT,
             },
             "Refeyn OneMP, as in Sonn-Segev, Nat. Commun. 11, 1772 (2020)",
             97.0,
@@ -95,6 +100,7 @@ instruments = Instruments(
                 "camera.pixel_size_nm": 60.0,
                 "bounds.photons_per_pixel": 1e6,
                 "simulation.photons_per_pixel": 1e6,
+                **_LIGHT,
             },
             "Piliarik and Sandoghdar, Nat. Commun. 5, 4495 (2014)",
             19.0,
@@ -112,6 +118,7 @@ instruments = Instruments(
                 "camera.pixel_size_nm": 80.0,
                 "bounds.photons_per_pixel": 1e6,
                 "simulation.photons_per_pixel": 1e6,
+                **_LIGHT,
             },
             "Huang, ACS Nano 11, 2575 (2017); Dong, J. Phys. D 54, 394002 (2021)",
             9.1,

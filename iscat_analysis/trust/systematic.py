@@ -210,14 +210,14 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
 
 
 def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
-    """Give what contrasts that are all wrong by a share do to masses.
+    """Give what contrasts that are all wrong by a share do to them and to masses.
 
-    Masses of dipoles are wrong by that share.  The contrast of a sphere is not in proportion to its
+    Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to its
     mass, and its picture changes with it.
     """
-    mass = np.abs(table["mass_kda"].to_numpy(float))
+    mass, contrast = (np.abs(table[name].to_numpy(float)) for name in ("mass_kda", "contrast"))
     if not config.fits_sizes or not share:
-        return {"mass_kda": share * mass}
+        return {"mass_kda": share * mass, "contrast": share * contrast}
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     if not known.any():
         return {}
@@ -228,7 +228,7 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
         abs(share * respond.to_contrast(z, kda, index=own)) * kda
         for (z, kda), own in zip(places, has_own_index(table)[known].tolist(), strict=True)
     ]
-    return {"mass_kda": out}
+    return {"mass_kda": out, "contrast": share * contrast}
 
 
 def _of_the_selection(

@@ -39,7 +39,10 @@ def test_a_protein_has_the_stated_signal_in_a_hundred_frames(name: str) -> None:
 
     config = ia.configure(instrument=name, settings=HUNDRED | LANDED)
     counts = np.array(list(Movie(config, 5).frames(5)))
-    (row,) = ia.fit_movie(counts, config=config).table.itertuples()
+    result = ia.fit_movie(counts, config=config)
+    (row,) = result.table.itertuples()
+    camera = result.summary["camera"]
+    assert camera["offset_adu"]["se"] < 0.05 * camera["light_adu"]  # the light tells its zero
     assert np.hypot(row.x_px - 35.3, row.y_px - 36.1) < 1
     assert row.snr == pytest.approx(stated, abs=4 + 0.1 * stated)  # σ is 1
     assert abs(row.mass_kda - 480) < 4 * row.sigma_mass_kda
@@ -81,6 +84,7 @@ def test_a_set_up_lies_below_what_is_given(tmp_path: Path) -> None:
 def test_simulated_counts_fit_into_their_bits_where_no_gain_is_given() -> None:
     """Each count is then as many photoelectrons as that takes; a gain that is given stands."""
     settings = LANDED | {"simulation.events": [], "simulation.frames": 20}
+    settings |= {"simulation.background": "flat", "simulation.power_noise": 0.0}
     for light, gain in ((1e4, 1), (6e4, 1), (1e6, 16)):
         config = ia.configure(
             instrument="iscat", settings=settings | {"simulation.photons_per_pixel": light}
