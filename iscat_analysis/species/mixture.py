@@ -130,7 +130,8 @@ class Mixture:
         belongs, mean = self.belongs, self.belongs @ self.means()
         apart = np.where(np.isclose(self.mean, mean, rtol=1e-9, atol=0), 0.0, self.mean - mean)
         square = self.variance + apart**2
-        return np.sqrt((self.weight * square) @ belongs / np.maximum(self.came, 1e-300))
+        mean_square = (self.weight * square) @ belongs / np.maximum(self.came, 1e-300)
+        return np.asarray(np.sqrt(mean_square))
 
     def arrived(self, events: Events) -> float:
         """Give the expected number of particles that arrived, detected or not: Σ_i 1/Z_i."""

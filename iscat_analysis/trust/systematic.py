@@ -215,7 +215,8 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to its
     mass, and its picture changes with it.
     """
-    mass, contrast = (np.abs(table[name].to_numpy(float)) for name in ("mass_kda", "contrast"))
+    sizes = table[["mass_kda", "contrast"]].abs()
+    mass, contrast = (sizes[name].to_numpy(float) for name in sizes)
     if not config.fits_sizes or not share:
         return {"mass_kda": share * mass, "contrast": share * contrast}
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
