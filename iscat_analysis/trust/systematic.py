@@ -212,8 +212,8 @@ def _of_the_camera(config: Config, camera: Mapping[str, Any]) -> Iterator[Source
 def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[str, FloatArray]:
     """Give what contrasts that are all wrong by a share do to them and to masses.
 
-    Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to its
-    mass, and its picture changes with it.
+    Masses of dipoles are wrong by that share too.  The contrast of a sphere is not in proportion to
+    its mass, and its picture changes with it.
     """
     sizes = table[["mass_kda", "contrast"]].abs()
     mass, contrast = (sizes[name].to_numpy(float) for name in sizes)
