@@ -199,7 +199,7 @@ def test_particles_that_move_are_told_from_those_that_land(
     """The same setting with four proteins on a membrane."""
     movie = tmp_path / "moving.tif"
     changes = [
-        *LANDING[:3], "simulation.count=0", "fit.mode=track", "camera.frame_rate_hz=331",
+        *LANDING[1:3], "simulation.count=0", "fit.mode=track", "camera.frame_rate_hz=331",
         "simulation.movers=[{count=4, mass_kda=900.0, d_um2_s=0.15}]", "simulation.shape=[72, 72]",
     ]  # fmt: skip
     options = [f"--set={change}" for change in changes]
