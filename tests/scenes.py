@@ -144,7 +144,7 @@ def write_bright_landings(movie: Path, setup: Path) -> None:
         "particle": {"kind": "protein", "height_nm": 5.0},
     }
     simulation = {
-        "shape": [176, 176], "frames": 160, "photons_per_pixel": 2e4, "seed": 3,
+        "shape": [176, 176], "frames": 160, "photons_per_pixel": 2e4, "seed": 4,
         "background": "speckle", "events": events,
     }  # fmt: skip
     true = {**nominal, "optics": nominal["optics"] | OPTICS_TRUTH, "simulation": simulation}
