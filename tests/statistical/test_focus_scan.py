@@ -12,7 +12,7 @@ from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.particle_image import best_amplitudes
 from iscat_analysis.instrument.result import OpticsCalibration
-from iscat_analysis.optics.parameters import optics_limits, settings_of
+from iscat_analysis.optics.parameters import optics_limits, prior_of, settings_of
 
 SIGMAS = 4.0
 PIXEL_NM = 84.0
@@ -120,6 +120,7 @@ def test_the_direction_of_linear_light_is_told(direction: float) -> None:
         build,
         ("focus", "phase", "polarization"),
         optics_limits(1.515, 1.515),
+        prior_of(config),
         side=-1,
     ).run(images)
     assert not found.refusals

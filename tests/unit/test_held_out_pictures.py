@@ -14,7 +14,7 @@ from iscat_analysis.instrument.joint_fit import Estimate
 from iscat_analysis.instrument.measure import OpticsSearch
 from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.parameters import Settings
+from iscat_analysis.optics.parameters import Prior, Settings
 
 HEIGHTS_NM = (0.0, 1000.0)
 
@@ -27,7 +27,16 @@ def _particle_images(count: int, mass_kda: float) -> tuple[ParticleImage, ...]:
 
 def _estimate(images: Sequence[ParticleImage], values: Settings) -> Estimate:
     return Estimate(
-        ("reference_phase_deg",), values, tuple(images), np.eye(1), np.eye(1), 0.0, True, 1
+        ("reference_phase_deg",),
+        values,
+        tuple(images),
+        information=np.eye(1),
+        scatter=np.eye(1),
+        errors=np.ones(1),
+        log_likelihood=0.0,
+        log_prior=0.0,
+        converged=True,
+        passes=1,
     )
 
 
@@ -49,7 +58,7 @@ class _Moving(OpticsSearch):
 def _search(kind: type[OpticsSearch] = OpticsSearch) -> OpticsSearch:
     values: dict[str, Any] = {"reference_phase_deg": 0.0, "polarization": "linear", "mask_na": 0.0}
     build: Any = None  # no picture is looked at
-    return kind(values, build, ("phase",), {})
+    return kind(values, build, ("phase",), {}, Prior(values))
 
 
 @pytest.mark.parametrize(("mass", "phase"), [(-400.0, 173.0), (400.0, -7.0)])
