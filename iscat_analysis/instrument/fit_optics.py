@@ -11,7 +11,7 @@ import numpy as np
 from iscat_analysis.config import MOVES, Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.instrument.joint_fit import Neighbours, maximise
-from iscat_analysis.instrument.measure import OpticsSearch
+from iscat_analysis.instrument.measure import TWIN_GAP, Measured, OpticsSearch
 from iscat_analysis.instrument.microscope import goodness, microscopes, reach_nm, rings_of
 from iscat_analysis.instrument.particle_image import ParticleImage, with_masses
 from iscat_analysis.instrument.result import OpticsCalibration, make_pictures, make_result
@@ -39,6 +39,9 @@ _OPTICS_PASSES = 8
 _LEADERS = 2  # microscopes that are followed beside the configured one,
 _FOLLOWED = 3  # for so many rounds,
 _CLEAR = 1.0  # unless one describes the pictures to so many standard errors of one picture's χ²
+_ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
+_ODD_SIGMAS = 5.0
+_PIXEL_ERROR = 1e-3  # to which the size of pixels is looked for, over that size
 _DESCRIBED_CHI2 = 1.2  # of pictures that were not fitted, from which no other is looked for
 
 
@@ -136,7 +139,50 @@ def _fitted(
         measured = replace(measured, refusals=(*measured.refusals, seen.refusal))
     estimate = measured.estimate
     pictures = make_pictures(estimate.images, build, estimate.values)
-    return make_result(config, configured, measured, pictures, origin)
+    notes = _on_the_pixel(search, config, measured)
+    return make_result(config, configured, measured, pictures, origin, notes)
+
+
+def _on_the_pixel(search: OpticsSearch, config: Config, measured: Measured) -> tuple[str, ...]:
+    """Say that the pixels may be wrong where the aperture is another than the configured one.
+
+    Pictures of a smaller aperture are wider, and so are those whose pixels are said to be too
+    large.  Light beyond the critical angle tells both apart, and does not widen as the rest does:
+    the size is fitted, with the aperture as configured, and named unless it is ruled out.
+    """
+    from scipy.optimize import minimize_scalar
+
+    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
+    if "na" not in estimate.names or pixel is None:
+        return ()
+    k = estimate.names.index("na")
+    engraved, values = search.configured["na"], estimate.values
+    apart = values["na"] - engraved
+    if abs(apart) < max(_ODD_NA, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
+        return ()
+    most = (values["na"] / engraved) ** 2  # apertures change by half of what pixels do, or more
+    build = microscopes(config, max(1.0, most) * max(map(reach_nm, estimate.images)))
+
+    def misfit(factor: float) -> float:
+        fit = maximise(
+            [image.stretched(factor) for image in estimate.images],
+            build,
+            {**values, "na": engraved},
+            [name for name in estimate.names if name != "na"],
+            prior=search.prior, limits=search.limits, passes=_OPTICS_PASSES, mapper=search.mapper,
+        )  # fmt: skip
+        return estimate.log_likelihood - fit.log_likelihood
+
+    found = minimize_scalar(
+        misfit, bounds=sorted((1.0, most)), method="bounded", options={"xatol": _PIXEL_ERROR}
+    )
+    if found.fun > TWIN_GAP:
+        return ()
+    return (
+        f"the numerical aperture differs by {apart:+.3f} from the configured one; pixels of about "
+        f"{found.x * pixel:.1f} nm instead of {pixel:g} nm would explain the pictures as well: "
+        "check camera.pixel_size_nm",
+    )
 
 
 @dataclass(frozen=True)

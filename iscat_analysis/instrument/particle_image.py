@@ -124,6 +124,12 @@ class ParticleImage:
             return {"focus_nm": self.focus_steps}
         return WEIGHTS[name](self.spot) if name in WEIGHTS else {name: 1.0}
 
+    def stretched(self, factor: float) -> ParticleImage:
+        """Return the picture with pixels of another size."""
+        was = self.grid
+        grid = PixelGrid(factor * was.x_nm, factor * was.y_nm, factor * was.pixel_nm)
+        return replace(self, grid=grid, x_nm=factor * self.x_nm, y_nm=factor * self.y_nm)
+
     def moved(self, private: FloatArray) -> ParticleImage:
         """Return the same pictures with another start."""
         x, y, z, mass, level = (float(v) for v in private)

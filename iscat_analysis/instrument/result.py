@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -116,9 +115,6 @@ def make_pictures(images: Sequence[ParticleImage], build: Build, settings: Setti
         na=float(settings["na"]),
     )
 
-
-_ODD_NA = 0.02  # between the aperture of an objective and what is engraved on it
-_ODD_SIGMAS = 5.0
 
 COLUMNS = ("parameter", "value", "sigma", "crb", "configured", "state")
 """Columns of `OpticsCalibration.parameters`."""
@@ -286,8 +282,9 @@ def make_result(
     measured: Measured,
     pictures: Pictures,
     source: Mapping[str, str],
+    notes: Sequence[str] = (),
 ) -> OpticsCalibration:
-    """Put a result together."""
+    """Put a result together, with what else could not be known."""
     estimate = measured.estimate
     covariance, bound = estimate.covariance, estimate.bound
     told = are_told(np.sqrt(np.diag(covariance)), estimate.errors)
@@ -319,7 +316,7 @@ def make_result(
         pictures=pictures,
         images=len(estimate.images),
         source=source,
-        notes=(*_notes(measured, untold, dropped), *_on_the_pixel(config, configured, measured)),
+        notes=(*_notes(measured, untold, dropped), *notes),
     )
 
 
@@ -378,25 +375,6 @@ def _notes(measured: Measured, untold: Sequence[str], dropped: Sequence[str]) ->
             "the sample's index would tell them apart"
         )
     return tuple(notes)
-
-
-def _on_the_pixel(
-    config: Config, configured: Mapping[str, Any], measured: Measured
-) -> tuple[str, ...]:
-    """Say that a wrong pixel size looks like a wrong aperture, where the aperture is another."""
-    estimate, pixel = measured.estimate, config.camera.pixel_size_nm
-    if "na" not in estimate.names or pixel is None:
-        return ()
-    k = estimate.names.index("na")
-    apart = measured.settings["na"] - configured["na"]
-    if abs(apart) < max(_ODD_NA, _ODD_SIGMAS * math.sqrt(estimate.covariance[k, k])):
-        return ()
-    other = pixel * measured.settings["na"] / configured["na"]
-    return (
-        f"the numerical aperture differs by {apart:+.3f} from the configured one; pixels of about "
-        f"{other:.1f} nm instead of {pixel:g} nm would look much the same: check "
-        "camera.pixel_size_nm",
-    )
 
 
 def _judged(judgement: Judgement) -> dict[str, Any]:

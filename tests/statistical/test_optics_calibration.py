@@ -205,9 +205,14 @@ def test_a_wrong_pixel_size_is_suspected() -> None:
     assert isinstance(found, OpticsCalibration)
     (note,) = [line for line in found.notes if "camera.pixel_size_nm" in line]
     guess = float(note.partition("pixels of about ")[2].split()[0])
-    assert guess == pytest.approx(pixel, rel=0.02)
+    assert guess == pytest.approx(pixel, rel=0.005)
     fine = fit_optics(Collected(said, images), ROUND, {"movie": "m.tif"})
     assert not any("camera.pixel_size_nm" in line for line in fine.notes)
+    # where it is the aperture that is wrong, light beyond the critical angle says so
+    engraved = fit_optics(Collected(configuration(na=1.38), images), ROUND, {"movie": "m.tif"})
+    assert isinstance(engraved, OpticsCalibration)
+    assert engraved.value("na") == pytest.approx(1.42, abs=SIGMAS * engraved.sigma("na"))
+    assert not any("camera.pixel_size_nm" in line for line in engraved.notes)
 
 
 def test_what_the_pictures_do_not_tell_stays_as_configured_with_its_usual_error() -> None:
