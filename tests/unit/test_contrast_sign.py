@@ -10,7 +10,10 @@ import pytest
 
 import iscat_analysis as ia
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.instrument import contrast_sign
 from iscat_analysis.instrument.contrast_sign import wrong_sign
+from iscat_analysis.instrument.fit_optics import Collected, fit_optics
+from iscat_analysis.instrument.result import OpticsCalibration
 
 MASSES = (800.0, 1000.0, 1500.0, 600.0, 1200.0, 2000.0, 900.0, 700.0, 1100.0)
 HEIGHTS = (12.0, 65.0, 120.0, 175.0, 230.0, 285.0, 340.0, 395.0, 50.0)
@@ -84,14 +87,42 @@ def test_heights_of_their_own_tell_the_focus_too(tmp_path: Path) -> None:
     assert np.abs(pulls).max() < 4.0
 
 
-def test_what_the_movie_does_not_tell_is_not_said_to_go_on(flat: Path) -> None:
+def test_what_the_movie_does_not_tell_is_not_said_to_go_on(
+    flat: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The optics may not be learned; or a focus alone is, which describes no particle."""
     wrong = {"optics.focus_nm": -10.0}
     never = _refused(flat, {**wrong, "optics.calibrate": "never"})
     assert "next to no contrast" in never
     assert 'by optics.calibrate = "never" the optics are not learned' in never
+
+    def the_focus_alone(
+        seen: Collected,
+        _movie: Any,
+        _config: Any,
+        _camera: Any,
+        _free: Any,
+        origin: Any,
+        _pool: Any,
+    ) -> OpticsCalibration:
+        return fit_optics(seen, ("focus",), origin)
+
+    monkeypatch.setattr(contrast_sign, "learned_from", the_focus_alone)
     more = _refused(flat, {**wrong, "optics.na": 1.38})
     assert "as where more than the focus is wrong" in more
     assert "describes the brightest particles best, but not well" in more
+
+
+def test_a_wrong_aperture_is_measured_with_the_focus(flat: Path) -> None:
+    """Nine particles tell both: no focus alone describes them, and all of the optics do."""
+    result = ia.fit_movie(flat, config={**SETUP, "optics.focus_nm": -10.0, "optics.na": 1.38})
+    assert "next to no contrast" in " ".join(result.warnings)
+    assert _focus_is(result, -300.0)
+    (na,) = (p for p in result.summary["optics"]["parameters"] if p["parameter"] == "na")
+    assert na["state"] == "measured"
+    assert abs(na["value"] - 1.42) < 4 * na["sigma"] < 0.01
+    pulls = (result.table["mass_kda"] - np.array(MASSES)) / result.table["sigma_mass_kda"]
+    assert np.abs(pulls).max() < 4.0
 
 
 def test_a_wrong_sign_of_the_line_is_told_from_a_wrong_focus(flat: Path) -> None:
