@@ -217,8 +217,9 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
     """
     sizes = table[["mass_kda", "contrast"]].abs()
     mass, contrast = (sizes[name].to_numpy(float) for name in sizes)
+    result = {"contrast": share * contrast} if config.calibration is None else {}
     if not config.fits_sizes or not share:
-        return {"mass_kda": share * mass, "contrast": share * contrast}
+        return {"mass_kda": share * mass, **result}
     known = table[["z_nm", "mass_kda"]].notna().all(axis=1).to_numpy()
     if not known.any():
         return {}
@@ -229,7 +230,7 @@ def _as_a_share(share: float, config: Config, table: pd.DataFrame) -> Mapping[st
         abs(share * respond.to_contrast(z, kda, index=own)) * kda
         for (z, kda), own in zip(places, has_own_index(table)[known].tolist(), strict=True)
     ]
-    return {"mass_kda": out, "contrast": share * contrast}
+    return {"mass_kda": out, **result}
 
 
 def _of_the_selection(

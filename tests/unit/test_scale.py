@@ -303,8 +303,10 @@ def test_the_budget_has_the_camera(
     assert total(gain, 1) == {}  # and nothing is said to be known
     shares = np.hypot.reduce([size for size, _ in expected.values()])
     contrast = abs(float(_event()["contrast"][0]))
-    of_camera = [each for each in found if "camera" in each[0].name]
-    assert total(of_camera, 1)["contrast"] == pytest.approx(shares * contrast)
+    for config in (_config(), _config().model_copy(update={"calibration": None})):
+        whole = contributions(config, _event(), camera=camera)
+        told = total([each for each in whole if "camera" in each[0].name], 1).get("contrast")
+        assert told == (None if config.calibration else pytest.approx(shares * contrast))
     said = {name.removesuffix(" of the camera") if "lin" in name else name: one
             for name, one in lines.items()}  # fmt: skip
     assert {name: (one["sigma_rel"], one["kind"]) for name, one in said.items()} == {

@@ -131,7 +131,7 @@ def test_tables_and_configuration_are_those_of_the_folder(written) -> None:
         assert isinstance(result.view(1), Figure)
         result.close()
         assert result.images(2).contrast.shape  # the movie is opened again
-        assert "mode mass: 4 events: 4 ok; Median mass" in repr(result)
+        assert "mode mass: 4 events: 4 ok; Mass 695 to 1198 kDa" in repr(result)
 
 
 def test_the_movie_is_looked_for_beside_the_folder(written, tmp_path) -> None:
