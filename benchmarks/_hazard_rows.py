@@ -59,7 +59,8 @@ def recorded(standards: Instrument = NOMINAL, relative: float = LINE_SE) -> dict
             "focus_nm": standards.focus_nm, "wavelength_nm": standards.wavelength_nm,
             "na": standards.na,
         },
-        "calibration.camera": {"pixel_size_nm": PIXEL_NM},
+        # the peaks are those of the light, not of light that is averaged in pixels
+        "calibration.camera": {"pixel_size_nm": PIXEL_NM, "samples_per_pixel": "auto"},
     }  # fmt: skip
 
 

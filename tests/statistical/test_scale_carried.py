@@ -25,7 +25,7 @@ def _recorded(focus_nm: float) -> dict[str, Any]:
     return {
         "calibration.optics": {"focus_nm": focus_nm},
         "calibration.height_nm": STANDARDS.height_nm,
-        "calibration.camera": {"pixel_size_nm": 84.0},
+        "calibration.camera": {"pixel_size_nm": 84.0, "samples_per_pixel": "auto"},
     }
 
 
