@@ -100,9 +100,11 @@ class BindingPart:
         rows, fit = found.samples, found.fit
         at = rows[list(CONCENTRATIONS[found.model])].sum(axis=1).to_numpy(float)
         self._points.data = {
-            "x": at, "y": rows["complexes"], "low": rows["complexes_low"],
+            "x": at,
+            "y": rows["complexes"],
+            "low": rows["complexes_low"],
             "high": rows["complexes_high"],
-        }  # fmt: skip
+        }
         self._plot.visible = True
         curve = found.curve
         if len(curve):
@@ -112,10 +114,12 @@ class BindingPart:
             self._curve.data = {"x": at[order], "y": rows["predicted"].to_numpy(float)[order]}
         high = "∞" if math.isinf(fit.kd_high) else f"{fit.kd_high:.4g}"
         said = [
-            (f"K_D = {fit.kd_nm:.4g} nM (95 %: {fit.kd_low:.4g} to {high} nM); "
-             f"p = {fit.p_value:.2g} of the equilibrium",),
+            (
+                f"K_D = {fit.kd_nm:.4g} nM (95 %: {fit.kd_low:.4g} to {high} nM); "
+                f"p = {fit.p_value:.2g} of the equilibrium",
+            ),
             *((f"{note}.",) for note in found.notes),
-        ]  # fmt: skip
+        ]
         cells = [
             (
                 str(row["path"]), f"{total:.4g}", str(row["events"]), f"{row['complexes']:.1%}",

@@ -47,8 +47,9 @@ class Bounds:
             "particle.mass_kda": slider(label="Mass [kDa]", start=10, end=2000, step=5, value=150),
             "particle.height_nm": slider(label="Height [nm]", start=0, end=500, step=5, value=5),
         }  # fmt: skip
-        self._mode = pn.widgets.Select(label="Free", width=150, value="joint",
-                                       options=["mass", "localize", "joint"])  # fmt: skip
+        self._mode = pn.widgets.Select(
+            label="Free", width=150, value="joint", options=["mass", "localize", "joint"]
+        )
         self._image = ColumnDataSource({"image": [np.zeros((_PIXELS, _PIXELS))]})
         self._mapper = LinearColorMapper(palette=gray(256), low=-1, high=1)
         plot = figure(width=380, height=380, tools="", toolbar_location=None,
@@ -82,8 +83,9 @@ class Bounds:
         config, settings = self._config, self._settings()
         self._notice.latest(
             "" if self._seen else "Computing, the first time",
-            lambda: _computed(config, settings), self._show,
-        )  # fmt: skip
+            lambda: _computed(config, settings),
+            self._show,
+        )
 
     def _settings(self) -> dict[str, Any]:
         settings: dict[str, Any] = {key: s.value for key, s in self._sliders.items()}

@@ -41,8 +41,9 @@ class Calibrate:
         self.peaks: list[ContrastPeak] = []
         self.assigned: dict[int, float] = {}  # masses by number of the peak
         self._make_figures()
-        self._standards = pn.widgets.TextInput(label="Masses of the standards [kDa]",
-                                               placeholder="66, 146, 480", width=260)  # fmt: skip
+        self._standards = pn.widgets.TextInput(
+            label="Masses of the standards [kDa]", placeholder="66, 146, 480", width=260
+        )
         fit = pn.widgets.Button(label="Fit the line", color="primary", width=120)
         forget = pn.widgets.Button(label="Take all masses back", width=160)
         self._peak = pn.widgets.Select(label="Peak", width=200)
@@ -100,9 +101,11 @@ class Calibrate:
         """Show the contrasts of the result that is chosen."""
         self._taken.refresh()
         movie, result = self._chosen.movie, self._chosen.result
-        others = [] if movie is None else [
-            entry.path.name for entry in listed(movie.parent) if entry.kind == "movie"
-        ]  # fmt: skip
+        others = (
+            []
+            if movie is None
+            else [entry.path.name for entry in listed(movie.parent) if entry.kind == "movie"]
+        )
         darks = [_NO_DARK, *(name for name in others if movie is None or name != movie.name)]
         if darks != self._dark.options:
             self._dark.options = darks
@@ -170,7 +173,7 @@ class Calibrate:
         texts = [
             f"{k + 1}: {x:.3g} %" + (f", {assigned[k]:g} kDa" if k in assigned else "")
             for k, x in enumerate(places)
-        ]  # fmt: skip
+        ]
         peak = self._peak.value if self._peak.value in range(len(texts)) else None
         self._peak.param.update(
             options={text: k for k, text in enumerate(texts)},

@@ -12,12 +12,7 @@ from bokeh.models import Legend
 from bokeh.plotting import figure
 
 import iscat_analysis as ia
-from iscat_analysis.answers.gates import (
-    MassHistogram,
-    counted_events,
-    counted_rows,
-    mass_histogram,
-)
+from iscat_analysis.answers.gates import MassHistogram, counted_events, counted_rows, mass_histogram
 from iscat_analysis.report.gates import PALETTES
 from iscat_analysis.species.tables import EventTable
 from iscat_app.binding import BindingPart
@@ -46,8 +41,9 @@ class Compare:
         self._chosen, self._queue = chosen, queue
         self._notice = Notice()
         self.samples: list[tuple[str, MassHistogram]] = []
-        self._paths = pn.widgets.MultiSelect(label="Results (Ctrl for several)",
-                                             options=[], size=10, width=430)  # fmt: skip
+        self._paths = pn.widgets.MultiSelect(
+            label="Results (Ctrl for several)", options=[], size=10, width=430
+        )
         self._bin = pn.widgets.FloatInput(
             label="Bar width [kDa]", value=10.0, start=0.01, width=130
         )
@@ -167,8 +163,9 @@ class Compare:
 def _rows(names: list[str], found: list[ia.Comparison]) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
     for name, each in zip(names, found, strict=True):
-        tests = [_said(t.p_value, ".3g") for t in
-                 (each.same, each.same_masses, each.same_fractions)]  # fmt: skip
+        tests = [
+            _said(t.p_value, ".3g") for t in (each.same, each.same_masses, each.same_fractions)
+        ]
         for place, s in enumerate(each.species.to_dict("records")):
             head = (name, *tests) if place == 0 else ("", "", "", "")
             rows.append(

@@ -69,8 +69,8 @@ class Export:
             return make()
 
         return pn.widgets.FileDownload(
-            callback=named, filename=f"histogram.{ending}", label=name, width=240,
-        )  # fmt: skip
+            callback=named, filename=f"histogram.{ending}", label=name, width=240
+        )
 
     def refresh(self) -> None:
         """Show what would be exported."""
@@ -107,9 +107,11 @@ class Export:
                 raise ia.DataError("choose two results or more under Compare")
             return io.BytesIO(figure_bytes(histogram_figure(self._compare.samples, **shape), kind))
         drawn = histogram_figure(
-            [(results.result.folder.stem, results.histogram)], gates=results.gates,
-            curve=results.species_curve(), **shape,
-        )  # fmt: skip
+            [(results.result.folder.stem, results.histogram)],
+            gates=results.gates,
+            curve=results.species_curve(),
+            **shape,
+        )
         return io.BytesIO(figure_bytes(drawn, kind))
 
     def _csv(self) -> io.BytesIO:
@@ -143,8 +145,10 @@ class Export:
         words = ["iscat", "species", str(folder)]
         if rejected and self._results.rejections is not None:
             words[2] = f"{folder.stem}.csv"
-            lines.append(f"# {words[2]} is Events as CSV; {len(rejected)} of these were rejected "
-                         f"by hand: {self._results.rejections.path}")  # fmt: skip
+            lines.append(
+                f"# {words[2]} is Events as CSV; {len(rejected)} of these were rejected "
+                f"by hand: {self._results.rejections.path}"
+            )
             limit = self._limit()
             words += ["--limit", ":".join(f"{kda:.9g}" for kda in limit)] if limit else []
         branch = self._results.counted_branch

@@ -66,10 +66,12 @@ def facts_of(movie: Path) -> list[tuple[str, str]]:
             ("size", f"{frames * rows * columns * stack.dtype.itemsize / _MB:.4g} MB of pixels"),
         ]
         for name, label, unit in (
-            ("pixel_size_nm", "pixel", "nm"), ("exposure_ms", "exposure", "ms"),
-            ("frame_rate_hz", "frame rate", "Hz"), ("wavelength_nm", "wavelength", "nm"),
+            ("pixel_size_nm", "pixel", "nm"),
+            ("exposure_ms", "exposure", "ms"),
+            ("frame_rate_hz", "frame rate", "Hz"),
+            ("wavelength_nm", "wavelength", "nm"),
             ("na", "NA", ""),
-        ):  # fmt: skip
+        ):
             value = getattr(told, name, None)
             if value is not None:
                 facts.append((label, f"{value:.4g} {unit} ({told.source})"))
@@ -102,8 +104,9 @@ class Files:
         # Of many, since a list of one sends its first line where nothing is chosen.
         self._list = pn.widgets.MultiSelect(
             label="Movies (● analysed, ○ not yet), ◆ results, ▸ folders",
-            size=_SHOWN, sizing_mode="stretch_width",
-        )  # fmt: skip
+            size=_SHOWN,
+            sizing_mode="stretch_width",
+        )
         self._facts = pn.pane.HTML("", sizing_mode="stretch_width")
         again = pn.widgets.Button(label="Look again", width=100)
         again.on_click(lambda _: self.refresh())
@@ -116,13 +119,10 @@ class Files:
         self._list.param.watch(self._pick, "value")
         self._drop.param.watch(self._dropped, "value")
         self.body = pn.FlexBox(
-            pn.Column(
-                self._where, in_line(self._filter, again), self._list, self._drop,
-                width=640,
-            ),
+            pn.Column(self._where, in_line(self._filter, again), self._list, self._drop, width=640),
             pn.Column(self._notice.pane, self._facts, width=560),
             sizing_mode="stretch_width",
-        )  # fmt: skip
+        )
 
     def refresh(self) -> None:
         """List the folder as it is now."""
@@ -130,9 +130,10 @@ class Files:
         wanted = self._filter.value.strip().lower()
         with self._notice.told():
             entries = [
-                e for e in listed(self.folder)
+                e
+                for e in listed(self.folder)
                 if e.kind == "folder" or wanted in e.path.name.lower()
-            ]  # fmt: skip
+            ]
             self._entries = {e.label: e for e in entries}
             here = [e.label for e in entries if e.path in (self._chosen.movie, self._chosen.result)]
             self._list.param.update(options=[*self._entries], value=here[:1])

@@ -70,8 +70,9 @@ class Film:
     # ---- what there is to see ---------------------------------------------------------------
 
     def _make_figures(self) -> None:
-        self._picture = ColumnDataSource({"image": [np.zeros((2, 2), np.uint32)], "sent": [0],
-                                          "dw": [1.0], "dh": [1.0]})  # fmt: skip
+        self._picture = ColumnDataSource(
+            {"image": [np.zeros((2, 2), np.uint32)], "sent": [0], "dw": [1.0], "dh": [1.0]}
+        )
         self._rings = ColumnDataSource({"x": [], "y": [], "colour": [], "text": []})
         self._x, self._y = Range1d(0, 1), Range1d(1, 0)
         self._figure = figure(
@@ -326,9 +327,11 @@ class Film:
         digits = max(0, 2 - math.floor(math.log10(unit * span)))
         self.contrast.param.update(
             label="Black and white at " + ("[%]" if unit > 1 else "[counts]"),
-            start=round(unit * (low - span), digits), end=round(unit * (high + span), digits),
-            step=10.0**-digits, value=(round(unit * low, digits), round(unit * high, digits)),
-        )  # fmt: skip
+            start=round(unit * (low - span), digits),
+            end=round(unit * (high + span), digits),
+            step=10.0**-digits,
+            value=(round(unit * low, digits), round(unit * high, digits)),
+        )
 
     def _contrast_changed(self, event: Any) -> None:
         unit = 100.0 if self.kind.value == _RATIO else 1.0

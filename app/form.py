@@ -18,9 +18,7 @@ from iscat_app.chosen import Chosen, Notice
 from iscat_app.preview import DetectionPreview
 from iscat_app.setup_file import config_of, plain, read_texts, toml_text, write_texts
 
-FIRST = (
-    "camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind", "fit.mode",
-)  # fmt: skip
+FIRST = ("camera.pixel_size_nm", "optics.wavelength_nm", "optics.na", "particle.kind", "fit.mode")
 """What matters most, and is asked first."""
 
 _ELSEWHERE = ("simulation", "bounds")  # sections that no analysis of a movie reads
@@ -233,9 +231,7 @@ class Form:
             self._notice.say("Choose a movie under Open.", "error")
             return
         texts = self._texts()
-        answers = {
-            key: _number(texts[key]) for key in FIRST if key in texts and key != "fit.mode"
-        }  # fmt: skip
+        answers = {key: _number(texts[key]) for key in FIRST if key in texts and key != "fit.mode"}
         self._notice.work(
             "Looking at the movie",
             lambda: write_setup(movie, answers=answers, out=path, overwrite=True),

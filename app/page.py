@@ -72,8 +72,9 @@ def page_of(folder: Path, queue: Queue) -> Any:
     places = [pn.Column(sizing_mode="stretch_width") for _ in parts]
     tabs = pn.Tabs(
         *[(part.title, place) for part, place in zip(parts, places, strict=True)],
-        sizing_mode="stretch_width", stylesheets=[_TABS],
-    )  # fmt: skip
+        sizing_mode="stretch_width",
+        stylesheets=[_TABS],
+    )
 
     def show(*_: Any) -> None:
         heading.object = f"<h2>{html.escape(_name_of(chosen))}</h2>"

@@ -71,9 +71,10 @@ class DetectionPreview:
         self._x.end, self._y.start = columns, rows
         self._image.data = {"image": [look.image], "dw": [columns], "dh": [rows]}
         self._rings.data = {
-            "x": found["x_px"] + 0.5, "y": found["y_px"] + 0.5,
+            "x": found["x_px"] + 0.5,
+            "y": found["y_px"] + 0.5,
             "text": [f"{snr:.1f} σ" for snr in found["snr"]],
-        }  # fmt: skip
+        }
         first, stop = look.after
         self._said.object = (
             f"<p>{len(found)} above {look.threshold:.2f} times the noise, in frames {first} to "

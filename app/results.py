@@ -140,8 +140,9 @@ class Results:
         self.flagged = pn.widgets.Checkbox(label="flagged too")
         self.find = pn.widgets.Button(label="Find the species", width=140)
         self.refit = pn.widgets.Button(label="Fit again from the diamonds", width=210)
-        self.begin = pn.widgets.TextInput(label="Species begin at [kDa]", placeholder="66, 146",
-                                          width=300)  # fmt: skip
+        self.begin = pn.widgets.TextInput(
+            label="Species begin at [kDa]", placeholder="66, 146", width=300
+        )
         self.low = pn.widgets.FloatInput(label="Gate from [kDa]", value=0.0, width=100)
         self.high = pn.widgets.FloatInput(label="to [kDa]", value=100.0, width=100)
         add = pn.widgets.Button(label="Add the gate", width=100)
@@ -172,22 +173,21 @@ class Results:
         self.which.param.watch(self._show_event, "value")
         self.body = pn.Column(
             self._notice.pane,
-            in_line(
-                self.bin, self.kernel, self.branch, self.flagged, self.find, self._report,
-            ),
+            in_line(self.bin, self.kernel, self.branch, self.flagged, self.find, self._report),
             pn.FlexBox(
                 pn.Column(
                     pn.pane.Bokeh(self._hist),
                     pn.pane.HTML(_HINT),
                     in_line(self.low, self.high, add, pick, drop),
                     in_line(self.begin, self.refit),
-                    self._gate_table, self._species_table,
+                    self._gate_table,
+                    self._species_table,
                     pn.Row(pn.pane.Bokeh(self._map), pn.pane.Bokeh(self._course)),
                     width=_LEFT_PX,
                 ),
                 pn.Column(self.which, reject, self._facts, self._picture, self.listed, back),
             ),
-        )  # fmt: skip
+        )
 
     # ---- the result -------------------------------------------------------------------------
 
@@ -235,9 +235,11 @@ class Results:
             return
         with self._notice.told():
             counts = counted_rows(
-                self.table, branch=self.counted_branch, ok_only=not self.flagged.value,
+                self.table,
+                branch=self.counted_branch,
+                ok_only=not self.flagged.value,
                 rejected=self.rejected,
-            )  # fmt: skip
+            )
             if not self.table[counts].equals(self._seen):
                 self._seen, self.species, self.start = self.table[counts], None, None
             seen = self.histogram = mass_histogram(

@@ -58,9 +58,11 @@ class Job:
     def command(self) -> str:
         """The command line that does the same."""
         command = {
-            "fit": ["iscat-fit"], "camera": ["iscat", "calibrate", "camera"],
-            "optics": ["iscat", "calibrate", "optics"], "day": ["iscat", "batch"],
-        }  # fmt: skip
+            "fit": ["iscat-fit"],
+            "camera": ["iscat", "calibrate", "camera"],
+            "optics": ["iscat", "calibrate", "optics"],
+            "day": ["iscat", "batch"],
+        }
         words = [*command[self.kind], str(self.movie)]
         words += ["--dark", str(self.dark)] if self.dark else []
         words += ["--config", str(self.config)] if self.config and self.kind != "camera" else []

@@ -21,14 +21,7 @@ from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
 from iscat_cli.benchmark import benchmark
 from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
 from iscat_cli.bounds import bounds
-from iscat_cli.calibrate import (
-    CAMERA_EXAMPLE,
-    MASS_EXAMPLE,
-    OPTICS_EXAMPLE,
-    camera,
-    mass,
-    optics,
-)
+from iscat_cli.calibrate import CAMERA_EXAMPLE, MASS_EXAMPLE, OPTICS_EXAMPLE, camera, mass, optics
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
 from iscat_cli.challenge import MAKE_EXAMPLE, SCORE_EXAMPLE, make, score
 from iscat_cli.challenge import SUMMARY as CHALLENGE_SUMMARY

@@ -108,11 +108,7 @@ def benchmark(
             return
         if out is None:
             raise ConfigError("--out is missing: give the folder that is to be written")
-        from iscat_analysis.study import (
-            check_benchmark_output,
-            run_benchmark,
-            write_benchmark,
-        )
+        from iscat_analysis.study import check_benchmark_output, run_benchmark, write_benchmark
         from iscat_analysis.study.estimators import find_estimator
         from iscat_analysis.study.publish_scores import write_archive
 

@@ -333,9 +333,11 @@ def _optics(
     print_result(found)
     goals = report["goals"]
     found = table(
-        "particles needed for", f"focus ±{goals['focus_nm']:g} nm",
-        f"masses ±{100 * goals['mass_rel']:g} %", "SNR of one",
-    )  # fmt: skip
+        "particles needed for",
+        f"focus ±{goals['focus_nm']:g} nm",
+        f"masses ±{100 * goals['mass_rel']:g} %",
+        "SNR of one",
+    )
     for row in report["needed"]:
         counts = (row[key] for key in ("focus_nm", "mass_rel"))
         found.add_row(

@@ -85,13 +85,17 @@ def _percent(share: float | None) -> str:
 def _detection_table(limit: Mapping[str, Any]) -> Table:
     found = table(
         f"detected but for {100 * limit['miss']:g} %, {100 * limit['false_alarm']:g} % false",
-        "threshold", "SNR", "mass_kda",
-    )  # fmt: skip
+        "threshold",
+        "SNR",
+        "mass_kda",
+    )
     for label, name in (("place known", "known"), ("field searched", "searched")):
         found.add_row(
-            label, short(limit[f"threshold_{name}"]), short(limit[f"snr_{name}"]),
+            label,
+            short(limit[f"threshold_{name}"]),
+            short(limit[f"snr_{name}"]),
             short(limit[f"mass_{name}_kda"]),
-        )  # fmt: skip
+        )
     return found
 
 

@@ -19,13 +19,7 @@ from iscat_cli.console import (
     table,
     with_options,
 )
-from iscat_cli.options import (
-    CalibrationOption,
-    JsonOption,
-    OverwriteOption,
-    command,
-    frame_range,
-)
+from iscat_cli.options import CalibrationOption, JsonOption, OverwriteOption, command, frame_range
 from iscat_cli.tables import AboveOption, LimitOption, SigmaOption, numbers, pair, whole
 
 if TYPE_CHECKING:
@@ -172,9 +166,7 @@ def species(
     draws: Annotated[
         int,
         typer.Option(
-            "--draws",
-            metavar="N",
-            help="Number of simulated repetitions for the intervals.",
+            "--draws", metavar="N", help="Number of simulated repetitions for the intervals."
         ),
     ] = 100,
     seed: Annotated[int, typer.Option("--seed", metavar="N", help="Seed of the repetitions.")] = 1,
@@ -351,8 +343,9 @@ def _monomer(text: str | None) -> float | Literal["auto"] | None:
 
 def _print(found: Distribution) -> None:
     first = "oligomer" if found.ladder is not None else "species"
-    shown = table(first, "mass [kDa]", "95 %", "width", "events", "detected", "came", "fraction",
-                  "95 %")  # fmt: skip
+    shown = table(
+        first, "mass [kDa]", "95 %", "width", "events", "detected", "came", "fraction", "95 %"
+    )
     for number, row in enumerate(found.species.to_dict("records"), start=1):
         if row.get("background"):
             shown.add_row("background", "–", "–", "–", short(row["count"]), "–", "–", "–", "–")

@@ -10,8 +10,8 @@ SigmaOption = Annotated[
     float | None,
     typer.Option(
         "--sigma", metavar="KDA", help="Error of every event, instead of the table's [kDa]."
-    )
-]  # fmt: skip
+    ),
+]
 
 LimitOption = Annotated[
     str | None,
@@ -29,8 +29,8 @@ AboveOption = Annotated[
     float | None,
     typer.Option(
         "--above", metavar="KDA", help="Use events above this mass only, and correct for the cut."
-    )
-]  # fmt: skip
+    ),
+]
 
 
 def numbers(option: str, text: str) -> list[float]:

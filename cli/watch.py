@@ -9,13 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from iscat_cli import INTERRUPTED
-from iscat_cli.batch import (
-    INCOMPLETE,
-    KdMassesOption,
-    KdOption,
-    StandardsOption,
-    print_batch,
-)
+from iscat_cli.batch import INCOMPLETE, KdMassesOption, KdOption, StandardsOption, print_batch
 from iscat_cli.console import Messages, failures, print_json, print_result, with_options
 from iscat_cli.options import (
     CalibrationOption,
@@ -98,10 +92,12 @@ def watch(
 
         if is_movie(folder):
             given = {
-                "--standards": standards, "--kd": kd, "--kd-masses": kd_masses,
+                "--standards": standards,
+                "--kd": kd,
+                "--kd-masses": kd_masses,
                 "--scheduler": None if scheduler == "threads" else scheduler,
                 "--scheduler-file": scheduler_file,
-            }  # fmt: skip
+            }
             _refuse_options_of_folders(folder, given)
             from iscat_analysis.calibration.mass.tables import with_line
 

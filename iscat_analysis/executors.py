@@ -17,13 +17,7 @@ import uuid
 import warnings
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -146,10 +140,7 @@ class LocalExecutor:
             yield number, work(item)
 
     def _two_at_a_time(
-        self,
-        second: SecondProcess,
-        work: Callable[[T], R],
-        waiting: deque[tuple[int, T]],
+        self, second: SecondProcess, work: Callable[[T], R], waiting: deque[tuple[int, T]]
     ) -> Generator[tuple[int, R]]:
         """Do items here and in the second process, until none is left or that process dies.
 

@@ -293,9 +293,10 @@ class Result:
         lines = [
             line
             for name, text in self._facts()
-            for line in textwrap.wrap(f"{name} {text}".strip(), 78, initial_indent="  ",
-                                      subsequent_indent="    ")
-        ]  # fmt: skip
+            for line in textwrap.wrap(
+                f"{name} {text}".strip(), 78, initial_indent="  ", subsequent_indent="    "
+            )
+        ]
         looks = ".view(0), .histogram(), .posterior(0)"
         if self.analysis.tracks is not None:
             looks = ".tracks, .overview(), .view(0), .histogram()"

@@ -87,10 +87,7 @@ class Pictures:
     """
 
     def __init__(
-        self,
-        instrument: Instrument,
-        reach_nm: float = _FARTHEST_NM,
-        pixel_nm: float = 84.0,
+        self, instrument: Instrument, reach_nm: float = _FARTHEST_NM, pixel_nm: float = 84.0
     ) -> None:
         self._inside_nm = pixel_nm / 2 * np.polynomial.legendre.leggauss(2)[0]
         m = instrument

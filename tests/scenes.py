@@ -46,10 +46,7 @@ def make_config(*, calibrated: bool = True, **sections: Mapping[str, Any]) -> Co
 
 def gold(**optics: Any) -> dict[str, dict[str, Any]]:
     """Sections for 60 nm gold, whose contrast is far from weak."""
-    return {
-        "particle": {"kind": "gold", "mass_kda": None, "diameter_nm": 60.0},
-        "optics": optics,
-    }
+    return {"particle": {"kind": "gold", "mass_kda": None, "diameter_nm": 60.0}, "optics": optics}
 
 
 class Stack:

@@ -253,9 +253,11 @@ class Explorer(QWidget):
         layer.border_color = colours or _LANDS
         layer.selected_data = set()
         layer.text = {
-            "string": "{snr:.1f}", "size": 8, "color": "white",
+            "string": "{snr:.1f}",
+            "size": 8,
+            "color": "white",
             "translation": [0.0, -0.75 * _SPOT_PX, 0.0],
-        }  # fmt: skip
+        }
         first, last = look.after
         after = f"frame {first}" if last == first + 1 else f"frames {first}:{last}"
         over = "" if look.before is None else f" over {look.before[0]}:{look.before[1]}"
@@ -301,9 +303,11 @@ class Explorer(QWidget):
             if result is None or not layer.visible or not hasattr(layer, "symbol"):
                 continue
             index = layer.get_value(
-                event.position, view_direction=event.view_direction,
-                dims_displayed=event.dims_displayed, world=True,
-            )  # fmt: skip
+                event.position,
+                view_direction=event.view_direction,
+                dims_displayed=event.dims_displayed,
+                world=True,
+            )
             if index is not None:
                 self.show_event(result, int(layer.features[ROW].iloc[index]))
                 return

@@ -18,10 +18,7 @@ class LazyFrames:
     ndim = 3
 
     def __init__(
-        self,
-        shape: tuple[int, int, int],
-        dtype: Any,
-        frame: Callable[[int], NDArray[Any]],
+        self, shape: tuple[int, int, int], dtype: Any, frame: Callable[[int], NDArray[Any]]
     ) -> None:
         self.shape = shape
         self.dtype = np.dtype(dtype)

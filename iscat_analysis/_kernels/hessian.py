@@ -20,11 +20,7 @@ from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lattice_rows import lattice_fields
 from iscat_analysis._kernels.lens import LATTICE, LatticeLens, Lens, RoundLens
-from iscat_analysis._kernels.quintics import (
-    DISTANCE,
-    evaluate_bends,
-    evaluate_last_slopes,
-)
+from iscat_analysis._kernels.quintics import DISTANCE, evaluate_bends, evaluate_last_slopes
 
 FloatArray = NDArray[np.float64]
 

@@ -32,11 +32,7 @@ from iscat_analysis._kernels.image import Pixels
 from iscat_analysis._kernels.lattice import FAST
 from iscat_analysis._kernels.lines import copy_line
 from iscat_analysis._kernels.place_score import place_score
-from iscat_analysis._kernels.scoring import (
-    CONVERGED,
-    STALLED,
-    scoring_step,
-)
+from iscat_analysis._kernels.scoring import CONVERGED, STALLED, scoring_step
 
 FloatArray = NDArray[np.float64]
 AnyFloatArray = NDArray[np.floating[Any]]
@@ -251,9 +247,11 @@ def _add_signal(
 
 @kernel(fastmath=FAST, _nrt=False)
 def _add_signals(
-    total: NDArray[np.float32], background: NDArray[np.float32], power: float,
+    total: NDArray[np.float32],
+    background: NDArray[np.float32],
+    power: float,
     sums: NDArray[np.float32],
-) -> float:  # fmt: skip
+) -> float:
     """Add w C of a frame to `sums`; return Σ B C.  Both are small: single precision is enough."""
     amount, w = np.float32(0.0), np.float32(power)
     for i in range(sums.shape[0]):

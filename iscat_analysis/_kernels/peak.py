@@ -113,7 +113,6 @@ def largest_signal(
     evaluate(profile, f)
     square = (node / inv_step) ** 2
     linear, quadratic = _parts(
-        at, f[0, 0], f[1, 0], square * f[2, 0], square * f[3, 0], amplitude, rho, circular,
-        analyzer,
-    )  # fmt: skip
+        at, f[0, 0], f[1, 0], square * f[2, 0], square * f[3, 0], amplitude, rho, circular, analyzer
+    )
     return linear, quadratic

@@ -33,11 +33,7 @@ class Pupil:
 
 
 def gauss_legendre(
-    alpha: float,
-    critical: float | None,
-    nodes: int,
-    nodes_above: int,
-    edge: float = 0.0,
+    alpha: float, critical: float | None, nodes: int, nodes_above: int, edge: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Nodes and weights on [0, α], spectrally exact across the critical angle and a mask's edge.
 

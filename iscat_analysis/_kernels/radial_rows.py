@@ -14,12 +14,7 @@ from numpy.typing import NDArray
 
 from iscat_analysis._kernels import kernel
 from iscat_analysis._kernels.lattice import FAST
-from iscat_analysis._kernels.quintics import (
-    DISTANCE,
-    evaluate,
-    evaluate_slopes,
-    padded,
-)
+from iscat_analysis._kernels.quintics import DISTANCE, evaluate, evaluate_slopes, padded
 from iscat_analysis._kernels.whole import whole
 
 if TYPE_CHECKING:
@@ -152,8 +147,8 @@ def radial_strip(
             else:
                 evaluate(profile, f)
                 _add_parts(
-                    lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring, weight, f,
-                )  # fmt: skip
+                    lens.rho, lens.cos_psi, lens.sin_psi, lens.co, lens.cross, lens.ring, weight, f
+                )
     return sums
 
 

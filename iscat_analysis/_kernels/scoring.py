@@ -226,12 +226,7 @@ def blank_profile(axial: AxialTable, lens: Lens, orders: int) -> FloatArray:
 
 @kernel()
 def picture_at(
-    axial: AxialTable,
-    lens: Lens,
-    z_nm: float,
-    start: int,
-    stop: int,
-    profile: FloatArray,
+    axial: AxialTable, lens: Lens, z_nm: float, start: int, stop: int, profile: FloatArray
 ) -> FloatArray:
     """Profile at a height, filled over a range; a stamp has only one, in its table."""
     if len(lens) == STAMP:

@@ -48,7 +48,7 @@ def add_image(total: FloatArray, corner: tuple[int, int], image: FloatArray, sca
 @kernel()
 def times_change(
     ratio: FloatArray, here: Ends, image: FloatArray, inside: Ends, before: float, after: float
-) -> None:  # fmt: skip
+) -> None:
     """Multiply a ratio by (1 + after·image)/(1 + before·image).
 
     Shapes: `ratio` (y, x), `image` (ny, nx).

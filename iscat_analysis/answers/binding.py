@@ -29,13 +29,7 @@ from iscat_analysis.species.describe import LEAST_EFFICIENCY
 from iscat_analysis.species.equilibrium import EquilibriumFit, fit_equilibrium
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mass_action import Model, landing_logits
-from iscat_analysis.species.tables import (
-    EventTable,
-    event_table,
-    mass_in,
-    refuse_far,
-    sentences,
-)
+from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.text import from_table, in_table
 from iscat_analysis.units import count
 

@@ -250,14 +250,16 @@ def comparison_rows(contents: dict[str, Any]) -> pd.DataFrame:
         [
             {
                 "source": one["source"],
-                **{f"p_{key}": one[key]["p_value"] for key in
-                   ("same", "same_masses", "same_fractions")},
+                **{
+                    f"p_{key}": one[key]["p_value"]
+                    for key in ("same", "same_masses", "same_fractions")
+                },
                 **row,
             }
             for one in contents["comparisons"]
             for row in one["species"]
         ]
-    )  # fmt: skip
+    )
 
 
 def _pooled(tables: Sequence[EventTable]) -> Events:

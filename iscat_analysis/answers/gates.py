@@ -123,9 +123,9 @@ def mass_histogram(
     """
     mass = np.abs(np.asarray(masses_kda, dtype=np.float64))
     width = number_in("`bin_kda`", bin_kda, above=0.0)
-    kernel = width if bandwidth_kda is None else number_in(
-        "`bandwidth_kda`", bandwidth_kda, above=0.0
-    )  # fmt: skip
+    kernel = (
+        width if bandwidth_kda is None else number_in("`bandwidth_kda`", bandwidth_kda, above=0.0)
+    )
     reach = 1.1 * float(np.quantile(mass, _REACH)) if mass.size else width
     bars = math.ceil(reach / width) + 1
     if bars > MOST_BARS:

@@ -194,11 +194,7 @@ def _range_of(frames: tuple[int, int]) -> tuple[int, int]:
 
 
 def _unbinding(
-    table: EventTable,
-    inside: BoolArray,
-    stop: int,
-    rate_hz: float,
-    radius_px: float,
+    table: EventTable, inside: BoolArray, stop: int, rate_hz: float, radius_px: float
 ) -> UnbindingRate | None:
     place = np.column_stack([table.x_px, table.y_px])
     rows = np.flatnonzero(inside & np.isfinite(place).all(axis=1))
@@ -222,6 +218,8 @@ def _unbinding(
     if table.efficiency is not None:
         detected = table.efficiency(np.abs(mass))
     return unbinding_rate(
-        (stay[known] - window) / rate_hz, (censor[known] - window) / rate_hz, detected[known],
+        (stay[known] - window) / rate_hz,
+        (censor[known] - window) / rate_hz,
+        detected[known],
         chance_pairs=chance,
-    )  # fmt: skip
+    )

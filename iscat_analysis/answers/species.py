@@ -31,13 +31,7 @@ from iscat_analysis.species.choices import (
     Widths,
 )
 from iscat_analysis.species.describe import Branch
-from iscat_analysis.species.tables import (
-    EventTable,
-    event_table,
-    mass_in,
-    refuse_far,
-    sentences,
-)
+from iscat_analysis.species.tables import EventTable, event_table, mass_in, refuse_far, sentences
 from iscat_analysis.units import count
 
 SPECIES_FILES = frozenset({"species.csv", "species.json", "figures"})

@@ -79,10 +79,7 @@ def detector(config: Config) -> tuple[float, float]:
 
 
 def plan(
-    config: Config,
-    *,
-    model: ForwardModel | None = None,
-    scale: MassScale | None = None,
+    config: Config, *, model: ForwardModel | None = None, scale: MassScale | None = None
 ) -> Experiment:
     """Set up the experiment of ``[bounds]``."""
     at = config.bounds

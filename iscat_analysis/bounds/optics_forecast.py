@@ -308,7 +308,8 @@ def _needed(picture: _Picture, names: Sequence[str], usual: FloatArray) -> dict[
         "mass_kda": picture.mass_kda,
         "snr": picture.snr,
         "identified": least(lambda n: bool(are_told(errors(n)[0], usual)[can].all())),
-        "focus_nm": math.nan if focus is None
+        "focus_nm": math.nan
+        if focus is None
         else least(lambda n: bool(errors(n)[0][focus] <= goals["focus_nm"])),
         "mass_rel": least(lambda n: errors(n)[1] <= goals["mass_rel"]),
-    }  # fmt: skip
+    }

@@ -35,9 +35,11 @@ OPTICS: dict[str, Any] = {
     "emission": "dong2021",
 }  # fmt: skip
 PARTICLE: dict[str, Any] = {
-    "kind": "gold", "permittivity": (-3.7328, 2.7725), "density_kg_m3": 19300.0,
+    "kind": "gold",
+    "permittivity": (-3.7328, 2.7725),
+    "density_kg_m3": 19300.0,
     "diameter_nm": 30.0,
-}  # fmt: skip
+}
 """D21, appendix C."""
 
 COBRI_ATTENUATION = 0.0601
@@ -101,8 +103,12 @@ def paper_config(
     return parse_config(
         {
             "optics": {
-                **OPTICS, "scheme": scheme, "focus_nm": focus_nm, "attenuation": attenuation,
-                "convention": convention, "axial": "refocus" if authors else "stage",
+                **OPTICS,
+                "scheme": scheme,
+                "focus_nm": focus_nm,
+                "attenuation": attenuation,
+                "convention": convention,
+                "axial": "refocus" if authors else "stage",
                 **(optics or {}),
             },
             "camera": {  # the paper samples the light at the centres of pixels
@@ -110,12 +116,10 @@ def paper_config(
                 "samples_per_pixel": 1,
             },
             "particle": {**PARTICLE, "height_nm": z_nm},
-            "bounds": {
-                "pixels": PIXELS, "n_before": 0, "n_after": 1, "photons_per_pixel": 1.0,
-            },
+            "bounds": {"pixels": PIXELS, "n_before": 0, "n_after": 1, "photons_per_pixel": 1.0},
             "fit": {"mode": "joint"},
         }
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,11 @@ def optimize(
     value, smallest = float(grid[best]), float(score[best])
     if 0 < best < grid.size - 1:
         fine = scipy.optimize.minimize_scalar(
-            bound, bounds=(grid[best - 1], grid[best + 1]), method="bounded",
+            bound,
+            bounds=(grid[best - 1], grid[best + 1]),
+            method="bounded",
             options={"xatol": 1e-3 * (grid[best + 1] - grid[best - 1])},
-        )  # fmt: skip
+        )
         if fine.fun < smallest:
             value, smallest = float(fine.x), float(fine.fun)
     here = plan(config).bounds(coarse.free).crb_joint[PARAMETERS.index(parameter)]
@@ -169,8 +171,10 @@ def _effort(config: Config, goal: Goal, name: str, before: Callable[[int], int])
     if one > goal.value:
         root = scipy.optimize.brentq(
             lambda t: bound(max(1, round(math.exp(t)))) / goal.value - 1,
-            0.0, math.log(MAX_FRAMES), xtol=1e-3,
-        )  # fmt: skip
+            0.0,
+            math.log(MAX_FRAMES),
+            xtol=1e-3,
+        )
         frames = max(1, round(math.exp(root)))
         step = max(1, round(frames * 1e-4))
         while bound(frames) > goal.value:

@@ -94,9 +94,7 @@ class PupilOptimum:
                 }
                 for name in self.chosen
             },
-            "sum": {
-                "configured": self.sum_configured, "best": self.sum, "holevo": self.holevo,
-            },
+            "sum": {"configured": self.sum_configured, "best": self.sum, "holevo": self.holevo},
             "share": {
                 "configured": self.share_configured,
                 "best": self.share,
@@ -105,7 +103,7 @@ class PupilOptimum:
             "descents": list(self.descents),
             "near": sum(share > 0.99 * self.descents[0] for share in self.descents),
             "evaluations": self.evaluations,
-        }  # fmt: skip
+        }
 
 
 def optimize_pupil(

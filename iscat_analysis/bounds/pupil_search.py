@@ -130,13 +130,15 @@ class Search:
         low, high = np.array([self.range(key)[1] for key in keys]).T
         found = scipy.optimize.minimize(
             lambda point: self.value(self.decode(keys, point))[0],
-            np.clip(start, low, high), bounds=list(zip(low, high, strict=True)), method="COBYQA",
+            np.clip(start, low, high),
+            bounds=list(zip(low, high, strict=True)),
+            method="COBYQA",
             options={
                 "maxfev": BUDGET * len(keys),
                 "initial_tr_radius": RADII[0],
                 "final_tr_radius": RADII[1],
             },
-        )  # fmt: skip
+        )
         return self.value(self.decode(keys, found.x))
 
     def simplified(self, best: Optics) -> tuple[float, Optics]:
@@ -179,10 +181,7 @@ class Search:
         optics, height = self.config.optics, self.config.particle.nominal_height_nm
         wave = optics.wavelength_nm / _WAVES
         if key == "focus_nm":
-            return (
-                lambda v: (v - height) / _UNIT_FOCUS_NM,
-                lambda u: height + _UNIT_FOCUS_NM * u,
-            )
+            return (lambda v: (v - height) / _UNIT_FOCUS_NM, lambda u: height + _UNIT_FOCUS_NM * u)
         if key == "reference_phase_deg":
             return math.radians, lambda u: math.degrees(math.remainder(u, 2 * math.pi))
         if key == "attenuation":

@@ -78,10 +78,7 @@ def _pixelated(config: Config, value: float) -> Mapping[str, Mapping[str, Any]]:
         photons *= (value / old) ** 2
     return {
         "camera": {"pixel_size_nm": value},
-        "bounds": {
-            "pixels": round(side / value) if value > 0 else 0,
-            "photons_per_pixel": photons,
-        },
+        "bounds": {"pixels": round(side / value) if value > 0 else 0, "photons_per_pixel": photons},
     }
 
 

@@ -108,9 +108,9 @@ def find_fringes(changes: Changes, window: int, highest: int) -> Fringes:
         for k in range(_MOST_AMPLITUDE_DEGREE + 1)
         if not k or len(waves) * (k + 1) * (k + 2) <= room
     )
-    squares = np.array([
-        _explained(change, light, Fringes(waves, k), smooth_degree)[0] for k in range(most + 1)
-    ])  # fmt: skip
+    squares = np.array(
+        [_explained(change, light, Fringes(waves, k), smooth_degree)[0] for k in range(most + 1)]
+    )
     degree = int(np.flatnonzero(squares > squares.max() - least).min())
     return Fringes(waves / side, degree, math.sqrt(max(squares[degree], 0.0) * changes.error))
 

@@ -139,11 +139,13 @@ def with_camera(
     optics, pixel_nm = config.optics, config.camera.pixel_size_nm or math.inf
     resolved = pixel_nm < _RESOLVED_PIXEL * optics.wavelength_nm / optics.na
     learned = learn_camera(
-        movie if text is None else patched(movie, text), config.camera, span,
+        movie if text is None else patched(movie, text),
+        config.camera,
+        span,
         additive=optics.scheme == "darkfield",
         moving=config.fit.mode == "track" and resolved,
         metadata=movie.metadata,
-    )  # fmt: skip
+    )
     if learned.refusal:
         raise DataError(f"{movie.name}: {learned.refusal}")
     if text is not None:
@@ -196,12 +198,7 @@ class _Learning:
     """The numbers of a camera while they are being measured."""
 
     def __init__(
-        self,
-        camera: Camera,
-        free: set[str],
-        counts: NDArray[Any],
-        additive: bool,
-        moving: bool,
+        self, camera: Camera, free: set[str], counts: NDArray[Any], additive: bool, moving: bool
     ) -> None:
         self.camera, self.free, self.counts = camera, free, counts
         self.additive, self.moving = additive, moving
@@ -391,8 +388,9 @@ class _Learning:
     def _mind_zero(self) -> None:
         """Refuse counts without a true zero, where neither offset nor gain is known otherwise."""
         if self._source["offset_adu"] != ASSUMPTION or self._source["gain_e_per_adu"] not in (
-            MEASURED, EFFECTIVE,
-        ):  # fmt: skip
+            MEASURED,
+            EFFECTIVE,
+        ):
             return
         law = self.law
         if law is not None and law.below_nothing:

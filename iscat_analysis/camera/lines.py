@@ -185,9 +185,7 @@ class SteadyFrames:
 
 
 def find_lines(
-    counts: NDArray[Any],
-    camera: Camera,
-    surface: Surface | None = None,
+    counts: NDArray[Any], camera: Camera, surface: Surface | None = None
 ) -> Lines | None:
     """Find rows and columns that flicker.
 

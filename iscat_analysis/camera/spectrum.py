@@ -136,10 +136,7 @@ class NoiseSpectrum:
 
 
 def measure_spectrum(
-    counts: NDArray[Any],
-    camera: Camera,
-    *,
-    masked: BoolArray | None = None,
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
 ) -> NoiseSpectrum | None:
     """Measure the noise between neighbouring frames.
 

@@ -144,8 +144,7 @@ class Fit(Section):
         description="fit two equal halves to every particle, and give extended ones their mass",
     )
     index: bool = Field(
-        False,
-        description="mode size: fit the refractive index too, where the picture tells it",
+        False, description="mode size: fit the refractive index too, where the picture tells it"
     )
     z_range_nm: tuple[
         Annotated[NonNegative, length(0.0, LARGEST_NM)],
@@ -255,6 +254,5 @@ class Compute(Section):
         1000, description="for the pixel data held at once"
     )
     seed: Annotated[int, Field(ge=0)] = Field(
-        1,
-        description="of random numbers: posteriors, injected particles, resampled species",
+        1, description="of random numbers: posteriors, injected particles, resampled species"
     )

@@ -126,8 +126,7 @@ class Optics(FieldTerms):
         "stage", description='fixed in derivatives along z: "stage" | "refocus": the focus follows'
     )
     emission: Literal["reciprocal", "dong2021"] = Field(
-        "reciprocal",
-        description='"reciprocal" (conserves energy) | "dong2021" (as in the paper)',
+        "reciprocal", description='"reciprocal" (conserves energy) | "dong2021" (as in the paper)'
     )
     psf: Literal["model", "measured"] = Field(
         "model", description='"model" | "measured" (the image in template; mode mass only)'
@@ -258,12 +257,10 @@ class CameraConfig(Section):
         "flicker and noise of the pixels",
     )
     read_noise_e: NonNegative | str = Field(
-        AUTO,
-        description='read noise, standard deviation per frame: a number, a map, or "auto"',
+        AUTO, description='read noise, standard deviation per frame: a number, a map, or "auto"'
     )
     response: str | None = Field(
-        None,
-        description="CSV file of counts and photoelectrons, for a camera that is not linear",
+        None, description="CSV file of counts and photoelectrons, for a camera that is not linear"
     )
     well_depth_e: Positive | None = Field(
         None, description="full well: counts at or above it are flagged as saturated"
@@ -320,8 +317,7 @@ class Particle(Section):
         None, description="angle between a rod and the optical axis; for model rod"
     )
     density_kg_m3: Positive | None = Field(
-        None,
-        description="replaces that of the kind; for model shell, of core and shell together",
+        None, description="replaces that of the kind; for model shell, of core and shell together"
     )
     mass_kda: Positive | None = Field(
         None, description="start value, and the true mass in a simulation"
@@ -482,9 +478,11 @@ class Particle(Section):
             Without a prior of heights.
         """
         update = {
-            "height_nm": height_nm, "linker_nm": 0.0, "height_sd_nm": 0.0,
+            "height_nm": height_nm,
+            "linker_nm": 0.0,
+            "height_sd_nm": 0.0,
             "learned_height_nm": None,
-        }  # fmt: skip
+        }
         return self.model_copy(update=update)
 
     @property

@@ -300,7 +300,7 @@ def index_refusal(config: Config) -> str:
         (f'fit.mode = "{mode}": use "size"', mode != "size"),
         (f'particle.model = "{particle.model}": use "mie"', particle.model != "mie"),
         ("a material that absorbs, which has two numbers", absorbs or particle.kind == "gold"),
-    ):  # fmt: skip
+    ):
         if is_set:
             return key
     return ""
@@ -335,9 +335,10 @@ def sphere_refusal(config: Config) -> str:
     diameter = particle.nominal_diameter_nm
     if max(diameter, fit.diameter_range_nm[1]) > fit.roi_nm:
         what = (
-            f"particle.diameter_nm = {diameter:.4g}" if diameter > fit.roi_nm
+            f"particle.diameter_nm = {diameter:.4g}"
+            if diameter > fit.roi_nm
             else f"fit.diameter_range_nm = {list(fit.diameter_range_nm)}"
-        )  # fmt: skip
+        )
         return (
             f"{what} is larger than the square that is fitted, fit.roi_nm = {fit.roi_nm:g}: give "
             "the diameter in nanometres, or a larger square"
@@ -357,9 +358,9 @@ def sphere_refusal(config: Config) -> str:
             f'{diameter:.4g} nm, which would reach into the coverslip: set height_nm = "contact"'
         )
     for number, event in enumerate(config.simulation.events):
-        radius = sphere_diameter_nm(
-            event.mass_kda or particle.nominal_mass_kda, particle.density
-        ) / 2  # fmt: skip
+        radius = (
+            sphere_diameter_nm(event.mass_kda or particle.nominal_mass_kda, particle.density) / 2
+        )
         if event.z_nm is not None and event.z_nm < radius * (1 - 1e-9):
             return (
                 f"simulation.events[{number}].z_nm = {event.z_nm:g} is less than the radius of a "

@@ -6,14 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from iscat_analysis.config.values import (
-    LARGEST_NM,
-    Finite,
-    NonNegative,
-    Positive,
-    Section,
-    length,
-)
+from iscat_analysis.config.values import LARGEST_NM, Finite, NonNegative, Positive, Section, length
 
 MOST_FRAMES = 10_000_000
 """Longest simulated movie; particles that move have positions in all of its frames."""

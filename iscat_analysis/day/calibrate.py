@@ -107,11 +107,7 @@ def _camera(plan: Plan, runner: Runner) -> tuple[dict[str, Any], dict[str, Outco
 
     def work() -> dict[str, Any]:
         camera_calibration(
-            list(paths.values()),
-            out,
-            offset_adu=offset,
-            overwrite=True,
-            progress=runner.progress,
+            list(paths.values()), out, offset_adu=offset, overwrite=True, progress=runner.progress
         )
         return {"inputs": {name: {"sha256": sha256_of(path)} for name, path in paths.items()}}
 

@@ -28,9 +28,7 @@ from iscat_analysis.text import printable
 ROLES = ("sample", "calibrant", "blank", "flat")
 """What a movie is for."""
 
-COLUMNS = (
-    "path", "sample", "condition", "concentration_nm", "replicate", "role", "standards",
-)  # fmt: skip
+COLUMNS = ("path", "sample", "condition", "concentration_nm", "replicate", "role", "standards")
 """The columns that have a meaning; others are kept, or set keys of the configuration."""
 
 TABLES = ("samples.csv", "samples.toml")

@@ -202,9 +202,11 @@ def scale_warning(scale: MassScale) -> str:
     line = scale.calibration
     if line is None or (not scale.refusal and abs(scale.carried - 1) < _LEAST_SCALE_CHANGE):
         return ""
-    whose = "the configured optics, at which its gradient is taken" if line.optics_assumed else (
-        "the optics of its standards"
-    )  # fmt: skip
+    whose = (
+        "the configured optics, at which its gradient is taken"
+        if line.optics_assumed
+        else ("the optics of its standards")
+    )
     if scale.refusal:
         return (
             f"the scale of masses does not hold here: it belongs to {whose}, and {scale.refusal}; "

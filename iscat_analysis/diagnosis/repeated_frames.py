@@ -61,10 +61,9 @@ class KeptFrames:
             context=replace(found.context, config=own),
             fits=found.fits.assign(frame=frame),
             compared=replace(
-                compared, frames_before=spans[0], frames_after=spans[1],
-                power=np.concatenate(power),
+                compared, frames_before=spans[0], frames_after=spans[1], power=np.concatenate(power)
             ),
-        )  # fmt: skip
+        )
 
 
 def without_repeats(movie: Stack, config: Config, camera: Camera) -> KeptFrames:

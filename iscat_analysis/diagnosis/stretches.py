@@ -279,10 +279,12 @@ def _sudden(movie: Stack, start: int, stop: int) -> int | None:
     frames = _cells(movie, start, stop, each=True)
     frames /= frames.mean(axis=(1, 2), keepdims=True)
     whole = float(np.sum((frames[-_READ:].mean(axis=0) - frames[:_READ].mean(axis=0)) ** 2))
-    sizes = np.array([
-        np.sum((frames[k : k + _READ].mean(axis=0) - frames[k - _READ : k].mean(axis=0)) ** 2)
-        for k in range(_READ, len(frames) - _READ + 1)
-    ])  # fmt: skip
+    sizes = np.array(
+        [
+            np.sum((frames[k : k + _READ].mean(axis=0) - frames[k - _READ : k].mean(axis=0)) ** 2)
+            for k in range(_READ, len(frames) - _READ + 1)
+        ]
+    )
     if not sizes.size or whole <= 0:
         return None
     # of the four frames on either side none has a part of the change, if it is sudden

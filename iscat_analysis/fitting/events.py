@@ -92,9 +92,11 @@ def fit_flags(
         windows.saturated, fit.x_nm, fit.y_nm, context.pixel_nm, corner=corner
     )
     possible = (
-        (sidelobe, Status.SIDELOBE), (saturated, Status.SATURATED),
-        (too_close, Status.TOO_CLOSE), (changing, Status.CHANGING),
-    )  # fmt: skip
+        (sidelobe, Status.SIDELOBE),
+        (saturated, Status.SATURATED),
+        (too_close, Status.TOO_CLOSE),
+        (changing, Status.CHANGING),
+    )
     return verdict([*fit.flags, *(flag for true, flag in possible if true)])[1]
 
 

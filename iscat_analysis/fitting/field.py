@@ -286,8 +286,7 @@ def search_field(
     doubtful: list[Candidate] = []
     for candidate in found:
         size = max(
-            (_misfit(candidate, event, context, near, explains) for event in events),
-            default=0.0,
+            (_misfit(candidate, event, context, near, explains) for event in events), default=0.0
         )
         size = max(size, EXCEEDS * candidate.beside)
         if abs(candidate.snr) > size:
@@ -423,9 +422,10 @@ def _without_doubles(events: Sequence[Fitted], context: AnalysisContext) -> list
         here = event.candidate
         if all(
             math.hypot(here.x_px - k.candidate.x_px, here.y_px - k.candidate.y_px)
-            * context.pixel_nm > min(_DUPLICATE_PX * context.pixel_nm, 150.0)
+            * context.pixel_nm
+            > min(_DUPLICATE_PX * context.pixel_nm, 150.0)
             for k in kept
-        ):  # fmt: skip
+        ):
             kept.append(event)
     return kept
 

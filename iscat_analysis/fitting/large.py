@@ -27,11 +27,7 @@ BRIGHT_SNR = 50.0
 
 
 def with_spheres(
-    context: AnalysisContext,
-    events: Sequence[AnyFitted],
-    pool: ThreadPoolExecutor,
-    *,
-    level: bool,
+    context: AnalysisContext, events: Sequence[AnyFitted], pool: ThreadPoolExecutor, *, level: bool
 ) -> list[AnyFitted]:
     """Fit spheres where dipoles fail.
 

@@ -132,9 +132,9 @@ class MovingPattern:
         y, x = self.at(frame)
         my, mx, yy, yx, xx = self._moments(frames)
         first = np.array([my - y, mx - x])
-        return first, np.array([
-            yy - 2 * my * y + y * y, yx - my * x - mx * y + x * y, xx - 2 * mx * x + x * x,
-        ])  # fmt: skip
+        return first, np.array(
+            [yy - 2 * my * y + y * y, yx - my * x - mx * y + x * y, xx - 2 * mx * x + x * x]
+        )
 
     def span(self, before: slice, after: slice) -> slice:
         """Frames, relative to the chunk, whose light makes the pattern of two windows."""

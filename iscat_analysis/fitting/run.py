@@ -55,7 +55,8 @@ class Run:
         """Load or compile the kernels of fits."""
         config = context.config
         parts = parts_of(
-            FREE_PARAMETERS[context.mode], heights=has_prior(config),
+            FREE_PARAMETERS[context.mode],
+            heights=has_prior(config),
             posteriors=config.samples_posterior,
-        )  # fmt: skip
+        )
         compile_kernels(context.model, parts)

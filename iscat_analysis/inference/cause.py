@@ -66,15 +66,17 @@ _SIGMAS = 4.0  # standard errors of χ², by which they must too
 
 _OTHERS: Mapping[str, Mapping[str, Any]] = {
     "polarisation, as if circular light passed an analyser": {
-        "polarization": "circular", "analyzer": True,
+        "polarization": "circular",
+        "analyzer": True,
     },
     "polarisation, as if linear light reached the camera without an analyser": {
-        "polarization": "linear", "analyzer": False,
+        "polarization": "linear",
+        "analyzer": False,
     },
     "mask in the pupil": {"mask_na": 0.6, "attenuation": 0.3},
     'emission, as if it were "dong2021"': {"emission": "dong2021"},
     'emission, as if it were "reciprocal"': {"emission": "reciprocal"},
-}  # fmt: skip
+}
 _TURNED = "polarisation, as if turned by 90° (or the movie transposed)"
 _UNITS = {
     "focus": "nm", _PHASE: "degrees", "spherical aberration": "nm rms",

@@ -133,10 +133,12 @@ def common_sizes(
     """
     masses = scanned_masses(model, *model.mass_range_kda)
     heights = scanned_heights(model, *z_range_nm)
-    scans = np.array([
-        scan_sizes(likelihood, model, np.array([*place, 0.0, 0.0]), masses, heights)
-        for likelihood, place in zip(likelihoods, places, strict=True)
-    ])  # fmt: skip
+    scans = np.array(
+        [
+            scan_sizes(likelihood, model, np.array([*place, 0.0, 0.0]), masses, heights)
+            for likelihood, place in zip(likelihoods, places, strict=True)
+        ]
+    )
     found: list[CommonSize] = []
     for (k,) in highest_maxima(scans.max(axis=2).sum(axis=0), FOLLOWED):
         starts = [

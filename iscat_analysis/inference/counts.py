@@ -11,12 +11,7 @@ from iscat_analysis.camera.background import smooth_background
 from iscat_analysis.inference.checks import BoolArray, FloatArray, mask_of, pixels_of
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
-from iscat_analysis.inference.noise_models import (
-    CONDITIONAL,
-    NOISE_MODELS,
-    POISSON,
-    NoiseModel,
-)
+from iscat_analysis.inference.noise_models import CONDITIONAL, NOISE_MODELS, POISSON, NoiseModel
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid
 
 KNOWN, MEAN, MEDIAN = 0.0, 1.0, math.pi / 2

@@ -15,12 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from iscat_analysis.inference.common_size import (
-    UNDETERMINED,
-    CommonSize,
-    fit_common_size,
-    slopes,
-)
+from iscat_analysis.inference.common_size import UNDETERMINED, CommonSize, fit_common_size, slopes
 from iscat_analysis.inference.fit import AMPLITUDE, fit_particle
 from iscat_analysis.inference.likelihood import LEVEL, Likelihood
 from iscat_analysis.inference.sizes import OTHER_SIZE, SURE_ODDS

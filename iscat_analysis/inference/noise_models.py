@@ -297,9 +297,7 @@ class Poisson(NoiseModel):
 
 CONDITIONAL, POISSON = Conditional(), Poisson()
 
-NOISE_MODELS: Mapping[str, NoiseModel] = {
-    model.name: model for model in (CONDITIONAL, POISSON)
-}  # fmt: skip
+NOISE_MODELS: Mapping[str, NoiseModel] = {model.name: model for model in (CONDITIONAL, POISSON)}
 """Every noise model, by the name that ``fit.likelihood`` gives it."""
 
 

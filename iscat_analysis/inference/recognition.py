@@ -200,8 +200,10 @@ def _centred(likelihood: Likelihood, theta: FloatArray) -> FloatArray:
         weight = np.where(near, energy, 0.0)
         if not weight.any():
             return theta
-        x, y = (float(np.average(axis, weights=weight.sum(over)))
-                for axis, over in ((grid.x_nm, 0), (grid.y_nm, 1)))  # fmt: skip
+        x, y = (
+            float(np.average(axis, weights=weight.sum(over)))
+            for axis, over in ((grid.x_nm, 0), (grid.y_nm, 1))
+        )
     moved = theta.copy()
     moved[:2] = x, y
     beside = math.hypot(x - theta[0], y - theta[1]) > _BESIDE_NM

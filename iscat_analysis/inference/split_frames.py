@@ -126,9 +126,11 @@ def series_of(
     values -= np.sum(seen * offset, axis=(1, 2))[:, None]
     squared = flat**2
     return Series(
-        values, power[lit], squared @ np.maximum(mean_e, 0.0).ravel(),
+        values,
+        power[lit],
+        squared @ np.maximum(mean_e, 0.0).ravel(),
         squared @ read_variance_e2.ravel(),
-    )  # fmt: skip
+    )
 
 
 def repeats_of(windows: tuple[Series, ...], longer: tuple[Series, ...] | None = None) -> FloatArray:

@@ -97,12 +97,7 @@ def kind_of(config: Config) -> str:
 
 
 def landing_particle_images(
-    reader: Reader,
-    window: int,
-    config: Config,
-    pool: ThreadPoolExecutor,
-    rings: bool,
-    whole: bool,
+    reader: Reader, window: int, config: Config, pool: ThreadPoolExecutor, rings: bool, whole: bool
 ) -> tuple[list[ParticleImage], list[ParticleImage]]:
     """Find bright steps of a landing movie, chunk by chunk until there are enough."""
     stride = stride_of(window)
@@ -167,12 +162,14 @@ def _in_field(steps: Iterable[BrightStep], tile: Tile) -> list[BrightStep]:
     y, x = tile.corner
     moved = [
         replace(
-            step, y_px=step.y_px + y, x_px=step.x_px + x,
+            step,
+            y_px=step.y_px + y,
+            x_px=step.x_px + x,
             rows=(step.rows[0] + y, step.rows[1] + y),
             columns=(step.columns[0] + x, step.columns[1] + x),
         )
         for step in steps
-    ]  # fmt: skip
+    ]
     return [step for step in moved if tile.holds(np.array(step.y_px), np.array(step.x_px))]
 
 

@@ -22,13 +22,7 @@ from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.instrument.collect import bright_particle_images
 from iscat_analysis.instrument.fit_optics import Collected, fit_optics, misfit_of, none_bright
-from iscat_analysis.instrument.learning import (
-    NOISE,
-    adopted,
-    learned_from,
-    noise_differs,
-    why_not,
-)
+from iscat_analysis.instrument.learning import NOISE, adopted, learned_from, noise_differs, why_not
 from iscat_analysis.instrument.loop import accepted
 from iscat_analysis.instrument.microscope import (
     REJECTED_P,

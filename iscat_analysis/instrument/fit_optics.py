@@ -86,8 +86,10 @@ def fit_optics(
     begun = _likeliest(start, groups, mapper)
     other = _fitted(
         replace(seen, images=begun.images, others=begun.others, near=begun.settings),
-        groups, origin, mapper,
-    )  # fmt: skip
+        groups,
+        origin,
+        mapper,
+    )
     return min(found, other, key=lambda one: (not one.accepted, misfit_of(one)))
 
 

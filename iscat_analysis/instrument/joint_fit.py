@@ -26,12 +26,7 @@ from iscat_analysis.instrument.particle_image import (
     models_of,
     with_masses,
 )
-from iscat_analysis.optics.parameters import (
-    MASK_NA,
-    PARAMETERS,
-    Prior,
-    Settings,
-)
+from iscat_analysis.optics.parameters import MASK_NA, PARAMETERS, Prior, Settings
 from iscat_analysis.records import FloatArray, Mapper
 
 _PLACE_STEP_NM = 60.0

@@ -320,7 +320,7 @@ def calibrate_movie(
             "sha256": movie.sha256(),
             "kind": kind_of(config) if focus_step_nm is None else "scan of the focus",
             "version": version("iscat-analysis"),
-        }  # fmt: skip
+        }
         found = learned_from(seen, movie, config, camera, groups, origin, pool)
     return replace(found, config=ready.with_frames_asked(found.config))
 

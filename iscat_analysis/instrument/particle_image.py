@@ -263,13 +263,15 @@ def _average(images: Sequence[ParticleImage]) -> tuple[ParticleImage, list[Parti
     """Average pictures of one focus; their places are those of the average's centre."""
     contrasts, variances = zip(*(contrast_of(image) for image in images), strict=True)
     pixel = images[0].grid.pixel_nm
-    shifts = np.array([
-        (
-            (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
-            (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
-        )
-        for image in images
-    ])  # fmt: skip
+    shifts = np.array(
+        [
+            (
+                (image.y_nm - float(np.mean(image.grid.y_nm))) / pixel,
+                (image.x_nm - float(np.mean(image.grid.x_nm))) / pixel,
+            )
+            for image in images
+        ]
+    )
     template = ndimage.shift(contrasts[0], -shifts[0], order=3, mode="nearest")
     variance = np.full(template.shape, float(np.median(variances[0])))
     for _ in range(_ROUNDS if len(images) > 1 else 0):
@@ -288,9 +290,8 @@ def _average(images: Sequence[ParticleImage]) -> tuple[ParticleImage, list[Parti
     data[1] = counts + data[0]
     grid = PixelGrid.centred(template.shape[0], pixel)
     average = ParticleImage(
-        grid, CONDITIONAL, data, 0.0, 0.0, images[0].z_nm,
-        focus_steps=images[0].focus_steps,
-    )  # fmt: skip
+        grid, CONDITIONAL, data, 0.0, 0.0, images[0].z_nm, focus_steps=images[0].focus_steps
+    )
     placed = [
         replace(
             image,

@@ -31,12 +31,7 @@ from iscat_analysis.instrument.joint_fit import asked_changes, excess
 from iscat_analysis.instrument.measure import TWIN_GAP
 from iscat_analysis.instrument.particle_image import Build, ParticleImage
 from iscat_analysis.optics.field_map import BASES
-from iscat_analysis.optics.parameters import (
-    FREE,
-    Prior,
-    Settings,
-    free_names,
-)
+from iscat_analysis.optics.parameters import FREE, Prior, Settings, free_names
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.trust.systematic import REJECTED_SHARE
 
@@ -94,9 +89,11 @@ def score_test(
         bases = tuple(dict.fromkeys(base for name in names for base in BASES.get(name, (name,))))
         asked = asked_changes(images, build, settings, bases, mapper)
         slopes = np.array(
-            [[[image.slopes(name).get(base, 0.0) for base in bases] for name in names]
-             for image in images]
-        )  # fmt: skip
+            [
+                [[image.slopes(name).get(base, 0.0) for base in bases] for name in names]
+                for image in images
+            ]
+        )
         score = np.einsum("nik,nk->ni", slopes, asked.score) * usual
         information = np.einsum("nik,nkl,njl->nij", slopes, asked.information, slopes)
         information *= np.outer(usual, usual)
@@ -108,10 +105,12 @@ def score_test(
     total, asks = total / widened, asks / widened
     spread = np.linalg.inv(np.eye(size) + total)
     change = spread @ asks
-    gains, explains = np.transpose([
-        _alternative(total[np.ix_(free, free)], asks[free])
-        for free in (*np.arange(size)[:, None], np.arange(size))
-    ])  # fmt: skip
+    gains, explains = np.transpose(
+        [
+            _alternative(total[np.ix_(free, free)], asks[free])
+            for free in (*np.arange(size)[:, None], np.arange(size))
+        ]
+    )
     gain = float(logsumexp(gains)) - math.log(len(gains))
     power = math.fsum(image.snr**2 for image in images)
     explained = float(expit(gain)) * explains[np.argmax(gains)]

@@ -27,13 +27,7 @@ from iscat_analysis.instrument.particle_image import (
     best_amplitudes,
     contrast_of,
 )
-from iscat_analysis.optics.parameters import (
-    PRIMARY,
-    SECONDARY,
-    Prior,
-    Settings,
-    free_names,
-)
+from iscat_analysis.optics.parameters import PRIMARY, SECONDARY, Prior, Settings, free_names
 from iscat_analysis.records import FloatArray, Mapper
 
 FOCUS_RANGE_NM = 1000.0
@@ -142,9 +136,9 @@ def _best_phase(
     amplitude, phase = np.hypot(*linear), np.arctan2(linear[1], linear[0])
     if amplitude.max() ** 4 * gram[2, 2] < _FAINT * explained.max():
         return amplitude, phase, explained
-    turns = np.concatenate([
-        np.pi * np.arange(_TURNS)[:, None, None] / _TURNS * np.ones_like(phase), phase[None]
-    ])  # fmt: skip
+    turns = np.concatenate(
+        [np.pi * np.arange(_TURNS)[:, None, None] / _TURNS * np.ones_like(phase), phase[None]]
+    )
     way = np.stack([np.cos(turns), np.sin(turns)])
     tried, gained = best_amplitudes(
         np.einsum("itab,iab->tab", way, overlaps[:2]),

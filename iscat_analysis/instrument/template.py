@@ -31,11 +31,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
 from iscat_analysis.instrument.microscope import reach_nm, refuse_uncalibratable
-from iscat_analysis.instrument.particle_image import (
-    ParticleImage,
-    place_particle_images,
-    signal_of,
-)
+from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images, signal_of
 from iscat_analysis.movie.stack import Stack
 from iscat_analysis.optics.forward import (
     ForwardModel,

@@ -36,13 +36,7 @@ from iscat_analysis.optics.field_map import (
     centre_of,
     changes_at,
 )
-from iscat_analysis.optics.parameters import (
-    FREE,
-    Settings,
-    free_names,
-    is_usual,
-    prior_of,
-)
+from iscat_analysis.optics.parameters import FREE, Settings, free_names, is_usual, prior_of
 from iscat_analysis.records import FloatArray, Mapper
 
 KINDS: Mapping[str, tuple[str, ...]] = {
@@ -133,9 +127,10 @@ class FieldOfView:
         return [
             image
             for image in images
-            if not any(abs(frame - image.step) < 2 * abs(image.shown - image.step)
-                       for frame in self.jumps)
-        ]  # fmt: skip
+            if not any(
+                abs(frame - image.step) < 2 * abs(image.shown - image.step) for frame in self.jumps
+            )
+        ]
 
     def jumping(self, images: Sequence[ParticleImage], between: tuple[int, int]) -> FieldOfView:
         """Add a jump of the focus that lies between two pictures, in the order of time."""

@@ -68,9 +68,11 @@ class SidelobeFilter:
         table = np.array([(p.frame, p.x_px, p.y_px, abs(p.snr)) for p in peaks]).reshape(-1, 4)
         reach, side = STRIDES * self.stride, self.roi_px
         hidden: list[bool] = near_earlier_peaks(
-            table, (reach, reach + self.stride), (NEAR * side, side, LARGEST_IMAGE * side),
+            table,
+            (reach, reach + self.stride),
+            (NEAR * side, side, LARGEST_IMAGE * side),
             (SIDELOBE, FAR_LOBE),
-        ).tolist()  # fmt: skip
+        ).tolist()
         return hidden
 
     def _is_residue(self, step: Step, distance: float, peak: Peak) -> bool:
@@ -82,11 +84,7 @@ class SidelobeFilter:
         return distance < 1.5 * self.roi_px and abs(peak.snr) < share * abs(step.start.snr)
 
     def _left_over(
-        self,
-        peak: Peak,
-        near: Sequence[tuple[Step, float, int]],
-        places: FloatArray,
-        snr: MapArray,
+        self, peak: Peak, near: Sequence[tuple[Step, float, int]], places: FloatArray, snr: MapArray
     ) -> float:
         """Signal-to-noise ratio that a peak must have not to be a residual of the fits.
 

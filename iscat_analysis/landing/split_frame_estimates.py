@@ -266,8 +266,9 @@ def field_repeats(
         known = None
         if side:
             light = windows.before_e / powers[0].sum() if n_before else windows.before_e
-            known = signal * (photons_scale(context, windows) / power.sum()
-                              if context.additive else light)  # fmt: skip
+            known = signal * (
+                photons_scale(context, windows) / power.sum() if context.additive else light
+            )
         for a, b in pairwise(edges):
             total = np.zeros(shape)
             for start, stop in _pieces(shape, a, b):
@@ -287,10 +288,11 @@ def field_repeats(
         left = field.left([(event.candidate.x_px, event.candidate.y_px) for event in events])
         empty = field.spread(parts[0], parts[1], light, taken, left)
     return [
-        nothing_repeated(context.mode) if own is None
+        nothing_repeated(context.mode)
+        if own is None
         else repeats_of(tuple(_joined(side) for side in own.sides if side))
         for own in owns
-    ], empty  # fmt: skip
+    ], empty
 
 
 def _append(

@@ -43,9 +43,8 @@ class StepMaps:
         """Subtract known steps."""
         if self.is_local:
             maps = self._maps or sliding_maps(
-                self._chunk, self.matched, STRIDES,
-                in_place=self._chunk.lends_blocks, mapper=mapper,
-            )  # fmt: skip
+                self._chunk, self.matched, STRIDES, in_place=self._chunk.lends_blocks, mapper=mapper
+            )
             for step in _missing(self._known, steps):
                 self._add(maps, step, 1.0)
             for step in _missing(steps, self._known):

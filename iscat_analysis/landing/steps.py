@@ -436,7 +436,9 @@ class ChunkFitter:
             near = np.flatnonzero(at_once & (away < LARGEST_IMAGE * self._roi_px)).tolist()
             event = own.fitted.event
             flags = fit_flags(
-                self._context, event, event.windows,
+                self._context,
+                event,
+                event.windows,
                 sidelobe=own.lobe or described[number].is_dwarfed(described[i] for i in near),
                 too_close=own.crowded,
                 changing=steps[number].at.p_constant < POOR_FIT_P
@@ -444,7 +446,7 @@ class ChunkFitter:
                 or any(
                     away[i] < self._roi_px / 2 and _outshines(steps[i], steps[number]) for i in near
                 ),
-            )  # fmt: skip
+            )
             judged.append(replace(own.fitted, event=replace(event, flags=flags)))
         return judged
 

@@ -90,9 +90,7 @@ def clip_of(
     fold = math.ceil(side / CLIP_PIXELS)
     square, whole = region_around(side, chunk.shape, start), fitted.event.region
     sides = []
-    for (low, high), (first, last) in (
-        (square.rows, whole.rows), (square.columns, whole.columns)
-    ):  # fmt: skip
+    for (low, high), (first, last) in ((square.rows, whole.rows), (square.columns, whole.columns)):
         low, high = max(low, first), min(high, last)
         sides.append((low, high - (high - low) % fold))
     region = Region(sides[0], sides[1])

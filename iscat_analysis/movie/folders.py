@@ -74,7 +74,8 @@ FORMATS = (
     Format((b"II\x2a\x00", b"MM\x00\x2a", b"II\x2b\x00", b"MM\x00\x2b"), TIFF_SUFFIXES, _tiff),
     Format((NPY_SIGNATURE[:4],), (".npy",), _npy),
     Format(
-        (b"PK\x03\x04",), (".npz",),
+        (b"PK\x03\x04",),
+        (".npz",),
         partial(open_member, read=arrays_of_npz, kind="a ZIP archive"),
         partial(holds_one, read=arrays_of_npz),
     ),
@@ -82,7 +83,7 @@ FORMATS = (
     Format((b"MATL",), (".mat",), _matlab, _one_variable),
     Format((b"\xda\xce\xbe\x0a",), (".nd2",), open_nd2),
     Format((b"ZISR",), (".czi",), open_czi),
-)  # fmt: skip
+)
 """Files that are told by how they begin.  Folders, and numbers that something else describes, are
 told by `_opened` of `iscat_analysis.movie`."""
 

@@ -12,14 +12,7 @@ from typing import Any
 
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
-from iscat_analysis.movie.descriptions import (
-    LENGTH_NM,
-    TIME_S,
-    Hints,
-    inverse,
-    merge,
-    positive,
-)
+from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, inverse, merge, positive
 from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
 from iscat_analysis.movie.microscopes import needed_package
 from iscat_analysis.movie.stack import ArrayFrames

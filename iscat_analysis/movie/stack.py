@@ -74,11 +74,7 @@ class ArrayFrames:
     """The frames of an array; `iscat_analysis.movie.open_stack` makes it."""
 
     def __init__(
-        self,
-        array: ArrayLike,
-        name: str,
-        metadata: StackMetadata,
-        notes: tuple[str, ...] = (),
+        self, array: ArrayLike, name: str, metadata: StackMetadata, notes: tuple[str, ...] = ()
     ) -> None:
         shape = tuple(int(n) for n in array.shape)
         stored = np.dtype(array.dtype)

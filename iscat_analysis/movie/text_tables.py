@@ -35,8 +35,10 @@ _HEAD = 65536  # bytes that tell the encoding
 _LOOKED_AT = 50  # lines that tell the separator
 _ZEROS = 0.4  # of every other byte of UTF-16
 _MARKS = (
-    (codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")
-)  # fmt: skip
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
 _CONTROL = re.compile("[\x00-\x08\x0e-\x1b\ufeff]")
 _NOTHING = frozenset(
     ("", "-", "–", "—", "na", "n/a", "#n/a", "nan", "none", "null", "#num!", "#div/0!", "#value!",
@@ -118,10 +120,7 @@ class Cells:
 
 
 def read_cells(
-    path: Path,
-    choose: Callable[[Sequence[str]], Mapping[str, int]],
-    *,
-    units: bool = True,
+    path: Path, choose: Callable[[Sequence[str]], Mapping[str, int]], *, units: bool = True
 ) -> Cells:
     """Read a table of text.
 

@@ -173,10 +173,7 @@ def critical_angle(optics: Optics) -> float | None:
 
 
 def aperture_on(
-    optics: Optics,
-    theta: FloatArray,
-    weight: FloatArray,
-    scatterer: Sphere | Rod | None = None,
+    optics: Optics, theta: FloatArray, weight: FloatArray, scatterer: Sphere | Rod | None = None
 ) -> Aperture:
     """Make the pupil on given angles, with the light of a dipole, a sphere or a rod.
 

@@ -68,11 +68,7 @@ _STANDARDS_KEPT = 16  # cached optics of standards, with their contrast per kDa
 
 
 def forward_model(
-    config: Config,
-    reach_nm: float,
-    *,
-    z_max_nm: float | None = None,
-    nodes: int | None = None,
+    config: Config, reach_nm: float, *, z_max_nm: float | None = None, nodes: int | None = None
 ) -> ForwardModel:
     """Build the forward model of a configuration."""
     optics = config.optics

@@ -30,11 +30,7 @@ from iscat_analysis.optics.measured import MeasuredField
 from iscat_analysis.optics.memoize import memoize
 from iscat_analysis.optics.pixels import PixelArea
 from iscat_analysis.optics.scale import MassScale
-from iscat_analysis.optics.sensitivity import (
-    check_names,
-    sensitivity_lattices,
-    signal_derivatives,
-)
+from iscat_analysis.optics.sensitivity import check_names, sensitivity_lattices, signal_derivatives
 from iscat_analysis.optics.stamp import sample_picture
 from iscat_analysis.optics.waves import Field, LatticeField, RadialField, axial_table
 

@@ -152,12 +152,7 @@ def _log_efficiency_slope(optics: Optics) -> float:
 
 
 def signal_derivatives(
-    stack: FloatArray,
-    lens: LatticeLens,
-    pixels: Pixels,
-    x_nm: float,
-    y_nm: float,
-    amplitude: float,
+    stack: FloatArray, lens: LatticeLens, pixels: Pixels, x_nm: float, y_nm: float, amplitude: float
 ) -> FloatArray:
     """Combine lattices to derivatives of the signal.
 

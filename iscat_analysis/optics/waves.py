@@ -31,13 +31,7 @@ from iscat_analysis._kernels.lattice import (
 )
 from iscat_analysis._kernels.lens import LatticeLens, RoundLens
 from iscat_analysis._kernels.peak import largest_signal
-from iscat_analysis._kernels.radial import (
-    POWERS,
-    STEP,
-    AxialTable,
-    bessel_table,
-    radial_profile,
-)
+from iscat_analysis._kernels.radial import POWERS, STEP, AxialTable, bessel_table, radial_profile
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.optics.aperture import Aperture, aperture_on, harmonics, weight_on

@@ -60,16 +60,18 @@ class Counts:
         read = float(self.config.camera.assumed.read_noise_e) ** 2
         ratio = float(self.ratio[index])
         return counts_likelihood(
-            self.model, self.grid, self.before[index], self.after[index], ratio,
+            self.model,
+            self.grid,
+            self.before[index],
+            self.after[index],
+            ratio,
             background=MEAN if self.n_before else KNOWN,
-            noise=choose_noise(
-                "auto", interferes=bool(self.model.rho), counted=self.n_before > 0
-            ),
+            noise=choose_noise("auto", interferes=bool(self.model.rho), counted=self.n_before > 0),
             scale_e=None if self.model.rho else self._scale_e(ratio),
             read_variance_before_e2=self.n_before * read,
             read_variance_after_e2=self.n_after * read,
             masked=self.masked[index],
-        )  # fmt: skip
+        )
 
     def collected(self, index: int, z_nm: float, mass_kda: float) -> float:
         """Scattered photons that the pupil collected in the frames after; NaN if not known."""

@@ -195,12 +195,13 @@ def templates_of(counts: Counts) -> Templates:
     config, grid = counts.config, counts.grid
     alarms = {"false_alarms_per_movie": FALSE_ALARMS_PER_REGION}
     return make_templates(
-        counts.model, config.detection.model_copy(update=alarms),
+        counts.model,
+        config.detection.model_copy(update=alarms),
         pixel_nm=grid.pixel_nm,
         roi_nm=min(grid.shape) * grid.pixel_nm,
         z_range_nm=config.fit.z_range_nm if "z_nm" in FREE_PARAMETERS[config.fit.mode] else None,
         field_px=grid.shape,
-    )  # fmt: skip
+    )
 
 
 def line_of(

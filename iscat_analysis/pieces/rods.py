@@ -148,7 +148,8 @@ def _row(likelihood: Likelihood, found: list[Direction], rod: Rod) -> dict[str, 
     values = {name: float(best.theta[k]) for name, k in _NAMES.items()}
     sigmas = {f"sigma_{name}": float(best.sigma[k]) for name, k in _NAMES.items()}
     return {
-        **values, **sigmas,
+        **values,
+        **sigmas,
         "maxima": len(found),
         "other_azimuth_deg": float(other[AZIMUTH]),
         "other_tilt_deg": float(other[TILT]),
@@ -157,4 +158,4 @@ def _row(likelihood: Likelihood, found: list[Direction], rod: Rod) -> dict[str, 
         "chi2_reduced": chi2,
         "p_value": p_value,
         "status": str(verdict(flags)[0]),
-    }  # fmt: skip
+    }

@@ -58,9 +58,8 @@ def config_of(
     choice_in("mode", mode, tuple(FREE_PARAMETERS))
     fit = {"mode": mode} if z_range_nm is None else {"mode": mode, "z_range_nm": z_range_nm}
     return Config(
-        optics=optics, particle=particle, camera=camera, calibration=calibration,
-        fit=Fit(**fit),
-    )  # fmt: skip
+        optics=optics, particle=particle, camera=camera, calibration=calibration, fit=Fit(**fit)
+    )
 
 
 def together(

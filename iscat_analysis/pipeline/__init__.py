@@ -20,12 +20,7 @@ from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
-from iscat_analysis.fitting.checkpoint import (
-    is_resumable,
-    partial_folder,
-    parts_kept,
-    remove_parts,
-)
+from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept, remove_parts
 from iscat_analysis.fitting.compilation import compiling
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Notify, Run, notify_nobody

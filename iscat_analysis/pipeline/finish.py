@@ -81,9 +81,10 @@ def make_analysis(
     if rows.changing_light:
         run.warn(rows.changing_light)
     for name, finding in (
-        ("heights", rows.heights), ("extension", rows.extension),
+        ("heights", rows.heights),
+        ("extension", rows.extension),
         ("fluctuation", rows.fluctuation),
-    ):  # fmt: skip
+    ):
         if finding is not None:
             further[name] = finding.summary
             if finding.message:
@@ -107,10 +108,12 @@ def make_analysis(
         seen = rows.fluctuation is not None and rows.fluctuation.is_seen
         had = ("mass_kda",) if seen else ()  # by σ
         verdict = spread_verdict(
-            {name: one for name, one in achieved.items() if name not in had}, found.summary,
-            scaled=scaled, rejected=is_rejected(table),
+            {name: one for name, one in achieved.items() if name not in had},
+            found.summary,
+            scaled=scaled,
+            rejected=is_rejected(table),
             sliding=ready.background_mode == "sliding",
-        )  # fmt: skip
+        )
         further["repeats"] = verdict
         if verdict["message"]:
             run.warn(verdict["message"])

@@ -267,9 +267,11 @@ class BeforeAfterSearch:
         return Look(
             int(self._numbers[frame]),
             self._in_file(known.frames_before) if known.n_before else None,
-            self._in_file(windows.frames_after), np.where(windows.masked, np.nan, image),
-            context.templates.threshold, search,
-        )  # fmt: skip
+            self._in_file(windows.frames_after),
+            np.where(windows.masked, np.nan, image),
+            context.templates.threshold,
+            search,
+        )
 
 
 class MovingSearch:

@@ -121,9 +121,11 @@ def reported_rows(
     if config.fits_sizes:
         table = with_diameters(table, config.particle.density)
     unknown = SPHERES if config.fits_sizes else SCALE if config.calibration is None else None
-    budget = budget_of(
-        table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured",
-    ) if "mass_kda" in FREE_PARAMETERS[mode] else []  # fmt: skip
+    budget = (
+        budget_of(table, shared, achieved, unknown=unknown, scaled=config.fit.sigma == "measured")
+        if "mass_kda" in FREE_PARAMETERS[mode]
+        else []
+    )
     return ReportedRows(table, achieved, budget, heights, extension, fluctuation, changing_light)
 
 

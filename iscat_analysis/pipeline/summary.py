@@ -184,8 +184,10 @@ def sizes_of_tracks(tracks: pd.DataFrame, seed: int) -> Sizes | None:
     return describe_sizes(
         good["optical_diameter_nm"].to_numpy(float),
         good["sigma_optical_diameter_nm"].to_numpy(float),
-        seed=seed, common=common, notes=notes,
-    )  # fmt: skip
+        seed=seed,
+        common=common,
+        notes=notes,
+    )
 
 
 def _repeats(found: EmpiricalSpread) -> dict[str, Any]:

@@ -2,21 +2,8 @@
 
 from __future__ import annotations
 
-from iscat_analysis.records.analysis import (
-    Analysis,
-    Clip,
-    EventView,
-    Film,
-    Provenance,
-    Trace,
-)
-from iscat_analysis.records.arrays import (
-    BoolArray,
-    FloatArray,
-    Mapper,
-    Progress,
-    silent,
-)
+from iscat_analysis.records.analysis import Analysis, Clip, EventView, Film, Provenance, Trace
+from iscat_analysis.records.arrays import BoolArray, FloatArray, Mapper, Progress, silent
 from iscat_analysis.records.columns import (
     BUDGET_COLUMNS,
     DIPOLE,
@@ -33,13 +20,7 @@ from iscat_analysis.records.columns import (
     free_parameters,
     track_numbers,
 )
-from iscat_analysis.records.fits import (
-    Alternative,
-    Box,
-    Candidate,
-    FitResult,
-    PosteriorResult,
-)
+from iscat_analysis.records.fits import Alternative, Box, Candidate, FitResult, PosteriorResult
 from iscat_analysis.records.frames import (
     CountSource,
     FrameSource,

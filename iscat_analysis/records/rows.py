@@ -154,8 +154,9 @@ def has_only(table: pd.DataFrame, known: frozenset[str]) -> BoolArray:
     Shapes: result (rows,).
     """
     marks = zip(table["status"], table["flags"].fillna(""), strict=True)
-    return np.array([{status, *str(flags).split(";")} - {""} <= known for status, flags in marks],
-                    dtype=bool)  # fmt: skip
+    return np.array(
+        [{status, *str(flags).split(";")} - {""} <= known for status, flags in marks], dtype=bool
+    )
 
 
 def has_flag(table: pd.DataFrame, flag: Status | TrackStatus) -> BoolArray:

@@ -163,8 +163,9 @@ def _species(
     if species.empty:
         return None
     section = _charts("species", "Species", drawn, ("species", "shares")) or {
-        "id": "species", "title": "Species"
-    }  # fmt: skip
+        "id": "species",
+        "title": "Species",
+    }
     tables = []
     if len(shifts):
         tables.append(_shift_table(shifts, mass_label))
@@ -252,8 +253,7 @@ def _species_table(
                 *with_interval(row["width_kda"], row["width_low"], row["width_high"]),
                 f"{row['count']:.0f}",
                 *with_interval(
-                    *(100 * row[name] for name in ("share", "share_low", "share_high")),
-                    unit=" %",
+                    *(100 * row[name] for name in ("share", "share_low", "share_high")), unit=" %"
                 ),
                 f"{100 * row['efficiency']:.0f} %",
             ]
@@ -287,8 +287,7 @@ def _binding(
 
 
 def _equilibria(
-    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]],
-    drawn: Mapping[str, Markup],
+    equilibria: Sequence[tuple[str, Mapping[str, Any], Sequence[str]]], drawn: Mapping[str, Markup]
 ) -> dict[str, Any] | None:
     """Tabulate K_D of every series, and whether the movies follow the equilibrium."""
     if not equilibria:

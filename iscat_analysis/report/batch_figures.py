@@ -46,11 +46,7 @@ class Curve:
 
 
 def batch_figures(
-    curves: Sequence[Curve],
-    movies: pd.DataFrame,
-    species: pd.DataFrame,
-    *,
-    mass_label: str,
+    curves: Sequence[Curve], movies: pd.DataFrame, species: pd.DataFrame, *, mass_label: str
 ) -> Iterator[tuple[str, Figure]]:
     """Draw the figures of a batch."""
     shown = [curve for curve in curves if curve.masses_kda.size]

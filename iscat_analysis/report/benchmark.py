@@ -54,10 +54,7 @@ _FIGURES = {
     "pulls": "Pulls: (estimate − truth) / σ",
     "ranks": "Ranks of the truth among the draws of its posterior",
 }
-_AXES = {
-    "photons": ("collected scattered photons", "log"),
-    "z": ("height [nm]", "linear"),
-}
+_AXES = {"photons": ("collected scattered photons", "log"), "z": ("height [nm]", "linear")}
 
 
 def render_benchmark(study: Mapping[str, Any], *, folder: Path | None = None) -> str:

@@ -47,10 +47,11 @@ def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
             label="equilibrium",
         )  # fmt: skip
     left.set(
-        xscale="log", ylim=(0, 1),
+        xscale="log",
+        ylim=(0, 1),
         xlabel="monomers in all [nM]" if dimer else "A and B in all [nM]",
         ylabel="dimers among the particles" if dimer else "AB among the particles",
-    )  # fmt: skip
+    )
     left.legend(loc="upper left")
     kd = np.exp(np.array(found["profile"]["ln_kd_nm"], float))
     deviance = np.array(found["profile"]["deviance"], float)
@@ -62,9 +63,11 @@ def binding_figure(found: Mapping[str, Any]) -> Iterator[tuple[str, Figure]]:
     right.axhline(_DEVIANCE, color=GREY, lw=0.8, ls="--")
     right.axvline(found["kd_nm"], color=VERMILLION, lw=1)
     right.set(
-        xlabel="$K_D$ [nM]", ylabel="2 (largest log-likelihood − profile)",
-        ylim=(0, 2.2 * _DEVIANCE), title=f"$K_D$ = {number(found['kd_nm'])} nM",
-    )  # fmt: skip
+        xlabel="$K_D$ [nM]",
+        ylabel="2 (largest log-likelihood − profile)",
+        ylim=(0, 2.2 * _DEVIANCE),
+        title=f"$K_D$ = {number(found['kd_nm'])} nM",
+    )
     ends = [end for end in (found["kd_low"], found["kd_high"]) if end]
     if len(ends) == 2:
         right.set_xlim(ends[0] / (ends[1] / ends[0]) ** 0.5, ends[1] * (ends[1] / ends[0]) ** 0.5)

@@ -23,12 +23,7 @@ from iscat_analysis.records import (
     free_parameters,
     tally,
 )
-from iscat_analysis.report.answer import (
-    answers,
-    caution,
-    is_uncalibrated,
-    main_quantity,
-)
+from iscat_analysis.report.answer import answers, caution, is_uncalibrated, main_quantity
 from iscat_analysis.report.budget import COLUMNS as BUDGET_HEADINGS
 from iscat_analysis.report.budget import budget_rows
 from iscat_analysis.report.event_figures import event_details

@@ -109,11 +109,12 @@ def _rows(species: Sequence[Mapping[str, Any]]) -> list[list[Any]]:
         if bounds:
             columns.append(
                 [
-                    "—" if half is None or half != half
+                    "—"
+                    if half is None or half != half
                     else f"{fixed(factor * p, decimals)} to {fixed(factor * q, decimals)}"
                     for p, q, half in zip(low, high, halves, strict=True)
                 ]
-            )  # fmt: skip
+            )
     return [list(row) for row in zip(*columns, strict=True)]
 
 

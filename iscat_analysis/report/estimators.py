@@ -124,10 +124,11 @@ def _map_section(found: Mapping[str, Any], svg: Markup) -> dict[str, Any]:
     """Say who is best where, in a map and with all who are as good in a table."""
     rows = [
         [LABELS[p], number(height), number(photons), *_cell(found["parameters"][p], r, c)]
-        for p in LABELS if p in found["parameters"]
+        for p in LABELS
+        if p in found["parameters"]
         for r, height in enumerate(found["height_nm"])
         for c, photons in enumerate(found["photons"])
-    ]  # fmt: skip
+    ]
     columns = ["parameter", _numeric("height [nm]"), _numeric("photons"), "best",
                _numeric("information kept"), "as good"]  # fmt: skip
     return {
@@ -206,8 +207,9 @@ def _part_section(
     pairs = [
         [LABELS[p], who, found["to"], _with(one, "mse_ratio"), one["trials"]]
         for p, found in part.get("paired", {}).items()
-        for who, one in found.items() if isinstance(one, Mapping)
-    ]  # fmt: skip
+        for who, one in found.items()
+        if isinstance(one, Mapping)
+    ]
     if pairs:
         columns = ["parameter", "estimator", "to", _numeric("mean square errors"), _numeric("both")]
         tables.append({"caption": "On the same counts", "columns": columns, "rows": pairs})
@@ -401,8 +403,9 @@ def _map_figure(found: Mapping[str, Any], names: Sequence[str]) -> Figure:
         Patch(facecolor=colours[who], alpha=0.6, label=f"{letter} {who}")
         for who, letter in letters.items()
     ]
-    figure.legend(handles=patches, loc="outside lower center", ncols=min(len(patches), 5) or 1,
-                  fontsize=8)  # fmt: skip
+    figure.legend(
+        handles=patches, loc="outside lower center", ncols=min(len(patches), 5) or 1, fontsize=8
+    )
     return figure
 
 
@@ -432,8 +435,9 @@ def _reached_figure(part: Mapping[str, Any]) -> Figure:
         at = np.arange(len(scored))[::-1]
         values = _floats([e["spread_over_crb"] for _, e in scored])
         ends = np.array([_floats(e["spread_over_crb_ci95"]) for _, e in scored]).reshape(-1, 2).T
-        axes.errorbar(values, at, xerr=_reach(values, ends), fmt="o", markersize=4,
-                      color=_COLOURS[0])  # fmt: skip
+        axes.errorbar(
+            values, at, xerr=_reach(values, ends), fmt="o", markersize=4, color=_COLOURS[0]
+        )
         axes.axvline(1.0, color=INK, linewidth=1)
         axes.set_yticks(at, [who for who, _ in scored])
         axes.set_xscale("log")

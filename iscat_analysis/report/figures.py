@@ -12,14 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
-from iscat_analysis.records import (
-    Analysis,
-    BoolArray,
-    FloatArray,
-    Status,
-    counted,
-    free_parameters,
-)
+from iscat_analysis.records import Analysis, BoolArray, FloatArray, Status, counted, free_parameters
 from iscat_analysis.report.answer import main_quantity
 from iscat_analysis.report.budget import budget_figure
 from iscat_analysis.report.event_figures import HALO, scale_bar
@@ -263,10 +256,7 @@ def diagnostics(analysis: Analysis, table: pd.DataFrame) -> Figure | None:
         return None
     figure = new_figure(3.2 * count, 2.7)
     panels = iter(np.atleast_1d(figure.subplots(1, count)))
-    for values, label, window in (
-        (chi2, "reduced χ²", None),
-        (p_value, "p-value", (0.0, 1.0)),
-    ):
+    for values, label, window in ((chi2, "reduced χ²", None), (p_value, "p-value", (0.0, 1.0))):
         if values.size > 1:
             axes = next(panels)
             bins = 20 if window else int(np.clip(np.sqrt(values.size), 8, 40))

@@ -102,10 +102,12 @@ def _frames(film: Film, low: float, high: float, limit: float) -> NDArray[np.uin
     """Colour data, model and residual side by side, shape (t, y, 3 x + gaps, 3)."""
     gap = np.zeros((*film.contrast.shape[:2], _GAP, 4))
     strip = [
-        GREYS(_stepped((film.contrast - low) / (high - low))), gap,
-        GREYS(_stepped((film.model - low) / (high - low))), gap,
+        GREYS(_stepped((film.contrast - low) / (high - low))),
+        gap,
+        GREYS(_stepped((film.model - low) / (high - low))),
+        gap,
         DIVERGING(_stepped((film.residual / limit + 1) / 2)),
-    ]  # fmt: skip
+    ]
     return np.asarray(255 * np.concatenate(strip, axis=2)[..., :3], dtype=np.uint8)
 
 

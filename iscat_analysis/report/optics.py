@@ -129,11 +129,13 @@ def optics_page(title: str, found: Mapping[str, Any], toml: str) -> str:
         },
     ]
     unknown = [f"{text[:1].upper()}{text[1:].rstrip('.')}." for text in found["notes"]]
-    sections.append({
-        "id": "unknown",
-        "title": "What could not be known",
-        "notes": unknown or ["Everything that was asked for was determined."],
-    })  # fmt: skip
+    sections.append(
+        {
+            "id": "unknown",
+            "title": "What could not be known",
+            "notes": unknown or ["Everything that was asked for was determined."],
+        }
+    )
     return render_document(title, "Optics, learned from the movie", sections, toml, OPTICS_FILE)
 
 

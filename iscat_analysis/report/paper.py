@@ -52,9 +52,8 @@ def write_paper(
         )
         for panel in PANELS:
             curves[curves["panel"] == panel].to_csv(
-                building / f"fig_{panel}.csv",
-                index=False, float_format="%.9g", lineterminator="\n",
-            )  # fmt: skip
+                building / f"fig_{panel}.csv", index=False, float_format="%.9g", lineterminator="\n"
+            )
         for name in ("table_1.csv", "comparison.csv"):
             table.to_csv(building / name, index=False, float_format="%.9g", lineterminator="\n")
         drawn = publish(_figures(curves, images, table, quantum, field_nm), building)

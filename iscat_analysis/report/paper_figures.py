@@ -129,11 +129,12 @@ def limits_of(
         schemes = {"4a": ("cobri",), "4b": ("iscat",)}.get(panel, ("iscat", "cobri"))
         return [
             Limit(
-                f"quantum bound, {SCHEMES[s]}", float(quantum[convention, s][2]),
+                f"quantum bound, {SCHEMES[s]}",
+                float(quantum[convention, s][2]),
                 GREY if spec.by_attenuation else SCHEME_COLORS[s],
             )
             for s in schemes
-        ]  # fmt: skip
+        ]
     value = float(quantum[convention, "iscat"][spec.bound])
     return [Limit("quantum bound", value, GREY)]
 

@@ -29,8 +29,10 @@ def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str
     samples = np.stack([p.samples[:n_chain, -n_draw:] for p in chains], axis=2)
     values = np.stack([p.log_likelihood[:n_chain, -n_draw:] for p in chains], axis=2)
     coordinates = {
-        "chain": range(n_chain), "draw": range(n_draw), "event": [view.event for view in views],
-    }  # fmt: skip
+        "chain": range(n_chain),
+        "draw": range(n_draw),
+        "event": [view.event for view in views],
+    }
     refused = [
         (view.event, view.posterior.message)
         for view in analysis.views
@@ -50,8 +52,9 @@ def posterior_groups(analysis: Analysis, views: Sequence[EventView]) -> dict[str
     }
     if all(p.van_trees is not None for p in chains):
         by_parameter["van_trees"] = (
-            ("event", "parameter"), np.stack([np.asarray(p.van_trees) for p in chains]),
-        )  # fmt: skip
+            ("event", "parameter"),
+            np.stack([np.asarray(p.van_trees) for p in chains]),
+        )
     statistics = {
         "log_likelihood": (axes, values),
         "acceptance": (("event",), np.array([p.acceptance for p in chains])),

@@ -48,16 +48,20 @@ def write_tables(analysis: Analysis, folder: Path) -> None:
         tables["tracks"] = analysis.tracks
     for name, table in tables.items():
         table.to_csv(
-            folder / f"{name}.csv", index=False, float_format=f"%.{CSV_DIGITS}g",
+            folder / f"{name}.csv",
+            index=False,
+            float_format=f"%.{CSV_DIGITS}g",
             lineterminator="\n",
-        )  # fmt: skip
+        )
         with (folder / f"{name}.parquet").open("wb") as file:  # pyarrow wants paths as text
             table.to_parquet(file, index=False)
     if analysis.response is not None:
         analysis.response.to_csv(
-            folder / "response.csv", index=False, float_format=f"%.{CSV_DIGITS}g",
+            folder / "response.csv",
+            index=False,
+            float_format=f"%.{CSV_DIGITS}g",
             lineterminator="\n",
-        )  # fmt: skip
+        )
     summary = to_json("summary", analysis.summary)
     (folder / "summary.json").write_text(summary + "\n", encoding="utf-8")
     (folder / "config.toml").write_text(analysis.config_toml, encoding="utf-8")

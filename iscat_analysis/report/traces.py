@@ -96,12 +96,15 @@ def draw_trace(axes: Axes, trace: Trace) -> None:
     axes.plot(
         [begin, trace.frame, trace.frame, end],
         [1e3 * level for level in (trace.before, trace.before, trace.after, trace.after)],
-        color=VERMILLION, lw=1.6,
-    )  # fmt: skip
+        color=VERMILLION,
+        lw=1.6,
+    )
     axes.set(
-        xlim=(frames[0], frames[-1] + 1), ylim=(1e3 * low, 1e3 * high),
-        xlabel="frame", ylabel="contrast [10⁻³]",
-    )  # fmt: skip
+        xlim=(frames[0], frames[-1] + 1),
+        ylim=(1e3 * low, 1e3 * high),
+        xlabel="frame",
+        ylabel="contrast [10⁻³]",
+    )
 
 
 def _range(trace: Trace) -> tuple[float, float]:

@@ -72,9 +72,11 @@ def _tiles(analysis: Analysis, fits: pd.DataFrame) -> list[dict[str, str]]:
     note = f"{rows.ok} ok, {rows.flagged} flagged; {len(fits)} fitted positions"
     return [
         {"label": "Tracks", "value": str(rows.number), "note": note},
-        *(asdict(replace(answer, note="over tracks that are ok"))
-          for answer in answers(analysis, fits, tracks)),
-    ]  # fmt: skip
+        *(
+            asdict(replace(answer, note="over tracks that are ok"))
+            for answer in answers(analysis, fits, tracks)
+        ),
+    ]
 
 
 def track_rows(analysis: Analysis) -> dict[str, Any]:

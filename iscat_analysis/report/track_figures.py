@@ -186,8 +186,9 @@ def mass_d(analysis: Analysis) -> Figure:
             _points(axes, mass[at], d[at], at, color=color, ms=3, mew=0, label=mark)
     if (usable & ~good).any():
         figure.legend(loc="outside upper right", ncols=2)
-    axes.set(yscale="log", xlim=x_ends, ylim=y_ends, xlabel=mass_label(analysis),
-             ylabel="D [µm²/s]")  # fmt: skip
+    axes.set(
+        yscale="log", xlim=x_ends, ylim=y_ends, xlabel=mass_label(analysis), ylabel="D [µm²/s]"
+    )
     _plain_log(axes)
     return figure
 
@@ -227,8 +228,9 @@ def distributions(analysis: Analysis) -> Figure:
                     xerr=bars[..., part], ls="none", color=color, elinewidth=0.7,
                 )  # fmt: skip
             if part.any():
-                _points(below, value[rows][part], rank[part], rows[part], color=color, ms=2.5,
-                        mew=0)  # fmt: skip
+                _points(
+                    below, value[rows][part], rank[part], rows[part], color=color, ms=2.5, mew=0
+                )
         above.set(ylim=(0, None))
         above.spines.left.set_visible(False)
         below.spines.left.set_visible(False)

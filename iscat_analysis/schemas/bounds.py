@@ -236,11 +236,11 @@ class Bounds(Document):
     per_photon: BoundsPerPhoton = key("For one scattered photon [nm; mass_rel is relative]")
     actual: BoundsPlanned = key("For the planned frames [nm, kDa]")
     fisher: Matrix4 = key(
-        "Fisher information of all frames, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]",
+        "Fisher information of all frames, order x, y, z, mass [1/nm², 1/(nm kDa), 1/kDa²]"
     )
     qfi: Matrix4 = key("Quantum Fisher information of the light")
     qfi_imaginary: Matrix4 = key(
-        "Its imaginary part; where not zero, no single measurement is best for both parameters",
+        "Its imaginary part; where not zero, no single measurement is best for both parameters"
     )
     holevo: Holevo = key("Holevo bound over the mode's free parameters")
     information_fraction: dict[Parameter, Number] = key("Share of the light's information")

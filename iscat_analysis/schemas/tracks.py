@@ -5,14 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from iscat_analysis.records import TRACKS, TrackStatus
-from iscat_analysis.schemas.base import (
-    Closed,
-    Count,
-    Document,
-    Number,
-    key,
-    row_model,
-)
+from iscat_analysis.schemas.base import Closed, Count, Document, Number, key, row_model
 
 if TYPE_CHECKING:
     Track = Closed

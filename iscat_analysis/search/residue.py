@@ -105,9 +105,8 @@ def size_on_ring(
     near = known[np.hypot(known[:, 0] - x0, known[:, 1] - y0) < reach]
     highest = np.empty(max(8, round(2 * math.pi * distance / _SECTOR_PX)))
     ring_heights(
-        snr, (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX, _PATCH_PX,
-        near, highest,
-    )  # fmt: skip
+        snr, (float(x0), float(y0)), (float(xc), float(yc)), _RING_PX, _PATCH_PX, near, highest
+    )
     seen = np.sort(highest[highest >= 0])
     if not seen.size:
         return 0.0

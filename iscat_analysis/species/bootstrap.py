@@ -32,12 +32,7 @@ class Repeat:
 
 
 def bootstrap(
-    possible: Sequence[Possible],
-    found: Chosen,
-    *,
-    draws: int,
-    least: int,
-    seed: int,
+    possible: Sequence[Possible], found: Chosen, *, draws: int, least: int, seed: int
 ) -> tuple[list[Repeat], float]:
     """Fit simulated repetitions; in some of them let BIC choose between neighbouring numbers.
 
@@ -55,10 +50,9 @@ def bootstrap(
         fit = fit_jointly(drawn, best, one.structure, one.curvature)
         repeats.append(
             Repeat(
-                fit, fit.shares(drawn).sum(axis=0), fit.came * fit.arrived(drawn),
-                peaks(drawn, fit),
+                fit, fit.shares(drawn).sum(axis=0), fit.came * fit.arrived(drawn), peaks(drawn, fit)
             )
-        )  # fmt: skip
+        )
         if found.searched and number < _SUPPORT_DRAWS:
             n = drawn.x.size
             agreed.append(

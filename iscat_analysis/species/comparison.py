@@ -39,10 +39,7 @@ from iscat_analysis.species.intervals import TWO_SIDED_95
 from iscat_analysis.species.maximum import Maximum
 from iscat_analysis.species.mixture import Mixture
 from iscat_analysis.species.search import peaks
-from iscat_analysis.species.structure import (
-    maximise_jointly,
-    structure_of,
-)
+from iscat_analysis.species.structure import maximise_jointly, structure_of
 
 LEAST_COMPARED = 20
 """Events of a species in each sample, without which its masses are not compared."""

@@ -345,8 +345,9 @@ def _ladder(
     drawn = [np.array(choice.values(found, r.mixture)) for r in repeats]
     error, (low, high) = _error(drawn, 2), interval_of(drawn, 2)
     scale = scale_error(np.array([monomer]))
-    below, above = (float(widening(np.array([r]), scale)[0]) for r in
-                    (monomer - low[0], high[0] - monomer))  # fmt: skip
+    below, above = (
+        float(widening(np.array([r]), scale)[0]) for r in (monomer - low[0], high[0] - monomer)
+    )
     return LadderFit(
         found.steps,
         monomer, float(error[0]), float(low[0]) - below, float(high[0]) + above,

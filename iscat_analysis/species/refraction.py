@@ -91,9 +91,11 @@ def refractive_index(
     if index == n_medium:
         raise ConfigError(f"index = {index:g} is that of the medium: such particles are not seen")
     named = {
-        "mass_kda": mass_kda, "diameter_nm": diameter_nm,
-        "sigma_mass_kda": sigma_mass_kda, "sigma_diameter_nm": sigma_diameter_nm,
-    }  # fmt: skip
+        "mass_kda": mass_kda,
+        "diameter_nm": diameter_nm,
+        "sigma_mass_kda": sigma_mass_kda,
+        "sigma_diameter_nm": sigma_diameter_nm,
+    }
     arrays = [real_array(name, value) for name, value in named.items()]
     for name, array in zip(named, arrays, strict=True):
         far = np.isfinite(array) & (np.abs(array) > LARGEST)  # D of 0 makes a diameter infinite

@@ -91,9 +91,11 @@ def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
     numbers = track_numbers(fits)
     known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
     rows = TrackRows(
-        *(known[part.name].to_numpy(object if part.name == "status" else float)
-          for part in fields(TrackRows))
-    )  # fmt: skip
+        *(
+            known[part.name].to_numpy(object if part.name == "status" else float)
+            for part in fields(TrackRows)
+        )
+    )
     order = np.lexsort((rows.frame, track))
     edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
     return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}

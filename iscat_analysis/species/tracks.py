@@ -44,12 +44,7 @@ from iscat_analysis.species.diffusion import (
 from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
 from iscat_analysis.species.refraction import refractive_index
-from iscat_analysis.species.track_rows import (
-    TrackRows,
-    nearest_nm,
-    of_known,
-    rows_by_track,
-)
+from iscat_analysis.species.track_rows import TrackRows, nearest_nm, of_known, rows_by_track
 from iscat_analysis.threads import threads
 
 TESTED_POSITIONS = 300
@@ -309,11 +304,7 @@ def _size(record: Mapping[str, Any], setup: TrackSetup) -> dict[str, float]:
 
 
 def _motions(
-    places: Mapping[int, TrackRows],
-    setup: TrackSetup,
-    seed: int,
-    workers: int,
-    progress: Progress,
+    places: Mapping[int, TrackRows], setup: TrackSetup, seed: int, workers: int, progress: Progress
 ) -> dict[int, tuple[Diffusion | None, dict[str, float]]]:
     """D of all tracks and the tests of their motion; an interrupt leaves tests out."""
 

@@ -64,10 +64,12 @@ _HAZARDS: Values = {
     "optics": {"focus_nm": -330.0, "aberrations_nm": {"z5": 8.0, "z11": -10.0}},
     "particle": {"height_sd_nm": 4.0, "height_nm": 12.0},
     "simulation": {
-        "drift_px_per_frame": [0.001, -0.0005], "species": [90.0, 180.0, 360.0], "leavings": 3,
+        "drift_px_per_frame": [0.001, -0.0005],
+        "species": [90.0, 180.0, 360.0],
+        "leavings": 3,
         "power_noise": 0.005,
     },
-}  # fmt: skip
+}
 """What is true of the hard preset, and not told."""
 
 _GLASS_NOISE: Values = {
@@ -103,8 +105,10 @@ def preset_parts(name: str) -> list[Part]:
 
 
 _SCHEMES: Mapping[str, tuple[float, float]] = {
-    "iscat": (1.0, 3e4), "cobri": (COBRI_ATTENUATION, 3e4), "darkfield": (1.0, 3e3),
-}  # fmt: skip
+    "iscat": (1.0, 3e4),
+    "cobri": (COBRI_ATTENUATION, 3e4),
+    "darkfield": (1.0, 3e3),
+}
 """Attenuation, and photons per pixel and frame; in dark field those collected per frame."""
 
 

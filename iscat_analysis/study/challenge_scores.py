@@ -61,8 +61,10 @@ def score_challenge(
 ) -> dict[str, Any]:
     """Score results and estimators, part by part."""
     groups = _groups(challenge)
-    pixel = {group: float(challenge.manifest["parts"][parts[0]]["pixel_size_nm"])
-             for group, parts in groups.items()}  # fmt: skip
+    pixel = {
+        group: float(challenge.manifest["parts"][parts[0]]["pixel_size_nm"])
+        for group, parts in groups.items()
+    }
     if len({path.name for path in results}) < len(results):
         raise DataError("two results have the same name, by which they are told apart; rename one")
     out: dict[str, Any] = {}
@@ -84,8 +86,9 @@ def score_challenge(
             answer = answers[estimator.name][group]
             entry = _entry(answer.columns, events, limits)
             entries[estimator.name] = entry | {
-                "failures": answer.failures, "about": estimator.about,
-            }  # fmt: skip
+                "failures": answer.failures,
+                "about": estimator.about,
+            }
             columns[estimator.name] = answer.columns
         out[group] = {
             "kind": about["kind"],
@@ -238,11 +241,7 @@ def _truth_of(challenge: Challenge, parts: Sequence[str]) -> tuple[pd.DataFrame,
 
 
 def _of_results(
-    read: Results,
-    about: Mapping[str, Any],
-    events: pd.DataFrame,
-    limits: Limits,
-    told: Config,
+    read: Results, about: Mapping[str, Any], events: pd.DataFrame, limits: Limits, told: Config
 ) -> tuple[dict[str, Any] | None, dict[str, FloatArray]]:
     """Match one table with one part and score it; nothing where no row is of it."""
     pixel = float(about["pixel_size_nm"])
@@ -271,8 +270,9 @@ def _of_results(
     notes = list(read.notes)
     columns = {
         str(name): placed[name].to_numpy(dtype=float)
-        for name in placed if str(name).removeprefix("sigma_") in (*PARAMETERS, "amplitude")
-    }  # fmt: skip
+        for name in placed
+        if str(name).removeprefix("sigma_") in (*PARAMETERS, "amplitude")
+    }
     if "mass_kda" in columns:
         columns["mass_kda"] = np.abs(columns["mass_kda"])  # one that leaves has a negative mass
     elif "amplitude" in columns:
@@ -335,18 +335,20 @@ def _paired(
     out: dict[str, Any] = {}
     for i, name in enumerate(limits.free):
         ranked = {
-            who: one[name]["efficiency_crb"] for who, one in entries.items()
+            who: one[name]["efficiency_crb"]
+            for who, one in entries.items()
             if math.isfinite(one.get(name, {}).get("efficiency_crb", math.nan))
             and not one[name]["below_bound"]
-        }  # fmt: skip
+        }
         if len(ranked) < 2:
             continue
         best = max(ranked, key=lambda who: ranked[who])
         truth, crb = events[name].to_numpy(dtype=float), limits.crb[:, i]
         out[name] = {"to": best} | {
             who: paired(columns[who][name] - truth, columns[best][name] - truth, crb, weights)
-            for who in ranked if who != best
-        }  # fmt: skip
+            for who in ranked
+            if who != best
+        }
     return out
 
 

@@ -87,10 +87,12 @@ def draw(
     bounds = true.bounds.crb_joint
     pixel = setting.context.pixel_nm
     most = [RANGE_PX * pixel, RANGE_PX * pixel, RANGE_Z_NM, RANGE_MASS * setting.truth[3]]
-    width = np.array([
-        min(RANGE_CRB * bounds[k], most[k]) if name in setting.free else 0.0
-        for k, name in enumerate(PARAMETERS)
-    ])  # fmt: skip
+    width = np.array(
+        [
+            min(RANGE_CRB * bounds[k], most[k]) if name in setting.free else 0.0
+            for k, name in enumerate(PARAMETERS)
+        ]
+    )
     width = np.where(np.isfinite(width), width, np.array(most))
     low, high = setting.config.fit.z_range_nm
     width[2] = min(width[2], setting.truth[2] - low, high - setting.truth[2]) * (width[2] > 0)
@@ -158,11 +160,14 @@ def compare_estimators(
     place = executor or LocalExecutor()
     mode = config.fit.mode if config.fit.mode in OF_DIPOLES else "mass"
     settings = {m: make_setting(config, m) for m in OF_DIPOLES}
-    tables = {m: draw(s, trials, seed=seed, stream=1000 + k)
-              for k, (m, s) in enumerate(settings.items())}  # fmt: skip
+    tables = {
+        m: draw(s, trials, seed=seed, stream=1000 + k) for k, (m, s) in enumerate(settings.items())
+    }
     fewer = max(trials // CURVE_SHARE, LEAST_CURVE)
-    points = [*_points(config, settings[mode], fewer, seed),
-              *_map_points(config, settings[mode], fewer, seed)]  # fmt: skip
+    points = [
+        *_points(config, settings[mode], fewer, seed),
+        *_map_points(config, settings[mode], fewer, seed),
+    ]
     rate = max(config.bounds.false_alarm_probability, FALSE_ALARMS / max(trials, 2 * FALSE_ALARMS))
     empty = draw(settings["mass"], trials, seed=seed, stream=1900, empty=True)
     jobs = [*(d.job for d in tables.values()), *(d.job for _, _, d in points), empty.job]
@@ -227,8 +232,9 @@ def _paired(
         errors = {who: a.columns[name] - truth for who, a in answers.items() if name in a.columns}
         out[name] = {"to": best} | {
             who: paired(error, errors[best], crb, weights)
-            for who, error in errors.items() if who != best
-        }  # fmt: skip
+            for who, error in errors.items()
+            if who != best
+        }
     return out
 
 
@@ -322,9 +328,11 @@ def _map(
             truth, crb = drawn.truths[:, PARAMETERS.index(name)], drawn.limits.crb[:, i]
             errors = {who: answers[who][number].columns[name] - truth for who in kept}
             equal = [
-                who for who in kept if who != best
+                who
+                for who in kept
+                if who != best
                 and not paired(errors[who], errors[best], crb, weights)["mse_ratio_ci95"][0] > 1
-            ]  # fmt: skip
+            ]
             for key, value in zip(_CELL, (best, kept[best], equal), strict=True):
                 table[key][row][column] = value
     return {"photons": list(MAP_PHOTONS), "height_nm": heights, "parameters": out}

@@ -83,9 +83,8 @@ def calibrate_posterior(
         likelihood = setting.likelihood(setting.windows(frame, random, gain=gain))
         start = setting.start(truth, random)
         fit = fit_particle(
-            likelihood, start, setting.mode, (float(lower[2]), float(upper[2])),
-            level=setting.level,
-        )  # fmt: skip
+            likelihood, start, setting.mode, (float(lower[2]), float(upper[2])), level=setting.level
+        )
         prior = Box(
             free=fit.box.free,
             lower=np.array([*lower[:3], min(amplitudes), fit.box.lower[4]]),

@@ -227,8 +227,10 @@ def refuse_other_units(
 
 
 def _units_said(name: str, what: str, said: str, factor: float) -> str:
-    names = {"pixels": ", or call them x_px and y_px", "nm, though called pixels":
-             ", or call them x_nm and y_nm"}  # fmt: skip
+    names = {
+        "pixels": ", or call them x_px and y_px",
+        "nm, though called pixels": ", or call them x_nm and y_nm",
+    }
     return (
         f"{name}: its {what} are in {said}: times {factor:.4g} they fit the truth; convert them"
         f"{names.get(said, '')}"

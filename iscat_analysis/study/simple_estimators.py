@@ -269,10 +269,12 @@ def radial_symmetry(before: FloatArray, after: FloatArray, setup: EstimatorSetup
         far = np.hypot(x - middle[0], y - middle[1])
         w = strength / np.maximum(far, 0.5) / np.maximum(strength, 1e-300)
         # distance of (a, b) from the line: (gy (x − a) − gx (y − b)) / |g|
-        matrix = np.array([
-            [np.sum(w * gy * gy), -np.sum(w * gx * gy)],
-            [-np.sum(w * gx * gy), np.sum(w * gx * gx)],
-        ])  # fmt: skip
+        matrix = np.array(
+            [
+                [np.sum(w * gy * gy), -np.sum(w * gx * gy)],
+                [-np.sum(w * gx * gy), np.sum(w * gx * gx)],
+            ]
+        )
         aim = gy * x - gx * y
         a, b = np.linalg.lstsq(
             matrix, np.array([np.sum(w * gy * aim), -np.sum(w * gx * aim)]), rcond=None
@@ -323,10 +325,12 @@ def _highest(
 ) -> Table:
     """Find the maximum near each start."""
     pixel = setup.pixel_size_nm
-    out = np.stack([
-        highest(image, start, polarity, refined=refined)
-        for image, start in zip(images, setup.start[:, :2] / pixel, strict=True)
-    ])  # fmt: skip
+    out = np.stack(
+        [
+            highest(image, start, polarity, refined=refined)
+            for image, start in zip(images, setup.start[:, :2] / pixel, strict=True)
+        ]
+    )
     return {"x_nm": out[:, 0] * pixel, "y_nm": out[:, 1] * pixel, "amplitude": out[:, 2]}
 
 

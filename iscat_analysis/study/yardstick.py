@@ -58,10 +58,7 @@ def resamples(count: int, seed: int, number: int = RESAMPLES) -> FloatArray:
 
 
 def score_estimates(
-    columns: Mapping[str, FloatArray],
-    truths: FloatArray,
-    limits: Limits,
-    weights: FloatArray,
+    columns: Mapping[str, FloatArray], truths: FloatArray, limits: Limits, weights: FloatArray
 ) -> dict[str, dict[str, Any]]:
     """Score every free parameter that an estimator gives.
 

@@ -69,8 +69,10 @@ def in_turns(
     return replace(
         found,
         context=replace(sharp, mode="track", config=config),
-        fits=fits.assign(**wider), repeats=(), empty=None,
-    )  # fmt: skip
+        fits=fits.assign(**wider),
+        repeats=(),
+        empty=None,
+    )
 
 
 def beside_particles(context: AnalysisContext, windows: Windows, fits: pd.DataFrame) -> FloatArray:

@@ -60,7 +60,7 @@ def held_height_warning(
     try:
         moving = find_rows_and_background(
             context, movie, camera, (first, last), check=check, pool=pool, progress=silent
-        )  # fmt: skip
+        )
     except DataError:  # nothing can be followed at one height
         return ""
     held = _rejected(moving_table(context, moving, first)[moving.field.holds(moving.rows.theta)])

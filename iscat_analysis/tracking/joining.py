@@ -73,9 +73,7 @@ def join_tracks(config: Config, blocks: Sequence[Block]) -> list[IntArray]:
     for k, (one, two) in enumerate(pairwise(blocks)):
         for before, after in _met(config, one, two):
             numbers[k + 1][after] = numbers[k][before]
-    rows = [
-        replace(b.rows, track=n[b.rows.track]) for n, b in zip(numbers, blocks, strict=True)
-    ]  # fmt: skip
+    rows = [replace(b.rows, track=n[b.rows.track]) for n, b in zip(numbers, blocks, strict=True)]
     whole = reduce(_both, rows)
     if not len(whole.frame):
         return numbers

@@ -53,9 +53,8 @@ def linked(
             "fewer frames (fit.frames), in which it stands still"
         )
     track = link(
-        rows.frame, places,
-        reach_nm=config.track.max_step_nm, memory=config.track.memory_frames,
-    )  # fmt: skip
+        rows.frame, places, reach_nm=config.track.max_step_nm, memory=config.track.memory_frames
+    )
     rows = replace(rows, track=track)
     rows = rows.only((np.bincount(track, minlength=1) >= _least(config, rows, inner))[track])
     if bridged:
@@ -124,10 +123,7 @@ def typical(rows: Localizations) -> Localizations:
 
 
 def alone(
-    context: AnalysisContext,
-    rows: Localizations,
-    *,
-    inner: tuple[int, int] | None = None,
+    context: AnalysisContext, rows: Localizations, *, inner: tuple[int, int] | None = None
 ) -> Localizations:
     """Leave out tracks that are rarely isolated or rarely seen: they may be parts of neighbours."""
     config = context.config

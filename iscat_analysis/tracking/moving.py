@@ -130,9 +130,7 @@ def find_rows_and_background(
         progress("track", number, total)
         before = len(rows.frame)
         enough = round(_FEW * before) if number >= _FULL else 0
-        found = search_frames(
-            context, field, ground, rows, pool, enough=enough, cautious=cautious
-        )  # fmt: skip
+        found = search_frames(context, field, ground, rows, pool, enough=enough, cautious=cautious)
         if number and len(found.frame) <= _FEW * before:
             break
         rows = _joined(context, rows, found)
@@ -265,9 +263,9 @@ def _joined(context: AnalysisContext, rows: Localizations, found: FrameCandidate
     """Add candidates to the rows as starting points of fits."""
     n = len(found.frame)
     pixel = context.pixel_nm
-    theta = np.column_stack([
-        found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n),
-    ])  # fmt: skip
+    theta = np.column_stack(
+        [found.x_px * pixel, found.y_px * pixel, found.z_nm, found.strength, np.zeros(n)]
+    )
     unknown = replace(rows, track=np.full(len(rows.frame), -1))
     blur = int(np.bincount(rows.group).argmax()) if len(rows.group) else 0
     return unknown.joined(found.frame, np.full(n, -1), theta, np.full(n, blur, dtype=np.int64))
@@ -323,10 +321,12 @@ def diffusion_of(config: Config, free: BoolArray, rows: Localizations) -> FloatA
         if mine.sum() < _LEAST_POSITIONS:
             continue
         out[k] = estimate_diffusion(
-            rows.frame[mine], rows.theta[mine][:, axes], sigma[mine][:, axes],
+            rows.frame[mine],
+            rows.theta[mine][:, axes],
+            sigma[mine][:, axes],
             frame_rate_hz=rate,
             exposure_ms=1e3 * exposure,
-        )  # fmt: skip
+        )
     return out
 
 

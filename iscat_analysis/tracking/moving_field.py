@@ -218,6 +218,8 @@ def search_frames(
         parts |= zip(others, pool.map(block, others), strict=True)
     found = [parts[first] for first in sorted(parts)]
     return FrameCandidates(
-        *(np.concatenate([getattr(part, name) for part in found])
-          for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr"))
-    )  # fmt: skip
+        *(
+            np.concatenate([getattr(part, name) for part in found])
+            for name in ("frame", "x_px", "y_px", "z_nm", "strength", "snr")
+        )
+    )

@@ -131,12 +131,14 @@ def path_shifts(
     )
     third = (high - low) / (2 * _STEP_NM)  # ∂z of ∂a∂b
     skew = q**1.5
-    changes = np.stack([
-        *(ALONG * q / 2 * second[a, a] for a in range(3)),
-        *(ACROSS * q * second[a, b] for a, b in ((0, 1), (0, 2), (1, 2))),
-        SKEW * skew / 6 * third[2, 2],
-        *(SKEW_ACROSS * skew / 2 * third[a, 2] for a in (0, 1)),
-    ])  # fmt: skip
+    changes = np.stack(
+        [
+            *(ALONG * q / 2 * second[a, a] for a in range(3)),
+            *(ACROSS * q * second[a, b] for a, b in ((0, 1), (0, 2), (1, 2))),
+            SKEW * skew / 6 * third[2, 2],
+            *(SKEW_ACROSS * skew / 2 * third[a, 2] for a in (0, 1)),
+        ]
+    )
     weight = 1 / (1 + signal + read_share)
     fisher = np.einsum("ayx,byx,yx->ab", slopes, slopes, weight)
     scale = 1 / np.sqrt(np.diag(fisher))

@@ -148,9 +148,11 @@ class Extension:
         Shapes: `rows` (n,).
         """
         return replace(
-            self, flagged=self.flagged & ~rows,
-            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda), paired=int(rows.sum()),
-        )  # fmt: skip
+            self,
+            flagged=self.flagged & ~rows,
+            mass_shift_kda=np.where(rows, 0.0, self.mass_shift_kda),
+            paired=int(rows.sum()),
+        )
 
     @property
     def message(self) -> str:

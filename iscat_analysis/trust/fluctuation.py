@@ -144,9 +144,11 @@ class Fluctuation:
     def summary(self) -> Mapping[str, Any]:
         """The section of ``summary.json``."""
         return {
-            "probability": self.probability, "relative": self.relative,
-            "relative_se": self.relative_se, "frames": self.frames,
-        }  # fmt: skip
+            "probability": self.probability,
+            "relative": self.relative,
+            "relative_se": self.relative_se,
+            "frames": self.frames,
+        }
 
 
 @dataclass(frozen=True)

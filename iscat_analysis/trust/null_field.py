@@ -67,9 +67,10 @@ def taken_by(
     """
     rows, columns = windows.after_e.shape
     taken = taken_places(
-        context, (rows, columns),
+        context,
+        (rows, columns),
         [(e.candidate.x_px, e.candidate.y_px, Status.POOR_FIT not in e.flags) for e in events],
-    )  # fmt: skip
+    )
     if context.additive:
         taken |= (
             photons_scale(context, windows) * signal

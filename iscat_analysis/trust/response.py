@@ -16,12 +16,7 @@ from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.sizes import slopes_with_index
-from iscat_analysis.optics.forward import (
-    ForwardModel,
-    PixelGrid,
-    forward_model,
-    peak_per_amplitude,
-)
+from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 
@@ -185,12 +180,14 @@ def response_of(
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     bare = config.model_copy(update={"calibration": None})
     return Response(
-        forward_model(bare, 1.05 * grid.diagonal_nm / 2), grid, tuple(names),
+        forward_model(bare, 1.05 * grid.diagonal_nm / 2),
+        grid,
+        tuple(names),
         tuple(name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS),
         level=config.background.method == "sliding",
         frames=(int(table["n_before"].median()), int(table["n_after"].median())),
         contrast=contrast,
-    )  # fmt: skip
+    )
 
 
 def has_own_index(table: pd.DataFrame) -> NDArray[np.bool_]:

@@ -62,10 +62,12 @@ class ReferenceMap(NamedTuple):
         sizes = ", ".join(
             f"{100 * value:+.1f} ± {100 * error:.1f} % {way}"
             for value, error, way in zip(
-                self.terms, self.errors, ("along x", "along y", "with the square of the distance"),
+                self.terms,
+                self.errors,
+                ("along x", "along y", "with the square of the distance"),
                 strict=True,
             )
-        )  # fmt: skip
+        )
         centre = ", ".join(f"{value:.1f}" for value in self.field_px)
         return (
             f"masses of the same particles differ over the field, as with a reference whose "

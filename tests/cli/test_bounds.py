@@ -108,10 +108,7 @@ def test_pupil(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
         (["--optimize", "pupil", "--for", "colour"], "choose one of x, y, z, mass"),
         (["--optimize", "pupil", "--for", "z"], "z is not free in mode mass"),
         (["--optimize", "pupil", "--free", "colour"], "--free colour: choose among focus"),
-        (
-            ["--optimize", "pupil", "--set", "optics.scheme=darkfield"],
-            "has no reference",
-        ),
+        (["--optimize", "pupil", "--set", "optics.scheme=darkfield"], "has no reference"),
         (["--optimize", "focus", "--for", "mass", "--free", "phase"], "--free also goes with"),
         (["--optimize", "focus", "--for", "mass", "--seed", "1"], "--seed needs --optimize pupil"),
         (["--for", "mass"], "go together"),

@@ -86,10 +86,7 @@ def test_estimators_that_can_be_named_are_listed(
 
 
 def test_one_own_simulation_is_scored(
-    made: Path,
-    sample_configs: dict[str, Path],
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    made: Path, sample_configs: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     results, truth = tmp_path / "r.csv", tmp_path / "t.csv"
     table = _results(made)

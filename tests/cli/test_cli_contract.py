@@ -266,11 +266,7 @@ def test_strict_exits_with_3_where_sigma_is_understated(library, understated, st
             1,
             "unexpected ZeroDivisionError: oh; run again with --debug for the traceback",
         ),
-        (
-            MemoryError(),
-            1,
-            "unexpected MemoryError; run again with --debug for the traceback",
-        ),
+        (MemoryError(), 1, "unexpected MemoryError; run again with --debug for the traceback"),
     ],
 )
 def test_errors_are_one_line_and_a_status(library, capsys, error, status, line) -> None:

@@ -98,11 +98,7 @@ def _found(capsys, *arguments: str) -> dict:
             ["--pixel-size-nm", "84", "--na=1.4", "--sample=gold"],
             [ANSWER, "assumed", ANSWER, ANSWER],
         ),
-        (
-            "ome",
-            ["--na", "1.4", "--instrument", "iscat"],
-            [OME_FILE, OME_FILE, ANSWER, "assumed"],
-        ),
+        ("ome", ["--na", "1.4", "--instrument", "iscat"], [OME_FILE, OME_FILE, ANSWER, "assumed"]),
         (
             "plain",
             ["--pixel-size-nm=84", "--sample=gold", "--instrument", "iscat"],

@@ -245,8 +245,7 @@ def test_virtual_and_external_data_are_refused(tmp_path: Path) -> None:
     raw.write_bytes(bytes(10_000))
     external = [(str(raw), 0, 6 * 10 * 14 * 2)]
     path = _movie_with(
-        tmp_path / "m.mp",
-        lambda f: f.create_dataset("frame", (6, 10, 14), "u2", external=external),
+        tmp_path / "m.mp", lambda f: f.create_dataset("frame", (6, 10, 14), "u2", external=external)
     )
     refuse(path, "lie in other files")
 

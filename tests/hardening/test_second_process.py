@@ -121,12 +121,7 @@ def test_the_work_of_a_lost_process_is_done_again(place: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "number",
-    [
-        signal.SIGINT,
-        pytest.param(signal.SIGTERM, marks=pytest.mark.large),
-        signal.SIGKILL,
-    ],
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.large), signal.SIGKILL]
 )
 def test_the_second_process_ends_with_the_first(place: Path, number: signal.Signals) -> None:
     process = subprocess.Popen(

@@ -22,12 +22,7 @@ from iscat_analysis.config import Config, configure
 from iscat_analysis.optics.collected import collected_area_nm2
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.optics.materials import material
-from iscat_analysis.optics.spheres import (
-    Sphere,
-    amplitudes,
-    coefficients,
-    scattering_length_nm,
-)
+from iscat_analysis.optics.spheres import Sphere, amplitudes, coefficients, scattering_length_nm
 from iscat_analysis.records import PARAMETERS, with_diameters
 from iscat_analysis.report.headline import as_diameters
 from iscat_analysis.trust.assumed import assumed_error

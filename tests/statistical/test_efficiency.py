@@ -15,14 +15,7 @@ from microscopes import PHOTONS, setting
 from scipy.stats import binom
 
 from iscat_analysis.records import PARAMETERS, FloatArray
-from iscat_analysis.study import (
-    Baselines,
-    Setting,
-    Trials,
-    run_trials,
-    score,
-    spread_error,
-)
+from iscat_analysis.study import Baselines, Setting, Trials, run_trials, score, spread_error
 
 pytestmark = pytest.mark.large
 

@@ -108,8 +108,7 @@ def test_the_best_strength_of_a_strong_particle() -> None:
 
 
 @pytest.mark.parametrize(
-    "direction",
-    [35.0, *(pytest.param(d, marks=pytest.mark.large) for d in (80.0, 100.0, 150.0))],
+    "direction", [35.0, *(pytest.param(d, marks=pytest.mark.large) for d in (80.0, 100.0, 150.0))]
 )
 def test_the_direction_of_linear_light_is_told(direction: float) -> None:
     config = configuration()

@@ -60,9 +60,7 @@ def misplaced(seed: int, snr: float, number: int = 12) -> FloatArray:
     return np.hypot(*(apart - np.median(apart, axis=0)).T)
 
 
-def test_pictures_are_registered_to_half_a_pixel(
-    repetitions: Callable[[int, int], int],
-) -> None:
+def test_pictures_are_registered_to_half_a_pixel(repetitions: Callable[[int, int], int]) -> None:
     """A start for the fit of the optics: some twice of what the light tells, 1/(snr·g).
 
     Here g is the gradient of the drawn particle, relative to its size.

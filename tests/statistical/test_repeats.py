@@ -43,10 +43,7 @@ class Layout:
             return [
                 f"background.window_frames={self.window}", "background.drift_correction=false"
             ]  # fmt: skip
-        return [
-            f"background.frames=[0,{self.window}]",
-            f"fit.frames=[{self.window},{self.frames}]",
-        ]
+        return [f"background.frames=[0,{self.window}]", f"fit.frames=[{self.window},{self.frames}]"]
 
 
 LAYOUTS = {"landing": Layout(True, 240, 40, 10), "before-after": Layout(False, 80, 40, 9)}

@@ -33,12 +33,7 @@ def _steps(events: list[tuple[int, float, float, float]], seed: int) -> tuple[Br
         expected[frame:] *= 1 + _ring(y, x, contrast)
     counts = random.poisson(expected).astype(np.uint16)
     alone, _ = find_bright_steps(
-        _chunk(counts),
-        WINDOW,
-        pixel_nm=PIXEL_NM,
-        resolution_nm=370.0,
-        roi_px=20,
-        most=20,
+        _chunk(counts), WINDOW, pixel_nm=PIXEL_NM, resolution_nm=370.0, roi_px=20, most=20
     )
     return alone
 

@@ -13,12 +13,7 @@ from scenes import PIXEL_NM, gold, make_config
 from iscat_analysis._kernels.curvature import first_order_bias
 from iscat_analysis._kernels.hessian import PAIRS
 from iscat_analysis._kernels.image import signal_gradient, signal_image
-from iscat_analysis._kernels.scoring import (
-    image_score,
-    image_value,
-    picture_at,
-    score_pass,
-)
+from iscat_analysis._kernels.scoring import image_score, image_value, picture_at, score_pass
 from iscat_analysis.config import Calibration
 from iscat_analysis.inference import noise
 from iscat_analysis.inference.fit import FOLLOWED, PLAIN, fit_particle, search_box

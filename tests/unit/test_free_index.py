@@ -104,10 +104,7 @@ def test_errors_of_both_are_as_large_as_said(diameter: float, index: float, shar
 
 @pytest.mark.parametrize(
     ("section", "keys", "message"),
-    [
-        ("fit", {"mode": "localize"}, 'use "size"'),
-        ("particle", {"kind": "gold"}, "absorbs"),
-    ],
+    [("fit", {"mode": "localize"}, 'use "size"'), ("particle", {"kind": "gold"}, "absorbs")],
 )
 def test_where_no_index_can_be_fitted_it_is_refused(
     section: str, keys: dict[str, Any], message: str

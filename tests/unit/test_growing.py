@@ -129,8 +129,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize(
-    "kind",
-    [*(pytest.param(kind, marks=pytest.mark.large) for kind in ("tif", "zarr")), "h5"],
+    "kind", [*(pytest.param(kind, marks=pytest.mark.large) for kind in ("tif", "zarr")), "h5"]
 )
 def test_a_movie_that_grows_ends_as_the_finished_file(
     kind: str, config: Config, counts: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

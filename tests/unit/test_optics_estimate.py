@@ -16,12 +16,7 @@ from iscat_analysis.instrument.joint_fit import _Point, _walls, maximise
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage, average_particle_images
 from iscat_analysis.instrument.starts import search_starts
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.optics.parameters import (
-    free_groups,
-    optics_limits,
-    settings_of,
-    with_settings,
-)
+from iscat_analysis.optics.parameters import free_groups, optics_limits, settings_of, with_settings
 
 NAMES = ("focus_nm", "na", "reference_phase_deg", "z7", "z11")
 

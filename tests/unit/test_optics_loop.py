@@ -87,9 +87,7 @@ def test_optics_are_used_that_were_accepted_and_learned_from_good_pictures(
     assert len(rounds.all) == len(good)
 
 
-def test_pictures_are_collected_with_what_was_learned_last(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_pictures_are_collected_with_what_was_learned_last(monkeypatch: pytest.MonkeyPatch) -> None:
     source = _Source(True, True)
     _learn(monkeypatch, source, False, True)
     assert source.ahead[0] == -290.0

@@ -282,11 +282,7 @@ def test_dark_field_takes_no_scale_from_the_simulation(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "background",
-    [
-        {"method": "median"},
-        {"method": "known", "level_e": 4e4},
-        {"power_normalization": False},
-    ],
+    [{"method": "median"}, {"method": "known", "level_e": 4e4}, {"power_normalization": False}],
 )
 def test_backgrounds(background: dict[str, Any], tmp_path: Path) -> None:
     flat = {} if background.get("method") == "median" else {"background": "flat"}

@@ -125,8 +125,7 @@ def test_motion_of_two_particles_is_told_in_300_frames(d_um2_s: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("frames", "species"),
-    [(200, ((400.0, 0.15, 2), (200.0, 0.8, 1))), (300, ((400.0, 0.05, 3),))],
+    ("frames", "species"), [(200, ((400.0, 0.15, 2), (200.0, 0.8, 1))), (300, ((400.0, 0.05, 3),))]
 )
 @pytest.mark.parametrize(
     "seed", [300, *(pytest.param(seed, marks=pytest.mark.large) for seed in (301, 302))]

@@ -231,10 +231,7 @@ def test_a_failure_is_counted_with_its_reason(estimate: Estimate, said: str, dra
 
 @pytest.mark.parametrize(
     ("name", "limit_s", "said"),
-    [
-        ("hangs", 0.5, "no answer within 0.5 s"),
-        ("ends_its_process", 300.0, "ended with status 7"),
-    ],
+    [("hangs", 0.5, "no answer within 0.5 s"), ("ends_its_process", 300.0, "ended with status 7")],
 )
 def test_a_process_that_hangs_or_dies_is_counted(name, limit_s, said, drawn, repo_root) -> None:
     one = find_estimator(f"estimators_for_tests:{name}")

@@ -107,8 +107,7 @@ def test_a_wrong_offset_is_named_with_what_it_does_to_masses(power: float, why: 
     assert why in missing
     assert "gain" not in missing
     counts, effect, advised = map(
-        float,
-        re.findall(r"by (\d+) ± .* masses ([\d.]+) % too small: set .* = (\d+)", missing)[0],
+        float, re.findall(r"by (\d+) ± .* masses ([\d.]+) % too small: set .* = (\d+)", missing)[0]
     )
     assert counts == pytest.approx(TRUE_COUNTS, abs=800)
     assert effect == pytest.approx(7.4, abs=3)

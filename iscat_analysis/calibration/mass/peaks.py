@@ -183,7 +183,9 @@ def _hessian(
     for i in range(theta.size):
         for j in range(theta.size):
             out[i, j] = (
-                function(at + unit[i] + unit[j]) - function(at + unit[i] - unit[j])
-                - function(at - unit[i] + unit[j]) + function(at - unit[i] - unit[j])
-            ) / (4 * step**2)  # fmt: skip
+                function(at + unit[i] + unit[j])
+                - function(at + unit[i] - unit[j])
+                - function(at - unit[i] + unit[j])
+                + function(at - unit[i] - unit[j])
+            ) / (4 * step**2)
     return out

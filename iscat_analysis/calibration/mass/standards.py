@@ -20,9 +20,7 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.optics.forward import PEAK_SEARCH_RADIUS, forward_model
 
-_OF_A_MOVIE = {
-    "file": None, "covariance": None, "calibrate": "auto", **MOVING,
-}  # fmt: skip
+_OF_A_MOVIE = {"file": None, "covariance": None, "calibrate": "auto", **MOVING}
 """Keys of [optics] that do not change the contrast of standards, and their neutral values."""
 
 
@@ -85,9 +83,11 @@ def with_standards(config: Config) -> Config:
         return config
     found = standards_of(config)
     update = {
-        "optics": found.optics, "covariance": found.covariance, "height_nm": found.height_nm,
+        "optics": found.optics,
+        "covariance": found.covariance,
+        "height_nm": found.height_nm,
         "optics_assumed": True,
-    }  # fmt: skip
+    }
     return config.model_copy(update={"calibration": line.model_copy(update=update)})
 
 
@@ -109,8 +109,9 @@ def contrast_over(config: Config, standards: Standards) -> tuple[float, str]:
     )
     line = Calibration(
         gradient_per_kda=1e-5 if rises else -1e-5,
-        optics=standards.optics, height_nm=standards.height_nm,
-    )  # fmt: skip
+        optics=standards.optics,
+        height_nm=standards.height_nm,
+    )
     scale = forward_model(config.model_copy(update={"calibration": line}), reach_nm).scale
     return scale.carried, scale.refusal
 

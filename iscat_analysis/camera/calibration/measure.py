@@ -267,9 +267,11 @@ def _maps(
     """Make one number per pixel; masked pixels keep that of the whole sensor."""
     gain = result.gain.value
     offset = dark.mean if dark is not None else np.full(used.shape, result.offset.value)
-    read = dark.variance if dark is not None else np.full(
-        used.shape, max(0.0, result.intercept + result.slope * result.offset.value)
-    )  # fmt: skip
+    read = (
+        dark.variance
+        if dark is not None
+        else np.full(used.shape, max(0.0, result.intercept + result.slope * result.offset.value))
+    )
     light = sum(
         ((item.n_frames - 1) * (item.mean - offset) for item in found), np.zeros(used.shape)
     )

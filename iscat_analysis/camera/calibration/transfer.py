@@ -126,13 +126,15 @@ def _binned(found: Moments, used: BoolArray, other: FloatArray) -> Transfer:
     rows = []
     for part in brightness_bins(mean):
         root = math.sqrt(part.size)
-        rows.append([
-            mean[part].mean(),
-            variance[part].mean(),
-            wider[0] * variance[part].std(ddof=1) / root,
-            found.slope[used][part].mean(),
-            wider[1] * math.sqrt(found.slope_variance[used][part].mean()) / root,
-        ])  # fmt: skip
+        rows.append(
+            [
+                mean[part].mean(),
+                variance[part].mean(),
+                wider[0] * variance[part].std(ddof=1) / root,
+                found.slope[used][part].mean(),
+                wider[1] * math.sqrt(found.slope_variance[used][part].mean()) / root,
+            ]
+        )
     light, noises, noises_se, slopes, slopes_se = np.array(rows).T
     return Transfer(
         light, noises, noises_se, slopes, slopes_se, level=level, noise=noise, flicker=flicker

@@ -18,12 +18,7 @@ from iscat_analysis.camera.counts import Camera, check_counts
 from iscat_analysis.camera.field_sample import sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.records import (
-    BoolArray,
-    CountSource,
-    FloatArray,
-    Mapper,
-)
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, Mapper
 from iscat_analysis.scratch import Scratch
 from iscat_analysis.search.sliding import (
     DARK,

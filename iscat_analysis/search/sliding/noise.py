@@ -66,11 +66,7 @@ class NoiseCurve:
 
 
 def measure_noise(
-    counts: NDArray[Any],
-    camera: Camera,
-    longest: int,
-    *,
-    follows: bool = False,
+    counts: NDArray[Any], camera: Camera, longest: int, *, follows: bool = False
 ) -> NoiseCurve:
     """Noise of averages over frames, as the Allan deviation has it: neighbours are compared.
 

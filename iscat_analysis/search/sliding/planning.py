@@ -62,13 +62,15 @@ def plan_parts(
     return [
         [
             Part(
-                (begin, end), (max(begin - halo, first), min(end + halo, last)), tile,
+                (begin, end),
+                (max(begin - halo, first), min(end + halo, last)),
+                tile,
                 controlled=(number * len(tiles) + place) % every == 0,
             )
             for place, tile in enumerate(tiles)
         ]
         for number, (begin, end) in enumerate(pairwise([*range(first, last, even), last]))
-    ]  # fmt: skip
+    ]
 
 
 def halo_px(config: Config) -> int:
@@ -138,11 +140,7 @@ def _moving_bytes(config: Config) -> int:
 
 
 def plan_chunks(
-    reader: Reader,
-    config: Config,
-    window: int,
-    stride: int,
-    stretch: tuple[int, int] | None = None,
+    reader: Reader, config: Config, window: int, stride: int, stretch: tuple[int, int] | None = None
 ) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     """Divide a movie, or a stretch of it, whose field is not divided; empty where it has to be."""
     first, last = stretch or (reader.first, reader.last)

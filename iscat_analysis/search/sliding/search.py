@@ -99,10 +99,7 @@ def make_filter(chunk: Chunk, template: FloatArray, noise: NoiseSpectrum | None 
     """
     rows, columns = chunk.shape
     half = template.shape[0] // 2
-    size = (
-        fft.next_fast_len(rows + half, real=True),
-        fft.next_fast_len(columns + half, real=True),
-    )
+    size = (fft.next_fast_len(rows + half, real=True), fft.next_fast_len(columns + half, real=True))
     mean = np.where(chunk.usable, chunk.mean_e, 0.0)
     read = chunk.camera.read_variance_e2(chunk.shape)
     weight = np.zeros(size)
@@ -225,11 +222,7 @@ class Peak:
 
 
 def find_steps(
-    chunk: Chunk,
-    matched: Filter,
-    snr: MapArray,
-    effective: FloatArray,
-    threshold: float,
+    chunk: Chunk, matched: Filter, snr: MapArray, effective: FloatArray, threshold: float
 ) -> list[Peak]:
     """Peaks in (t, y, x) above the threshold, strongest first.
 

@@ -66,9 +66,10 @@ class Tile:
         rows, columns = (
             slice(low - first if low > first else None, high - first if high < last else None)
             for (low, high), (first, last) in (
-                (self.core_rows, self.rows), (self.core_columns, self.columns),
+                (self.core_rows, self.rows),
+                (self.core_columns, self.columns),
             )
-        )  # fmt: skip
+        )
         return rows, columns
 
     @property

@@ -130,12 +130,13 @@ class MovingField:
             near.optics.na * pixel_nm
         )
         self._book = PictureBook(
-            near, far,
+            near,
+            far,
             pixel_nm=pixel_nm,
             near_px=(roi_px + 1) / 2 + _SLACK[0] + reach / pixel_nm,
             far_px=min((self._whole.drawn + 1) / 2, farthest) + 1,
             z_range_nm=z_range_nm,
-        )  # fmt: skip
+        )
         self._pictures = self._book.of(np.zeros(1))
 
     @cached_property

@@ -141,6 +141,5 @@ class Judged:
         shift[:, index] = np.einsum("nij,nj->ni", inverse, bias[:, index])
         gain, chi2, pixels, worst, level, growth = numbers.T
         return cls(
-            fisher, observed, np.nan_to_num(shift), gain, chi2, pixels, worst, level, growth,
-            slopes,
-        )  # fmt: skip
+            fisher, observed, np.nan_to_num(shift), gain, chi2, pixels, worst, level, growth, slopes
+        )

@@ -89,6 +89,5 @@ def _along_z(
     one, lens = tables[0], model.lens
     window = np.zeros((1, 0, 0)) if isinstance(lens, RoundLens) else lens.window[None]
     return Pictures(
-        heights, one.first_nm, one.step_nm, one.kappa, lens, window,
-        np.zeros((2, 0, 0)),
-    )  # fmt: skip
+        heights, one.first_nm, one.step_nm, one.kappa, lens, window, np.zeros((2, 0, 0))
+    )

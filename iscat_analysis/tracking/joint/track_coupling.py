@@ -52,9 +52,8 @@ class Coupling:
         free = self._slopes.values.shape[1]
         out = np.zeros((len(self._rows), free, free))
         own_shares(
-            self._slopes, self._rows, self._squares, self._weight, out,
-            *np.empty((2, self._room)),
-        )  # fmt: skip
+            self._slopes, self._rows, self._squares, self._weight, out, *np.empty((2, self._room))
+        )
         return out
 
     def sent(self, by: FloatArray) -> FloatArray:
