@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from iscat_analysis.bounds import parse_scan, scan
 from iscat_analysis.config import Config
+from iscat_analysis.findings import Finding
 from iscat_analysis.records import (
     BUDGET_COLUMNS,
     FREE_PARAMETERS,
@@ -94,8 +95,13 @@ class Result:
         return self.analysis.mode
 
     @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What the user should know, each with a code, a severity, its values and a remedy."""
+        return self.analysis.findings
+
+    @property
     def warnings(self) -> tuple[str, ...]:
-        """What the user should know, one line each."""
+        """Sentences of the findings that are more than a note."""
         return self.analysis.warnings
 
     @property

@@ -9,6 +9,7 @@ import pandas as pd
 from walkers import SETUP
 
 from iscat_analysis.config import config_to_toml, parse_config
+from iscat_analysis.findings import remark
 from iscat_analysis.records import (
     EVENT_COLUMNS,
     FREE_PARAMETERS,
@@ -174,7 +175,7 @@ def make_analysis(
             seed=1,
             started="2024-05-06T07:08:09+00:00",
         ),
-        warnings=("The TIFF says pixel_size_nm = 84.0, the configuration 84.4: using 84.4.",),
+        findings=(remark("The TIFF says pixel_size_nm = 84.0, not 84.4: using 84.4."),),
     )
 
 
@@ -256,6 +257,7 @@ def summary_of(table: pd.DataFrame, mode: str, scheme: str) -> dict[str, object]
         "input": {"path": HOSTILE, "sha256": "0" * 64},
         "seed": 1,
         "versions": {"iscat-analysis": "0.1.0", "python": "3.11.7", "numpy": "2.1.0"},
+        "findings": [],
         "warnings": [],
         "efficiency": np.nan,
     }
@@ -265,5 +267,5 @@ def without_events(analysis: Analysis) -> Analysis:
     """Take every event out of an analysis."""
     tracks = None if analysis.tracks is None else analysis.tracks.iloc[:0]
     return replace(
-        analysis, table=analysis.table.iloc[:0], views=(), warnings=(), tracks=tracks, films=()
+        analysis, table=analysis.table.iloc[:0], views=(), findings=(), tracks=tracks, films=()
     )

@@ -26,13 +26,14 @@ from iscat_analysis.diagnosis.camera_numbers import law_messages
 from iscat_analysis.diagnosis.causes import axes_warning
 from iscat_analysis.diagnosis.light import JudgedLight, judge_light
 from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_noise
-from iscat_analysis.diagnosis.prepared import Finding, Prepared, within
+from iscat_analysis.diagnosis.prepared import Prepared, within
 from iscat_analysis.diagnosis.recognise import look_at_changes
 from iscat_analysis.diagnosis.repeated_frames import without_repeats
 from iscat_analysis.diagnosis.stage import motion_message, with_drift_correction
 from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
 from iscat_analysis.diagnosis.turns import refuse_channels
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import Finding, aside, remark, unreported
 from iscat_analysis.fitting.background_mode import describe_background_mode
 from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.run import Notify, notify_nobody
@@ -55,11 +56,11 @@ def metadata(state: Prepared) -> tuple[Prepared, list[Finding]]:
         darkfield_photons(config.particle)
     movie = state.movie.channel(config.camera.channels)
     config, notes = resolve_metadata(config, movie.metadata)
-    findings = [Finding(note) for note in (*movie.notes, *notes)]
-    findings.append(Finding(describe_background_mode(config), is_warning=False))
+    findings = [remark(note) for note in (*movie.notes, *notes)]
+    findings.append(aside(describe_background_mode(config)))
     if config.optics.psf == "measured":
         findings.append(
-            Finding(
+            remark(
                 'optics.psf = "measured": bounds are those of the template, and there is no '
                 "quantum bound: a measured picture does not give the field"
             )
@@ -87,7 +88,7 @@ def breaks(state: Prepared) -> tuple[Prepared, list[Finding]]:
     if not found.breaks:
         return replace(state, stretches=found), []
     state = replace(state, stretches=found, config=within(config, found.main))
-    return state, [Finding(found.message(movie.name))]
+    return state, [remark(found.message(movie.name))]
 
 
 def camera(state: Prepared) -> tuple[Prepared, list[Finding]]:
@@ -97,15 +98,15 @@ def camera(state: Prepared) -> tuple[Prepared, list[Finding]]:
     refuse_ratio(movie.read(0, 1)[0], f"{name}: frame 0", stated)
     refuse_channels(movie.read(*_first_frames(state)), stated, name)
     movie, config, known = with_camera(movie, config, learned_from)
-    findings = [Finding(f"{name}: {text}") for text in (*known.messages, *law_messages(known))]
+    findings = [remark(f"{name}: {text}") for text in (*known.messages, *law_messages(known))]
     stored = state.stored
     if known.text is not None:
         stored = without_text(stored, known.text, known.camera)
-        findings.append(Finding(text_message(known.text, name)))
+        findings.append(remark(text_message(known.text, name)))
     if known.padding_message:
-        findings.append(Finding(f"{name}: {known.padding_message}", is_warning=False))
+        findings.append(aside(f"{name}: {known.padding_message}"))
     if state.config.camera.assumed is not state.config.camera:
-        findings.append(Finding(f"{name}: {known.description}", is_warning=False))
+        findings.append(aside(f"{name}: {known.description}"))
     state = replace(
         state, stored=stored, whole=movie, movie=movie, steady=movie, config=config, known=known,
         summary={"camera": known.summary},
@@ -120,21 +121,21 @@ def repeats(state: Prepared) -> tuple[Prepared, list[Finding]]:
         return state, []
     kept = without_repeats(state.movie, config, state.camera)
     state = replace(state, movie=kept.movie, steady=kept.movie, config=kept.config, kept=kept)
-    return state, [Finding(kept.message)] if kept.message else []
+    return state, [remark(kept.message)] if kept.message else []
 
 
 def counts(state: Prepared) -> tuple[Prepared, list[Finding]]:
     """Refuse counts that no camera gives, and find what was done to them before."""
     movie, name = state.movie, state.movie.name
     processing = find_processing(movie, state.camera, state.span, moving=state.tracked)
-    findings = [] if processing is None else [Finding(f"{name}: {processing.message}")]
+    findings = [] if processing is None else [remark(f"{name}: {processing.message}")]
     start, stop = _first_frames(state)
     seen = movie.read(start, stop)
     if state.background_mode != "sliding":  # windows that slide pass over frames that repeat
         _refuse_still(seen, f"{name}: frames {start} to {stop - 1}")
     refuse_overflow(state.stored.read(start, stop), name)
     if swapped := axes_warning(name, seen):
-        findings.append(Finding(swapped))
+        findings.append(remark(swapped))
     if processing is None:
         return state, findings
     summary = {**state.summary, "processing": processing.summary}
@@ -153,13 +154,13 @@ def light(state: Prepared) -> tuple[Prepared, list[Finding]]:
                 config = with_drift_correction(config, moves=bool(motion))
             if motion:
                 said = f"{name}: {motion}; its motion is followed and divided out"
-                findings.append(Finding(said, is_warning=False))
+                findings.append(aside(said))
                 judged, opening, _ = _landing_light(state, config)
         else:
             if follow:  # in the light as it is; again if anything of it is unsteady
                 changes = start_in_thread(look_at_changes, movie, config, state.camera, state.span)
             judged = judge_light(movie, config, state.camera)
-    findings += [Finding(f"{name}: {text}") for text in judged.messages]
+    findings += [remark(f"{name}: {text}") for text in judged.messages]
     if follow and (changes is None or judged.steady is not movie):
         steady = judged.steady
         changes = start_in_thread(look_at_changes, steady, config, state.camera, state.span)
@@ -183,7 +184,7 @@ def calibrated(
     config: Config,
     steps: Sequence[Step] = LIGHT_STEPS,
     *,
-    warn: Notify = notify_nobody,
+    report: Callable[[Finding], None] = unreported,
     notify: Notify = notify_nobody,
     ahead: bool = False,
 ) -> Prepared:
@@ -194,7 +195,7 @@ def calibrated(
     for step in steps:
         state, findings = step(state)
         for finding in findings:
-            (warn if finding.is_warning else notify)(finding.text)
+            report(finding)
     return state
 
 

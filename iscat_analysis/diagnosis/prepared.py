@@ -25,14 +25,6 @@ from iscat_analysis.records import Status
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One sentence for the user; a warning stays with the result."""
-
-    text: str
-    is_warning: bool = True
-
-
-@dataclass(frozen=True)
 class Prepared:
     """A movie and what is known of it, before it is searched.
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from iscat_analysis.executors import Executor
+from iscat_analysis.findings import Finding, Findings, existing, remark
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.inference.heights import has_prior
 from iscat_analysis.inference.noise import compile_kernels, parts_of
@@ -36,7 +37,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Run:
-    """The settings of one run, and the warnings that it collects."""
+    """The settings of one run, and the findings that it collects."""
 
     notify: Notify
     progress: Progress
@@ -44,12 +45,17 @@ class Run:
     executor: Executor
     inject: int
     clock: Clock = field(default_factory=Clock)
-    warnings: list[str] = field(default_factory=list)
+    findings: Findings = field(default_factory=Findings)
+
+    def report(self, *findings: Finding | None) -> None:
+        """Print findings, and keep them for the result; what is None was not found."""
+        for finding in existing(findings):
+            self.findings.add(finding)
+            self.notify(finding.text)
 
     def warn(self, text: str) -> None:
-        """Show a warning to the user, and keep it for the result."""
-        self.warnings.append(text)
-        self.notify(text)
+        """Report a sentence that has no code yet."""
+        self.report(remark(text))
 
     def warm_up(self, context: AnalysisContext) -> None:
         """Load or compile the kernels of fits."""

@@ -18,6 +18,7 @@ from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, SCAN_STEPS, calibra
 from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_counts
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import printing
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
@@ -304,7 +305,7 @@ def calibrate_movie(
         _check_step(focus_step_nm, movie.channel(config.camera.channels).shape[0])
     refuse_uncalibratable(config)
     steps = LIGHT_STEPS if focus_step_nm is None else SCAN_STEPS
-    ready = calibrated(movie, config, steps, warn=notify or notify_nobody)
+    ready = calibrated(movie, config, steps, report=printing(notify))
     movie, config, camera = ready.steady, ready.config, ready.camera
     with threads(config.compute.workers) as pool:
         progress("particles", 0, 1)

@@ -25,8 +25,8 @@ import numpy as np
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import printing
 from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
@@ -140,7 +140,7 @@ def measure_template(
             f'fit.mode = "{config.fit.mode}" needs the picture at every height, which --measured '
             'does not give: use fit.mode = "mass"'
         )
-    ready = calibrated(movie, config, warn=notify or notify_nobody)
+    ready = calibrated(movie, config, report=printing(notify))
     movie, config, camera = ready.steady, ready.config, ready.camera
     pixel = float(config.camera.pixel_size_nm or np.nan)
     roi_nm = config.fit.roi_px(pixel) * pixel

@@ -177,7 +177,8 @@ def make_analysis(
         "seed": provenance.seed,
         "versions": dict(provenance.versions),
         "interrupted": interrupted,
-        "warnings": run.warnings,
+        "findings": run.findings.summary,
+        "warnings": run.findings.warnings,
         **described,
     }
     frames, first = _unique_frames(compared)
@@ -193,7 +194,7 @@ def make_analysis(
         power_frames=frames,
         summary=summary,
         provenance=provenance,
-        warnings=tuple(run.warnings),
+        findings=tuple(run.findings.made),
         tracks=tracks,
         films=films,
         response=ready.response.table if ready.response is not None else None,

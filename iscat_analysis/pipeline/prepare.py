@@ -8,7 +8,7 @@ from iscat_analysis.calibration.mass import with_standards
 from iscat_analysis.camera.burnt_in import text_summary
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, Step, calibrated
-from iscat_analysis.diagnosis.prepared import Finding, Prepared
+from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.diagnosis.recognise import (
     as_landing,
     as_moving,
@@ -16,6 +16,7 @@ from iscat_analysis.diagnosis.recognise import (
     look_at_changes,
 )
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.findings import Finding, remark
 from iscat_analysis.fitting.ranges import tracked_frames
 from iscat_analysis.fitting.run import Run
 from iscat_analysis.instrument.contrast_sign import learn_sign, wrong_sign
@@ -26,7 +27,7 @@ from iscat_analysis.threads import start_in_thread
 
 def prepare(movie: Stack, config: Config, run: Run) -> Prepared:
     """Load and calibrate a movie."""
-    ready = calibrated(movie, config, STEPS, warn=run.warn, notify=run.notify, ahead=True)
+    ready = calibrated(movie, config, STEPS, report=run.report, notify=run.notify, ahead=True)
     run.clock.lap("optics")
     if ready.background_mode != "sliding":
         _refuse_what_only_slides(run, movie.name)
@@ -43,7 +44,7 @@ def times(state: Prepared) -> tuple[Prepared, list[Finding]]:
     from iscat_analysis.tracking.tracks import judge_times
 
     frames = tracked_frames(state.movie, state.config)
-    return state, [Finding(text) for text in judge_times(state.config, frames, state.movie.name)]
+    return state, [remark(text) for text in judge_times(state.config, frames, state.movie.name)]
 
 
 def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
@@ -71,7 +72,7 @@ def optics(state: Prepared) -> tuple[Prepared, list[Finding]]:
             texts.append(stretches.message(steady.name))
     summary = {**state.summary, **({"optics": learned} if learned else {})}
     state = replace(state, config=config, changes=changes, stretches=stretches, summary=summary)
-    return state, [Finding(text) for text in texts]
+    return state, [remark(text) for text in texts]
 
 
 def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
@@ -82,7 +83,7 @@ def kind(state: Prepared) -> tuple[Prepared, list[Finding]]:
     other = (as_landing if state.tracked else as_moving)(changes, state.movie.name)
     summary = {**state.summary, "changes": changes_summary(changes)}
     state = replace(state, other_kind=other, summary=summary)
-    return state, [Finding(other)] if other else []
+    return state, [remark(other)] if other else []
 
 
 STEPS: tuple[Step, ...] = (*LIGHT_STEPS, times, optics, kind)

@@ -14,6 +14,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
+from iscat_analysis.findings import printing
 from iscat_analysis.fitting.background_mode import BackgroundMode
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie import Stack
@@ -82,7 +83,7 @@ class Preview:
                 "what open_stack and configure return"
             )
         notes: list[str] = []
-        self.prepared = calibrated(movie, config, warn=notes.append)
+        self.prepared = calibrated(movie, config, report=printing(notes.append))
         self.config = self.prepared.over_all_stretches().config
         self.notes = tuple(notes)
         self.camera, self.steady = self.prepared.known, self.prepared.steady

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.findings import Finding, warnings_in
 from iscat_analysis.records.arrays import FloatArray
 from iscat_analysis.records.fits import PosteriorResult
 
@@ -184,8 +185,8 @@ class Analysis:
         What ``summary.json`` holds.
     provenance : Provenance
         Versions, hash, command.
-    warnings : tuple of str
-        One line each.
+    findings : tuple of Finding
+        What the user should know beside the numbers, in the order in which it was found.
     tracks : pandas.DataFrame or None
         Mode ``track``: one row per track, columns `TRACK_COLUMNS`.
     films : tuple of Film
@@ -205,7 +206,12 @@ class Analysis:
     power_frames: NDArray[np.int64]
     summary: Mapping[str, Any]
     provenance: Provenance
-    warnings: tuple[str, ...] = field(default=())
+    findings: tuple[Finding, ...] = ()
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     response: pd.DataFrame | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences of the findings that are more than a note."""
+        return tuple(warnings_in(self.findings))

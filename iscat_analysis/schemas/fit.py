@@ -34,6 +34,17 @@ else:
     Event = row_model("Event", "One row of fits.csv.", EVENTS, Status)
 
 
+class FindingEntry(Closed):
+    """One thing that was found, and what to do."""
+
+    code: str = key("Which kind of finding, from the list in the manual")
+    severity: Literal["note", "caution", "fault"] = key("How much it matters")
+    values: dict[str, float | int | str] = key("The values of its sentence")
+    frames: tuple[Count, Count] | None = key("Frames that it is about [start, stop)")
+    text: str = key("The sentence, as it is printed")
+    remedy: str = key("What to do; empty where nothing is to be done")
+
+
 class Medians(Document):
     """Medians of one free parameter over the events that are ok."""
 
@@ -431,7 +442,8 @@ class Summary(Document):
     input: Input = key("The movie")
     seed: int | None = key("Seed of the posterior sampler")
     versions: Versions = key("Of this program, Python and the numerical libraries")
-    warnings: list[str] = key("What the user should know, one line each")
+    findings: list[FindingEntry] = key("What the user should know, the most severe first")
+    warnings: list[str] = key("Sentences of the findings that are more than a note, as printed")
     interrupted: bool = maybe("Whether an interrupt ended the run early")
     camera: CameraNumbers = maybe("The camera's numbers, and where they come from")
     background: Background = maybe("Movies with background frames: noise and drift")

@@ -1,0 +1,29 @@
+"""What a movie, a table or a day tells beside its numbers: findings with a code, and what to do.
+
+A finding of each kind is defined once, in the module of what it is about, as photutils defines its
+flags: code, severity, sentence, remedy and page of the manual.  Whoever makes one gives the values
+that stand in the sentence.  One place prints them, the page sorts them by severity, and
+``summary.json`` lists them with their values, so that a program can act on a code.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.findings.registry import (
+    KINDS,
+    Finding,
+    FindingKind,
+    Findings,
+    Severity,
+    aside,
+    define,
+    existing,
+    printing,
+    remark,
+    unreported,
+    warnings_in,
+)
+
+__all__ = [
+    "KINDS", "Finding", "FindingKind", "Findings", "Severity", "aside", "define", "existing",
+    "printing", "remark", "unreported", "warnings_in",
+]  # fmt: skip

@@ -1,0 +1,192 @@
+"""The registry of findings: each kind has a code of its own, and a sentence that takes values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from string import Formatter
+from typing import Any
+
+Value = float | int | str
+
+
+class Severity(StrEnum):
+    """How much a finding changes what a reader may conclude, least first."""
+
+    NOTE = "note"
+    """Something was learned or left out; the numbers are right as they stand."""
+    CAUTION = "caution"
+    """Numbers may be wrong by more than their errors, or some are missing."""
+    FAULT = "fault"
+    """Numbers are wrong unless the remedy is taken."""
+
+
+@dataclass(frozen=True)
+class FindingKind:
+    """What all findings of one code have in common.
+
+    Attributes
+    ----------
+    code : str
+        Words joined by hyphens; never changed, because programs test it.
+    severity : Severity
+        How much it matters.
+    sentence : str
+        What was found, with the names of values in braces, formatted as by `str.format`.
+    remedy : str
+        What the user can do, in the same way; empty where nothing is to be done.
+    page : str
+        Page of the manual that explains it, as ``"howto/focus"``.
+    """
+
+    code: str
+    severity: Severity
+    sentence: str
+    remedy: str = ""
+    page: str = ""
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the values that sentence and remedy need."""
+        parts = [*Formatter().parse(self.sentence), *Formatter().parse(self.remedy)]
+        return frozenset(name for _, name, _, _ in parts if name)
+
+    def __call__(
+        self,
+        values: Mapping[str, Value] | None = None,
+        *,
+        where: str = "",
+        frames: tuple[int, int] | None = None,
+    ) -> Finding:
+        """Make a finding; values that the sentence does not name go to ``summary.json`` alone."""
+        values = dict(values or {})
+        if missing := self.names - values.keys():
+            raise KeyError(f"{self.code}: no value for {', '.join(sorted(missing))}")
+        return Finding(self, values, where, frames)
+
+
+KINDS: dict[str, FindingKind] = {}
+"""All kinds of finding that were defined, by code."""
+
+
+def define(
+    code: str, severity: Severity, sentence: str, remedy: str = "", page: str = ""
+) -> FindingKind:
+    """Register a kind of finding; a code that is taken is refused at import."""
+    if code in KINDS:
+        raise ValueError(f"the finding {code!r} is defined twice")
+    KINDS[code] = FindingKind(code, severity, sentence, remedy, page)
+    return KINDS[code]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was found, with the values of its sentence.
+
+    Attributes
+    ----------
+    kind : FindingKind
+        Its code, severity, sentence and remedy.
+    values : mapping
+        Numbers and words of the sentence, and others that a program may want.
+    where : str
+        The movie or table that it is about; empty if that is plain.
+    frames : (int, int) or None
+        First frame, and the one after the last, where it is about some frames only.
+    """
+
+    kind: FindingKind
+    values: Mapping[str, Value] = field(default_factory=dict)
+    where: str = ""
+    frames: tuple[int, int] | None = None
+
+    @property
+    def code(self) -> str:
+        """Code of its kind."""
+        return self.kind.code
+
+    @property
+    def severity(self) -> Severity:
+        """How much it matters."""
+        return self.kind.severity
+
+    @property
+    def remedy(self) -> str:
+        """What the user can do; empty where nothing is to be done."""
+        return self.kind.remedy.format(**self.values)
+
+    @property
+    def text(self) -> str:
+        """The whole sentence, as it is printed."""
+        where = f"{self.where}: " if self.where else ""
+        remedy = f"; {self.remedy}" if self.kind.remedy else ""
+        return where + self.kind.sentence.format(**self.values) + remedy
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Its entry in ``findings`` of ``summary.json``."""
+        return {
+            "code": self.code,
+            "severity": str(self.severity),
+            "values": dict(self.values),
+            "frames": None if self.frames is None else list(self.frames),
+            "text": self.text,
+            "remedy": self.remedy,
+        }
+
+
+@dataclass
+class Findings:
+    """The findings of a run, in the order in which they were made."""
+
+    made: list[Finding] = field(default_factory=list)
+
+    def add(self, *findings: Finding | None) -> None:
+        """Keep findings; what is None was not found."""
+        self.made.extend(existing(findings))
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences of all that are more than a note, in the same order."""
+        return warnings_in(self.made)
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """``findings`` of ``summary.json``, the most severe first."""
+        order = list(Severity)[::-1]
+        ranked = sorted(self.made, key=lambda finding: order.index(finding.severity))
+        return [finding.summary for finding in ranked]
+
+
+def unreported(finding: Finding) -> None:
+    """Drop a finding."""
+
+
+def printing(notify: Callable[[str], None] | None) -> Callable[[Finding], None]:
+    """Report findings as their sentences; to nobody if `notify` is None."""
+    return unreported if notify is None else lambda finding: notify(finding.text)
+
+
+def warnings_in(findings: Iterable[Finding]) -> list[str]:
+    """Sentences of the findings that are more than a note."""
+    return [finding.text for finding in findings if finding.severity is not Severity.NOTE]
+
+
+def existing(findings: Iterable[Finding | None]) -> list[Finding]:
+    """Leave out what was looked for and not found."""
+    return [finding for finding in findings if finding is not None]
+
+
+_REMARK = define("remark", Severity.CAUTION, "{text}")
+_ASIDE = define("aside", Severity.NOTE, "{text}")
+
+
+def remark(text: str) -> Finding:
+    """Wrap a sentence that has no code yet."""
+    return _REMARK({"text": text})
+
+
+def aside(text: str) -> Finding:
+    """Wrap a note that has no code yet."""
+    return _ASIDE({"text": text})
