@@ -80,7 +80,8 @@ test-all: lint-and-kernels
 
 # Old libraries may use what new ones deprecate, so that warnings are errors above but not here.
 test-lowest: $(LOWEST)/.installed
-	$(LOWEST)/bin/python -m $(PYTEST) -q -p no:cacheprovider tests/unit tests/physics \
+	$(LOWEST)/bin/python -m $(PYTEST) -q -p no:cacheprovider tests \
+	    --ignore=tests/app --ignore=tests/cli --ignore=tests/docs --ignore=tests/hardening --ignore=tests/viewer \
 	    -W default::DeprecationWarning -W default::PendingDeprecationWarning -W default::FutureWarning
 
 $(LOWEST)/.installed: pyproject.toml .ci/lowest.py

@@ -133,7 +133,7 @@ def test_a_movie_of_a_membrane_says_so() -> None:
 
 MEMBRANE = """
 import sys
-sys.path[:0] = ["tests", "tests/unit"]
+sys.path[:0] = ["tests", "tests/camera"]
 import iscat_analysis as ia
 from test_planes import _moving
 config, movie = _moving(seed=2, exposure_ms=2.5, d_um2_s=0.8)
