@@ -18,10 +18,11 @@ PYTEST := pytest -n auto --dist loadfile --no-loadscope-reorder
 DEMO_CONFIG := sample_configs/landing.toml
 DEMO        := demo
 
-.PHONY: help install runtime demo test tests test-all test-lowest lint kernels lint-and-kernels bench docs docs-and-test clean
+.PHONY: help install runtime demo quick test tests test-all test-lowest lint kernels lint-and-kernels bench docs docs-and-test clean
 
 help:
 	@echo "make demo         simulate a landing movie, analyse it, say where the report is"
+	@echo "make quick        style, types, the tests of the rooms that changed since the last commit"
 	@echo "make test         style, types, architecture, docstrings, tests"
 	@echo "make test-all     the same with coverage, and the large tests: statistics, random kills"
 	@echo "make test-lowest  unit and physics tests with the lowest versions that pyproject.toml admits"
@@ -58,6 +59,10 @@ lint: $(STAMP)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python .ci/docstrings.py
+	$(BIN)/python .ci/size.py --check
+
+quick: $(STAMP)
+	$(BIN)/python .ci/quick.py
 
 kernels: $(KERNELS)
 

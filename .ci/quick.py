@@ -1,8 +1,9 @@
-"""Style, types, and the tests of what changed since a commit: the rooms, and those that import them.
+"""Judge a change soon: style, types, and the tests of the rooms that changed or import such a room.
 
     quick.py [COMMIT]       default: what is not committed
 
-A room is a folder of the library, or a package beside it; its tests are in ``tests/<room>``.
+A room is a folder of the library, or a package beside it; its tests are in ``tests/<room>``.  Of
+other rooms those tests are run that import a room that changed.
 """
 
 from __future__ import annotations
@@ -55,7 +56,9 @@ def main() -> int:
         names = sorted(str(test.relative_to(ROOT)) for test in tests)
         steps.append(["pytest", "-q", "-n", "auto", "--dist", "loadfile", *names])
     for step in steps:
-        if status := subprocess.run([str(Path(sys.executable).parent / step[0]), *step[1:]], cwd=ROOT).returncode:
+        if status := subprocess.run(
+            [str(Path(sys.executable).parent / step[0]), *step[1:]], cwd=ROOT
+        ).returncode:
             return status
     return 0
 

@@ -160,3 +160,19 @@ def test_a_movie_is_prepared_at_one_door() -> None:
     ]
     assert {_dotted(node.func) for _, node in calls} == steps
     assert [_where(path, node) for path, node in calls if path not in door] == []
+
+
+ROOT_HOLDS = {
+    ".ci", ".github", ".gitignore", ".typing", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
+    "LICENSE", "Makefile", "README.md", "SECURITY.md", "app", "benchmarks", "cli", "docs",
+    "iscat_analysis", "pyproject.toml", "sample_configs", "tests", "viewer",
+}  # fmt: skip
+
+
+def test_nothing_lies_about_in_the_root() -> None:
+    listed = subprocess.run(
+        ["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    if listed.returncode:
+        pytest.skip("no checkout of git")
+    assert {line.split("/")[0] for line in listed.stdout.splitlines()} == ROOT_HOLDS
