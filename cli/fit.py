@@ -265,7 +265,7 @@ def _print_table(analysis: Analysis, folder: Path) -> None:
             mass = ("mass, model scale", "kDa")
             if main_quantity(analysis).column == "contrast":
                 shown, mass = as_contrasts(shown), ("contrast", "")
-        if analysis.mode == "size":
+        if analysis.mode_kind.fits_sizes:
             shown, mass = as_diameters(shown), ("diameter", "nm")
         free = FREE_PARAMETERS[analysis.mode]
         print_result(events_table(shown.to_dict("records"), free, mass=mass, width=width))

@@ -271,7 +271,7 @@ class Explorer(QWidget):
     def _settings(self, preview: ia.Preview, threshold: float, window: int) -> str:
         """Say with which options the command would search so."""
         settings = []
-        if preview.config.background.method == "sliding" and window != preview.window:
+        if preview.config.background.slides and window != preview.window:
             settings.append(f"--set background.window_frames={window}")
         if abs(threshold - preview.threshold(window)) > 10.0 ** -self.threshold.decimals():
             alarms = preview.false_alarms(threshold, window)

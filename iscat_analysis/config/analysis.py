@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from iscat_analysis.config.kinds import METHODS, MODES, ModeKind, Way
 from iscat_analysis.config.values import (
     ALL,
     LARGEST_NM,
@@ -72,6 +73,31 @@ class BackgroundConfig(Section):
         return self.drift_correction is True
 
     @property
+    def way(self) -> Way:
+        """Which frames are compared with which, see `MethodKind`."""
+        return "tracks" if self.frames == ALL else METHODS[str(self.method)].way
+
+    @property
+    def slides(self) -> bool:
+        """Whether frames just after each frame are compared with those just before it."""
+        return self.way == "sliding"
+
+    @property
+    def learnt_with_tracks(self) -> bool:
+        """Whether the background is fitted together with the tracks over it."""
+        return self.method == "tracks"
+
+    @property
+    def is_known(self) -> bool:
+        """Whether its level is given, and no frame is needed for it."""
+        return self.method == "known"
+
+    @property
+    def is_counted(self) -> bool:
+        """Whether it is a sum of counts, as the conditional likelihood assumes."""
+        return METHODS[str(self.method)].is_counted
+
+    @property
     def recorded(self) -> tuple[int, int] | None:
         """Frames that were recorded before the particles; None if there are none."""
         return None if isinstance(self.frames, str) else self.frames
@@ -83,17 +109,15 @@ class BackgroundConfig(Section):
                 'frames = "all" is for method = "median" or "fixed", the median or the mean of all '
                 f'frames, and method is "{self.method}": set one of these, or leave frames out'
             )
-        if self.method == "known" and self.level_e is None:
+        if self.is_known and self.level_e is None:
             raise ValueError('method = "known" needs level_e, the known background level')
-        if self.method == "sliding" and self.frames is not None:
+        if self.frames is not None and self.method and not METHODS[self.method].takes_frames:
+            does = {
+                "sliding": "compares every frame with its neighbours",
+                "tracks": "learns the background from the frames in which the particles are",
+            }[self.method]
             raise ValueError(
-                'method = "sliding" compares every frame with its neighbours: leave frames out, '
-                'or set method = "fixed"'
-            )
-        if self.method == "tracks" and self.frames is not None:
-            raise ValueError(
-                'method = "tracks" learns the background from the frames in which the particles '
-                'are: leave frames out, or set method = "fixed"'
+                f'method = "{self.method}" {does}: leave frames out, or set method = "fixed"'
             )
         return self
 
@@ -168,6 +192,31 @@ class Fit(Section):
             raise ValueError(f"diameter_range_nm = {list(self.diameter_range_nm)} is empty")
         return self
 
+    @property
+    def kind(self) -> ModeKind:
+        """What the mode means."""
+        return MODES[self.mode]
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Parameters that are fitted, of `PARAMETERS`."""
+        return self.kind.free
+
+    @property
+    def follows_tracks(self) -> bool:
+        """Whether particles move, and are fitted frame by frame."""
+        return self.kind.follows_tracks
+
+    @property
+    def heights_free(self) -> bool:
+        """Whether every particle has a height of its own, which is fitted."""
+        return self.kind.heights_free
+
+    @property
+    def masses_free(self) -> bool:
+        """Whether masses are fitted."""
+        return self.kind.masses_free
+
     def roi_px(self, pixel_nm: float) -> int:
         """Side of the square that is fitted, in pixels of a given side [nm]."""
         return max(5, round(self.roi_nm / pixel_nm))
@@ -218,6 +267,11 @@ class TrackConfig(Section):
     temperature_c: Annotated[Finite, AfterValidator(_no_kelvins)] = Field(
         25.0, description="of the medium, for hydrodynamic diameters"
     )
+
+    @property
+    def heights_free(self) -> bool:
+        """Whether the height is fitted in every frame; else particles move in a plane."""
+        return MODES[self.free].heights_free
 
 
 class PosteriorConfig(Section):

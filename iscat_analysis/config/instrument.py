@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from iscat_analysis.config.covariance import ABERRATIONS, OpticsCovariance
 from iscat_analysis.config.field import MOST_JUMPS, FieldTerms, Jump, Share, Size
+from iscat_analysis.config.kinds import SCHEMES, SchemeKind
 from iscat_analysis.config.values import (
     LARGEST_NM,
     WAVELENGTH_NM,
@@ -179,6 +180,21 @@ class Optics(FieldTerms):
         None, description="of the measured keys, { names, matrix }; taken from the file"
     )
 
+    @property
+    def kind(self) -> SchemeKind:
+        """What the scheme means."""
+        return SCHEMES[self.scheme]
+
+    @property
+    def interferes(self) -> bool:
+        """Whether a reference reaches the camera; else, in dark field, particles add light."""
+        return self.kind.interferes
+
+    @property
+    def direction(self) -> float:
+        """Sign of the incident light's direction along the axis of the collected light."""
+        return self.kind.direction
+
     @model_validator(mode="before")
     @classmethod
     def _emission_of_the_convention(cls, values: Any) -> Any:
@@ -214,12 +230,12 @@ class Optics(FieldTerms):
                 'psf = "measured" needs a template: run `iscat calibrate optics MOVIE --measured` '
                 "and give its optics.toml as optics.file"
             )
-        if self.psf == "measured" and self.scheme == "darkfield":
+        if self.psf == "measured" and not self.interferes:
             raise ValueError(
                 'psf = "measured" needs an interferometric scheme: in dark field the image is the '
                 "square of the field, which the template does not have"
             )
-        if self.scheme == "iscat" and self.n_glass == self.n_sample:
+        if self.kind.reflected and self.n_glass == self.n_sample:
             raise ValueError(
                 "n_glass equals n_sample: nothing is reflected, so there is no iSCAT reference"
             )
@@ -228,7 +244,7 @@ class Optics(FieldTerms):
                 f"attenuation = {self.attenuation:g} is more than {LARGEST_ATTENUATION:g}: it is "
                 "the part of the reference's amplitude that passes, as 0.1 for a tenth"
             )
-        if self.scheme != "darkfield" and self.attenuation == 0:
+        if self.interferes and self.attenuation == 0:
             raise ValueError('attenuation = 0 leaves no reference: use scheme = "darkfield"')
         return self
 

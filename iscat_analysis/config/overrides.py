@@ -17,6 +17,7 @@ from pydantic import ValidationError
 
 from iscat_analysis.config.complaints import complaints
 from iscat_analysis.config.files import read_optics_file, read_toml
+from iscat_analysis.config.kinds import METHODS
 from iscat_analysis.config.named import instruments
 from iscat_analysis.config.renamed import rename
 from iscat_analysis.config.schema import Config
@@ -275,7 +276,7 @@ _METHOD_FOLLOWS = {
     ("optics", "scheme"),
     ("fit", "mode"),
 }
-_WITHOUT_FRAMES = ("sliding", "tracks")
+_WITHOUT_FRAMES = frozenset(name for name, kind in METHODS.items() if not kind.takes_frames)
 
 
 def _choose_method_again(values: dict[str, Any], changes: Iterable[Change]) -> None:

@@ -49,25 +49,25 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _explicit_method(self) -> Config:
-        known, tracked = self.background.frames is not None, self.fit.mode == "track"
+        known, tracked = self.background.frames is not None, self.fit.follows_tracks
         if self.background.method is None:
-            method = "fixed" if self.optics.scheme == "darkfield" else "sliding"
+            method = "sliding" if self.optics.interferes else "fixed"
             method = "tracks" if tracked else method
             method = "fixed" if known else method
             method = "median" if self.background.frames == ALL else method
             # The model is frozen for its users; here it is still being made.
             self.__dict__["background"] = self.background.model_copy(update={"method": method})
-        elif self.background.method == "sliding" and self.optics.scheme == "darkfield":
+        elif self.background.slides and not self.optics.interferes:
             raise ValueError(
                 'background.method = "sliding" needs an interferometric scheme: dark field needs '
                 "background.frames"
             )
-        elif self.background.method == "sliding" and self.fit.mode == "track":
+        elif self.background.slides and tracked:
             raise ValueError(
                 'background.method = "sliding" has no tracks: leave it out for fit.mode = "track", '
                 "or give background.frames"
             )
-        elif self.background.method == "tracks" and self.fit.mode != "track":
+        elif self.background.learnt_with_tracks and not tracked:
             raise ValueError(
                 'background.method = "tracks" is made of what fit.mode = "track" finds, and '
                 f'fit.mode is "{self.fit.mode}": use "sliding" for particles that land, or '
@@ -91,7 +91,7 @@ class Config(Section):
                 self.__dict__["optics"] = self.optics.model_copy(update=update)
             if refusal := sphere_refusal(self):
                 raise ValueError(refusal)
-        elif self.fit.mode == "size":
+        elif self.fit.kind.fits_sizes:
             raise ValueError(
                 'fit.mode = "size" fits spheres, and particle.model is '
                 f'"{self.particle.model}": set particle.model = "mie" or "shell"'
@@ -104,8 +104,8 @@ class Config(Section):
     def _pairs_suit_mode(self) -> Config:
         if self.fit.pairs:
             for key, is_set in (
-                (f'fit.mode = "{self.fit.mode}"', self.fit.mode != "mass"),
-                ('optics.scheme = "darkfield"', self.optics.scheme == "darkfield"),
+                (f'fit.mode = "{self.fit.mode}"', self.fit.heights_free),
+                ('optics.scheme = "darkfield"', not self.optics.interferes),
                 ('optics.psf = "measured"', self.optics.psf == "measured"),
                 ("particle.height_sd_nm", self.particle.height_prior_sd_nm > 0),
             ):
@@ -134,8 +134,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _median_has_frames(self) -> Config:
-        background, tracked = self.background, self.fit.mode == "track"
-        if background.frames == ALL and not (tracked and self.optics.scheme != "darkfield"):
+        background, tracked = self.background, self.fit.follows_tracks
+        if background.frames == ALL and not (tracked and self.optics.interferes):
             raise ValueError(
                 'background.frames = "all" is for particles that move over an interferometric '
                 f'background: with fit.mode = "{self.fit.mode}" and optics.scheme = '
@@ -151,7 +151,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _template_suits_mode(self) -> Config:
-        if self.optics.psf == "measured" and self.fit.mode != "mass":
+        if self.optics.psf == "measured" and self.fit.heights_free:
             raise ValueError(
                 f'fit.mode = "{self.fit.mode}" needs the image at every height, and optics.psf = '
                 '"measured" has it at one: use fit.mode = "mass", or optics.psf = "model"'
@@ -171,8 +171,7 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _priors_are_of_free_parameters(self) -> Config:
-        fixed = {"mass": "z_nm", "localize": "mass_kda"}.get(self.fit.mode)
-        if fixed in self.posterior.priors:
+        for fixed in self.posterior.priors.keys() - set(self.fit.free):
             raise ValueError(
                 f"posterior.prior_{fixed} is of a parameter that is fixed: use fit.mode = "
                 '"joint", or leave the prior out'
@@ -198,17 +197,22 @@ class Config(Section):
         return self
 
     @property
+    def heights_free(self) -> bool:
+        """Whether every particle has a height of its own, which is fitted."""
+        return self.track.heights_free if self.fit.follows_tracks else self.fit.heights_free
+
+    @property
     def fits_sizes(self) -> bool:
         """Whether the diameters of spheres are fitted, from which their masses follow."""
-        return self.particle.is_sphere and self.fit.mode != "localize"
+        return self.particle.is_sphere and self.fit.masses_free
 
     @property
     def samples_posterior(self) -> bool:
         """Whether posteriors are sampled: as configured, else if there are few events."""
-        if self.fit.mode == "track":
+        if self.fit.follows_tracks:
             return False
         if self.posterior.enabled == "auto":
-            return self.background.method != "sliding" and self.fit.mode != "size"
+            return not (self.background.slides or self.fit.kind.fits_sizes)
         return self.posterior.enabled
 
 
@@ -294,10 +298,10 @@ def refuse_sphere(config: Config, what: str) -> None:
 
 def index_refusal(config: Config) -> str:
     """Say why the index of a sphere cannot be fitted; else nothing."""
-    particle, mode = config.particle, config.fit.mode
+    particle = config.particle
     absorbs = particle.permittivity is not None and particle.permittivity[1] != 0
     for key, is_set in (
-        (f'fit.mode = "{mode}": use "size"', mode != "size"),
+        (f'fit.mode = "{config.fit.mode}": use "size"', not config.fit.kind.fits_sizes),
         (f'particle.model = "{particle.model}": use "mie"', particle.model != "mie"),
         ("a material that absorbs, which has two numbers", absorbs or particle.kind == "gold"),
     ):
@@ -309,19 +313,19 @@ def index_refusal(config: Config) -> str:
 def sphere_refusal(config: Config) -> str:
     """Say why a configuration does not go together with a sphere; else nothing."""
     particle, optics, fit = config.particle, config.optics, config.fit
-    if fit.mode not in ("size", "localize", "track"):
+    if not (fit.kind.fits_sizes or fit.follows_tracks or not fit.masses_free):
         return (
             f'fit.mode = "{fit.mode}" is for dipoles, whose image has one shape, and '
             f'particle.model is "{particle.model}": use fit.mode = "size", "track" for spheres '
             'that move, or "localize" for a known diameter'
         )
-    if fit.mode == "track" and config.track.free != "joint":
+    if fit.follows_tracks and not config.track.heights_free:
         return (
             f'track.free = "{config.track.free}" holds the height, and particle.model is '
             f'"{particle.model}": the diameter of a sphere needs track.free = "joint"'
         )
     background = config.background
-    if fit.mode == "track" and (background.method == "tracks" or background.frames == ALL):
+    if fit.follows_tracks and background.way == "tracks":
         return (
             f'particle.model = "{particle.model}" needs a background that is known before its '
             "tracks are: give frames without particles, as in background.frames = [0, 200]; one "

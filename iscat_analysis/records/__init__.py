@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from iscat_analysis.config import PARAMETERS
 from iscat_analysis.records.analysis import Analysis, Clip, EventView, Film, Provenance, Trace
 from iscat_analysis.records.arrays import BoolArray, FloatArray, Mapper, Progress, silent
 from iscat_analysis.records.columns import (
@@ -12,7 +13,6 @@ from iscat_analysis.records.columns import (
     FRAME_COLUMN,
     FREE_PARAMETERS,
     NO_MODEL,
-    PARAMETERS,
     REPEAT_COLUMNS,
     TRACK_COLUMNS,
     TRACKS,

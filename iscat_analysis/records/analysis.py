@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from iscat_analysis.config import MODES, SCHEMES, ModeKind, SchemeKind
 from iscat_analysis.findings import Finding, warnings_in
 from iscat_analysis.records.arrays import FloatArray
 from iscat_analysis.records.fits import PosteriorResult
@@ -210,6 +211,16 @@ class Analysis:
     tracks: pd.DataFrame | None = None
     films: tuple[Film, ...] = ()
     response: pd.DataFrame | None = None
+
+    @property
+    def mode_kind(self) -> ModeKind:
+        """What its mode means."""
+        return MODES[self.mode]
+
+    @property
+    def scheme_kind(self) -> SchemeKind:
+        """What its scheme means, with the unit of its images."""
+        return SCHEMES[self.scheme]
 
     @property
     def warnings(self) -> tuple[str, ...]:

@@ -12,16 +12,9 @@ from typing import Literal
 
 import pandas as pd
 
-PARAMETERS = ("x_nm", "y_nm", "z_nm", "mass_kda")
-"""The particle's parameters, in the order every matrix and vector uses."""
+from iscat_analysis.config import MODES, PARAMETERS
 
-FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {
-    "mass": ("x_nm", "y_nm", "mass_kda"),
-    "localize": ("x_nm", "y_nm", "z_nm"),
-    "joint": PARAMETERS,
-    "size": PARAMETERS,
-    "track": PARAMETERS,
-}
+FREE_PARAMETERS: Mapping[str, tuple[str, ...]] = {name: kind.free for name, kind in MODES.items()}
 """What each mode fits."""
 
 
@@ -29,7 +22,7 @@ def free_parameters(mode: str, fits: pd.DataFrame) -> tuple[str, ...]:
     """Give the fitted parameters: mode ``track`` fits the height only if ``track.free`` says so."""
     names = FREE_PARAMETERS[mode]
     fitted = tuple(name for name in names if fits[f"sigma_{name}"].notna().any())
-    return fitted if mode == "track" and fitted else names
+    return fitted if MODES[mode].follows_tracks and fitted else names
 
 
 @dataclass(frozen=True)
