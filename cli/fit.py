@@ -245,7 +245,8 @@ def _advise(messages: Messages, flagged: Sequence[Mapping[str, Any]]) -> None:
 def _print_table(analysis: Analysis, folder: Path) -> None:
     from rich.console import Console
 
-    from iscat_analysis.records import FREE_PARAMETERS, counted, tally
+    from iscat_analysis.config import MODES
+    from iscat_analysis.records import counted, tally
     from iscat_analysis.report.answer import answers, caution, main_quantity
     from iscat_analysis.report.answer import is_uncalibrated as uncalibrated
     from iscat_analysis.report.headline import NOT_A_MASS, as_contrasts, as_diameters
@@ -265,10 +266,10 @@ def _print_table(analysis: Analysis, folder: Path) -> None:
             mass = ("mass, model scale", "kDa")
             if main_quantity(analysis).column == "contrast":
                 shown, mass = as_contrasts(shown), ("contrast", "")
-        if analysis.mode_kind.fits_sizes:
+        mode = MODES[analysis.mode]
+        if mode.fits_sizes:
             shown, mass = as_diameters(shown), ("diameter", "nm")
-        free = FREE_PARAMETERS[analysis.mode]
-        print_result(events_table(shown.to_dict("records"), free, mass=mass, width=width))
+        print_result(events_table(shown.to_dict("records"), mode.free, mass=mass, width=width))
         if found.number > ROWS_SHOWN:
             print_result(f"… and {found.number - ROWS_SHOWN} more in {folder / 'fits.csv'}")
         for answer in answers(analysis, analysis.table):
