@@ -14,7 +14,12 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = {"cli": "iscat_cli", "app": "iscat_app", "viewer": "iscat_napari"}
+PACKAGES = {
+    "cli": "iscat_cli",
+    "app": "iscat_app",
+    "contest": "iscat_contest",
+    "viewer": "iscat_napari",
+}
 
 
 def room_of(path: Path) -> str:

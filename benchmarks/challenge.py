@@ -26,8 +26,8 @@ from typing import Any
 import pandas as pd
 
 from iscat_analysis.report.estimators import contest_parts
-from iscat_analysis.study.challenge_presets import ABOUT
-from iscat_analysis.study.estimators import known_estimators
+from iscat_contest.challenge import ABOUT
+from iscat_contest.estimators import known_estimators
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results" / "challenge"

@@ -39,7 +39,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.search.sliding import make_chunk, make_filter, measure_frames, sliding_maps
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"

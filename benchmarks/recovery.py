@@ -30,7 +30,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.records import FRAME_COLUMN
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"

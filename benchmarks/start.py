@@ -35,7 +35,7 @@ import pandas as pd
 from iscat_analysis.config import load_config
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.report import render_report
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 ROOT = Path(__file__).resolve().parent
 RESULTS = ROOT / "results"

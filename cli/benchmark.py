@@ -101,16 +101,16 @@ def benchmark(
         if truth is not None or results is not None:
             if truth is None or results is None:
                 raise ConfigError("--truth and --results belong together: give both")
-            from iscat_analysis.study.own_simulation import score_own
+            from iscat_contest.scoring import score_own
 
             scores = score_own(truth, results, resolved, command=messages.command)
             publish_scores(scores, out, archive, messages, overwrite=overwrite, as_json=as_json)
             return
         if out is None:
             raise ConfigError("--out is missing: give the folder that is to be written")
-        from iscat_analysis.study import check_benchmark_output, run_benchmark, write_benchmark
-        from iscat_analysis.study.estimators import find_estimator
-        from iscat_analysis.study.publish_scores import write_archive
+        from iscat_contest.benchmark import check_benchmark_output, run_benchmark, write_benchmark
+        from iscat_contest.estimators import find_estimator
+        from iscat_contest.publish import write_archive
 
         others = [find_estimator(text) for text in estimator or ()]
         for one in others:
@@ -145,7 +145,7 @@ def benchmark(
 
 def estimators_table() -> Table:
     """Tabulate the estimators that can be named."""
-    from iscat_analysis.study.estimators import known_estimators
+    from iscat_contest.estimators import known_estimators
 
     shown = table("estimator", "what it is", "")
     for column in shown.columns:

@@ -92,8 +92,12 @@ def make(
             raise ConfigError("give --preset or --config, one of them")
         if preset is not None and settings:
             raise ConfigError("--set changes a configuration: give --config, and no --preset")
-        from iscat_analysis.study.challenge import make_challenge, truth_beside
-        from iscat_analysis.study.challenge_presets import parts_of_config, preset_parts
+        from iscat_contest.challenge import (
+            make_challenge,
+            parts_of_config,
+            preset_parts,
+            truth_beside,
+        )
 
         if config:
             from iscat_analysis.config import load_config
@@ -148,9 +152,9 @@ def score(
 
         if not results and not estimator:
             raise ConfigError("there is nothing to score: give results, or --estimator")
-        from iscat_analysis.study.challenge import read_challenge
-        from iscat_analysis.study.challenge_scores import score_challenge
-        from iscat_analysis.study.estimators import find_estimator
+        from iscat_contest.challenge import read_challenge
+        from iscat_contest.estimators import find_estimator
+        from iscat_contest.scoring import score_challenge
 
         others = [find_estimator(text) for text in estimator or ()]
         for one in others:
@@ -176,7 +180,7 @@ def publish_scores(
 ) -> None:
     """Print scores, and write their page and archive."""
     from iscat_analysis.errors import ConfigError
-    from iscat_analysis.study.publish_scores import write_archive, write_scores
+    from iscat_contest.publish import write_archive, write_scores
 
     if archive is not None and out is None:
         raise ConfigError("--archive packs the output folder: give --out")

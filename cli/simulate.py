@@ -50,7 +50,7 @@ def simulate(
 
         resolved = load_config(config, settings or ())
 
-        from iscat_analysis.study.simulate import write_stack
+        from iscat_analysis.study import write_stack
 
         with messages.progress() as progress:
             truth = write_stack(resolved, out, seed=seed, overwrite=overwrite, progress=progress)

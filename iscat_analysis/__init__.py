@@ -131,7 +131,7 @@ if TYPE_CHECKING:
     from iscat_analysis.species import refractive_index as refractive_index
     from iscat_analysis.study.efficiency import bounds_for as bounds_for
     from iscat_analysis.study.efficiency import efficiency as efficiency
-    from iscat_analysis.study.estimators import EstimatorSetup as EstimatorSetup
+    from iscat_analysis.study.estimator_setup import EstimatorSetup as EstimatorSetup
 
 _HOME = {
     "Optics": "config",
@@ -182,7 +182,7 @@ _HOME = {
     "compute_bounds": "notebook",
     "bounds_for": "study.efficiency",
     "efficiency": "study.efficiency",
-    "EstimatorSetup": "study.estimators",
+    "EstimatorSetup": "study.estimator_setup",
     "forecast_optics": "notebook",
     "Bounds": "notebook",
     "Config": "config",

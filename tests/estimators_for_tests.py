@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.study.estimators import EstimatorSetup
+from iscat_analysis.study import EstimatorSetup
 
 
 def raises(*given: Any) -> dict[str, Any]:

@@ -18,9 +18,8 @@ from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.movie.text_tables import refuse_twice
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
-from iscat_analysis.study.limits import Limits, limits_at
 from iscat_analysis.study.setting import OF_DIPOLES
-from iscat_analysis.study.yardstick import resamples, score_estimates
+from iscat_analysis.study.yardstick import Limits, limits_at, resamples, score_estimates
 
 _MASS_STEP = 0.02
 _Z_STEP_NM = 2.0

@@ -22,6 +22,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, Candidate, FloatArray, Windows
+from iscat_analysis.study.estimator_setup import EstimatorSetup
 
 CLEARANCE = 8.0
 """Standard deviations that a height kept by default has to the ends of ``fit.z_range_nm``."""
@@ -217,6 +218,33 @@ class Setting:
             "level_fitted": self.level,
             "n_scattered": {"camera": e.on_camera, "collected": e.collected},
         }
+
+
+def setup_of(setting: Setting, start: FloatArray) -> EstimatorSetup:
+    """Say what an estimator may know.
+
+    Shapes: `start` (n, 4).
+    """
+    config, optics = setting.config, setting.config.optics
+    signal = setting.signal_e(setting.truth)
+    return EstimatorSetup(
+        mode=setting.mode,
+        free=setting.free,
+        optics=optics,
+        particle=config.particle,
+        camera=config.camera,
+        calibration=config.calibration,
+        pixel_size_nm=setting.context.pixel_nm,
+        photons_per_pixel=setting.level_e(),
+        n_before=config.bounds.n_before,
+        n_after=config.bounds.n_after,
+        interferes=not setting.context.additive,
+        polarity=int(np.sign(signal.flat[np.argmax(np.abs(signal))])) or 1,
+        psf_sigma_nm=0.21 * optics.wavelength_nm / optics.na,
+        z_range_nm=config.fit.z_range_nm,
+        level_fitted=setting.level,
+        start=start,
+    )
 
 
 def make_setting(

@@ -15,11 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
-from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
-from iscat_analysis.study.baselines import Baselines
+from iscat_analysis.records import BoolArray, Candidate, FitResult, FloatArray, Status
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.threads import threads
+
+Baseline = Callable[[Likelihood, Candidate], tuple[FloatArray, FloatArray]]
+"""Measures two baselines, a Gaussian and the highest pixel, (4,) each, on the same counts."""
 
 CHUNK = 16
 """Trials that a thread takes at a time."""
@@ -83,7 +86,7 @@ def run_trials(
     workers: int = 1,
     chunk: int = CHUNK,
     truths: FloatArray | None = None,
-    baselines: Baselines | None = None,
+    baselines: Baseline | None = None,
     correct_bias: bool = True,
     advance: Callable[[int], None] | None = None,
 ) -> Trials:
@@ -117,7 +120,7 @@ def run_trials(
             p_value[i], chi2[i] = fit.p_value, fit.chi2_reduced
             gap[i] = fit.alternatives[0].log_likelihood_gap if fit.alternatives else math.inf
             if baselines is not None:
-                gauss[i], peak[i] = baselines.measure(likelihood, start)
+                gauss[i], peak[i] = baselines(likelihood, start)
         if advance is not None:
             advance(last - first)
         return spent

@@ -21,7 +21,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.pattern import MovingPattern, follow
 from iscat_analysis.fitting.regions import Region
 from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 SIGMAS = 4.0
 STRIDE, WINDOW = 10, 40

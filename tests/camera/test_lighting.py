@@ -15,7 +15,7 @@ from iscat_analysis.camera.lighting import Surface, find_surface
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 Array = NDArray[np.float64]
 

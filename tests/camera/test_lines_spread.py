@@ -16,7 +16,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.diagnosis.light import judge_lines
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 

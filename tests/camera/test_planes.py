@@ -20,7 +20,7 @@ from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.causes import fixed_height_warning
 from iscat_analysis.fitting.ranges import checked
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 from iscat_analysis.tracking.held_height import held_height_warning
 
 STEP_NM, SIGMA_NM = 30.0, 5.0

@@ -17,7 +17,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
 from iscat_analysis.diagnosis.changes import least_beside
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 Counts = NDArray[np.float64]
 

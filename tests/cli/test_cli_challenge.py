@@ -78,7 +78,7 @@ def test_what_cannot_be_scored_is_said(
 def test_estimators_that_can_be_named_are_listed(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("iscat_analysis.study.estimators.find_spec", lambda _: None)
+    monkeypatch.setattr("iscat_contest.estimators.find_spec", lambda _: None)
     assert main(["benchmark", "--list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert any(line.startswith("gauss-mle ") and "not installed" not in line for line in lines)

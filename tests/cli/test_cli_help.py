@@ -24,11 +24,10 @@ from walkers import SETUP, fits_of, walk
 from iscat_analysis.config import SIMULATED, Config, config_to_toml, load_config
 from iscat_analysis.records import EVENT_COLUMNS
 from iscat_analysis.species import describe_tracks
-from iscat_analysis.study.challenge import make_challenge
-from iscat_analysis.study.challenge_presets import parts_of_config
 from iscat_cli import console, main, main_fit
 from iscat_cli.app import COMMANDS, GROUPS, _umbrella
 from iscat_cli.console import Messages, duration
+from iscat_contest.challenge import make_challenge, parts_of_config
 
 PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
 SHELLS = ["bash", "zsh", "fish"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 from iscat_cli import main
 from iscat_cli.options import Instrument
 

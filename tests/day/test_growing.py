@@ -22,7 +22,7 @@ from iscat_analysis.day.growing import RESTS, histogram, watch_movie
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 

@@ -22,7 +22,7 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.timeline import look_at
 from iscat_analysis.report.movie_figure import movie_figure
 from iscat_analysis.schemas.course import LeftOut, Timeline
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 Counts = NDArray[np.uint16]
 

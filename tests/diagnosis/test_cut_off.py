@@ -12,7 +12,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.search.sliding import cut_off
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 Counts = NDArray[np.uint16]
 OFFSET = 100

@@ -13,7 +13,7 @@ from iscat_analysis.config import load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.records import Windows
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 

@@ -27,7 +27,7 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import analyse, finder
 from iscat_analysis.records import EVENT_COLUMNS, SEVERITY, Analysis, Status, Windows
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 from iscat_analysis.tracking.moving_field import initial_background, load_field, tracking_context
 
 SIDE = 48

@@ -19,7 +19,7 @@ from small_movies import LANDING
 
 from iscat_analysis.config import load_config
 from iscat_analysis.second_process import SecondProcess
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 pytestmark = pytest.mark.large
 

@@ -96,7 +96,7 @@ def test_what_contradicts_itself_is_refused(setting: str) -> None:
 
 
 def test_simulated_heights_are_those_of_the_prior() -> None:
-    from iscat_analysis.study.particles import place_particles
+    from iscat_analysis.study.simulate import place_particles
 
     config = load_config(
         None,

@@ -12,8 +12,7 @@ from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.reach import AWAY
 from iscat_analysis.records import FitResult
-from iscat_analysis.study import Setting, run_trials
-from iscat_analysis.study.trials import trial_generator
+from iscat_analysis.study import Setting, run_trials, trial_generator
 
 TRIALS = 400
 STANDARD_ERRORS = 4.0

@@ -36,7 +36,7 @@ from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
 from iscat_analysis.search.sliding import chunks as chunks_module
 from iscat_analysis.search.sliding import planning
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 PIXEL_NM = 84.0
 SIDE, FRAMES = 64, 420

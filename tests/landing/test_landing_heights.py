@@ -11,7 +11,7 @@ import pytest
 
 from iscat_analysis.config import configure, load_config
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 pytestmark = pytest.mark.large
 

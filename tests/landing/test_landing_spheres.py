@@ -15,7 +15,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.search.sliding import measure_motion
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 DIAMETER_NM, INDEX = 150.0, 1.461
 LANDINGS = [(70, 24.3, 30.6), (150, 30.2, 66.8), (160, 43.1, 70.4)]

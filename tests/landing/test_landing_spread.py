@@ -20,7 +20,7 @@ from iscat_analysis.inference.noise import conditional
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import FRAME_COLUMN, Candidate
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 

@@ -20,7 +20,7 @@ from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.landing.measured_images import ring_average
 from iscat_analysis.landing.searched import LEVELS, Searched, searched_warning
 from iscat_analysis.species import Efficiency
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 PIXEL_NM, SIDE, FRAMES = 84.0, 112, 240
 VESICLE = (120, 55.3, 54.1, 8000.0)  # frame, x, y [px], mass [kDa]

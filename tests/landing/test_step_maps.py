@@ -14,7 +14,7 @@ from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.neighbours import Step
 from iscat_analysis.landing.step_maps import StepMaps
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 SAMPLE = Path(__file__).resolve().parents[2] / "sample_configs" / "landing.toml"
 

@@ -27,7 +27,7 @@ from iscat_analysis.search.sliding import planning
 from iscat_analysis.search.sliding.chunks import Reader
 from iscat_analysis.search.sliding.stored import frames_in_place
 from iscat_analysis.search.sliding.tiles import Tile, cut_field
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 from iscat_analysis.threads import threads
 
 SIDE, FRAMES = 176, 130

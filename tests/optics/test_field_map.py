@@ -19,7 +19,7 @@ from iscat_analysis.optics.field_map import WEIGHTS, Spot
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.local import LocalModels
 from iscat_analysis.optics.parameters import FIELD, settings_of
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -20,7 +20,7 @@ from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import table_of
 from iscat_analysis.records import FREE_PARAMETERS
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 

@@ -22,7 +22,7 @@ from iscat_analysis.records import (
     REPEAT_COLUMNS,
     Analysis,
 )
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 pytestmark = pytest.mark.usefixtures("all_sketched")
 

@@ -12,7 +12,7 @@ import tifffile
 import iscat_analysis as ia
 from iscat_analysis.camera.background import measure_windows
 from iscat_analysis.camera.counts import camera_from_config
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 WINDOW, LANDS, LEAVES = 24, 60, 120
 LANDING = {

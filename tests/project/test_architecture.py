@@ -13,7 +13,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCES = sorted(
-    p for room in ("iscat_analysis", "app", "cli", "viewer") for p in (ROOT / room).rglob("*.py")
+    p
+    for room in ("iscat_analysis", "app", "cli", "contest", "viewer")
+    for p in (ROOT / room).rglob("*.py")
 )
 TREES = {path: ast.parse(path.read_text(encoding="utf-8"), str(path)) for path in SOURCES}
 
@@ -164,8 +166,8 @@ def test_a_movie_is_prepared_at_one_door() -> None:
 
 ROOT_HOLDS = {
     ".ci", ".github", ".gitignore", ".typing", "CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md",
-    "LICENSE", "Makefile", "README.md", "SECURITY.md", "app", "benchmarks", "cli", "docs",
-    "iscat_analysis", "pyproject.toml", "sample_configs", "tests", "viewer",
+    "LICENSE", "Makefile", "README.md", "SECURITY.md", "app", "benchmarks", "cli", "contest",
+    "docs", "iscat_analysis", "pyproject.toml", "sample_configs", "tests", "viewer",
 }  # fmt: skip
 
 

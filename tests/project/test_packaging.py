@@ -13,7 +13,12 @@ from pathlib import Path
 
 import pytest
 
-FRONT_ENDS = {"app": "iscat_app", "cli": "iscat_cli", "viewer": "iscat_napari"}
+FRONT_ENDS = {
+    "app": "iscat_app",
+    "cli": "iscat_cli",
+    "contest": "iscat_contest",
+    "viewer": "iscat_napari",
+}
 """Folder → the name it is installed under."""
 
 

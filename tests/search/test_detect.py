@@ -25,7 +25,7 @@ from iscat_analysis.search.templates import (
     refuse_flood,
     signal_to_noise,
 )
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 FIELD = (96, 96)
 TRIALS, SEED = 60, 5

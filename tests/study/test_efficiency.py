@@ -15,7 +15,8 @@ from microscopes import PHOTONS, setting
 from scipy.stats import binom
 
 from iscat_analysis.records import PARAMETERS, FloatArray
-from iscat_analysis.study import Baselines, Setting, Trials, run_trials, score, spread_error
+from iscat_analysis.study import Setting, Trials, run_trials, score, spread_error
+from iscat_contest.simple import Baselines
 
 pytestmark = pytest.mark.large
 
@@ -185,7 +186,7 @@ def test_a_wrong_likelihood_is_seen_in_the_pulls() -> None:
 def test_lab_baselines_miss_the_bound_or_are_biased() -> None:
     experiment = setting("iscat", "mass")
     trials = run_trials(
-        experiment, TRIALS // 2, seed=SEED, baselines=Baselines.calibrated(experiment)
+        experiment, TRIALS // 2, seed=SEED, baselines=Baselines.calibrated(experiment).measure
     )
     crb = experiment.bounds.crb_joint
     gauss, peak = trials.gauss - trials.truth, trials.peak - trials.truth

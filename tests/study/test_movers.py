@@ -16,9 +16,10 @@ import iscat_analysis as ia
 from iscat_analysis.config import Config, config_to_toml, parse_config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
+from iscat_analysis.study import Movie, write_stack
 from iscat_analysis.study import movers as moving
 from iscat_analysis.study.movers import MovingParticle, place_movers
-from iscat_analysis.study.simulate import TRACK_COLUMNS, TRUTH_COLUMNS, Movie, write_stack
+from iscat_analysis.study.simulate import TRACK_COLUMNS, TRUTH_COLUMNS
 
 SIGMAS = 4.0
 PICTURE = 1e-3  # of the sharp picture's peak; what `FINE` is chosen for

@@ -15,7 +15,8 @@ from scipy.stats import kstest, norm
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.study.simulate import TRUTH_COLUMNS, Movie, write_stack
+from iscat_analysis.study import Movie, write_stack
+from iscat_analysis.study.simulate import TRUTH_COLUMNS
 
 SIGMAS = 5.0
 TABLE = 1e-7  # the model's radial interpolation

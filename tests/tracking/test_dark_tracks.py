@@ -16,7 +16,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.ranges import measured_windows
 from iscat_analysis.movie import open_stack
-from iscat_analysis.study.simulate import write_stack
+from iscat_analysis.study import write_stack
 
 PHOTONS = 600.0
 D_UM2_S = 0.8

@@ -14,7 +14,7 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse
 from iscat_analysis.records import Analysis
-from iscat_analysis.study.simulate import Movie
+from iscat_analysis.study import Movie
 
 pytestmark = pytest.mark.large
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.records import FloatArray
-from iscat_analysis.study.estimators import EstimatorSetup
+from iscat_analysis.study import EstimatorSetup
 
 Table = dict[str, FloatArray]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,26 +16,35 @@ from numpy.typing import NDArray
 
 from iscat_analysis.bounds.paper import PRINTED
 from iscat_analysis.config import Config
-from iscat_analysis.errors import DataError
-from iscat_analysis.executors import Executor, LocalExecutor, versions
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.executors import Executor, versions
+from iscat_analysis.hashing import sha256_of_files
 from iscat_analysis.movie import open_stack
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Progress, silent
-from iscat_analysis.study.challenge import Challenge, manifest_sha256
-from iscat_analysis.study.contest import setup_of
-from iscat_analysis.study.efficiency import limits_of_many
-from iscat_analysis.study.estimator_process import Answer, Job, run_estimator
-from iscat_analysis.study.estimators import Estimator
-from iscat_analysis.study.limits import Limits
-from iscat_analysis.study.results import Results, match_movie, match_stacks, read_results, stem
-from iscat_analysis.study.setting import make_setting
-from iscat_analysis.study.trials import trial_generator
-from iscat_analysis.study.yardstick import (
+from iscat_analysis.study import (
+    Limits,
+    beside_best,
+    limits_of_many,
+    make_setting,
+    matched,
     mean_interval,
-    paired,
     power_bound,
     resamples,
     score_estimates,
+    setup_of,
+    trial_generator,
+)
+from iscat_contest.challenge import Challenge, manifest_sha256
+from iscat_contest.estimators import Estimator
+from iscat_contest.process import Answer, Job, run_estimators
+from iscat_contest.results import (
+    Results,
+    match_movie,
+    match_stacks,
+    read_results,
+    refuse_other_units,
+    stem,
 )
 
 SEED = 1
@@ -99,7 +107,13 @@ def score_challenge(
             "mass_kda": float(events["mass_kda"].mean()),
             "bounds": _bounds(limits),
             "estimators": entries,
-            "paired": _paired(columns, entries, events, limits),
+            "paired": beside_best(
+                columns,
+                entries,
+                events[list(PARAMETERS)].to_numpy(dtype=float),
+                limits,
+                resamples(len(events), SEED),
+            ),
         }
     lost = [path.name for path in results if path.name not in used]
     if lost:
@@ -325,33 +339,6 @@ def _recall(
     return {"false_alarms": len(false), "false_alarms_per_movie": rate, "recall": table}
 
 
-def _paired(
-    columns: Mapping[str, Mapping[str, FloatArray]],
-    entries: Mapping[str, Any],
-    events: pd.DataFrame,
-    limits: Limits,
-) -> dict[str, Any]:
-    weights = resamples(len(events), SEED)
-    out: dict[str, Any] = {}
-    for i, name in enumerate(limits.free):
-        ranked = {
-            who: one[name]["efficiency_crb"]
-            for who, one in entries.items()
-            if math.isfinite(one.get(name, {}).get("efficiency_crb", math.nan))
-            and not one[name]["below_bound"]
-        }
-        if len(ranked) < 2:
-            continue
-        best = max(ranked, key=lambda who: ranked[who])
-        truth, crb = events[name].to_numpy(dtype=float), limits.crb[:, i]
-        out[name] = {"to": best} | {
-            who: paired(columns[who][name] - truth, columns[best][name] - truth, crb, weights)
-            for who in ranked
-            if who != best
-        }
-    return out
-
-
 def _bounds(limits: Limits) -> dict[str, dict[str, float]]:
     def rms(values: FloatArray) -> float:
         return float(np.sqrt(np.mean(values**2)))
@@ -377,17 +364,11 @@ def _answers(
         return {}
     cut = [_job(challenge, parts, known[group][0]) for group, parts in groups.items()]
     jobs = [one.job for one in cut]
-    place = executor or LocalExecutor()
-    paths = [path for path in sys.path if path]
-
-    def work(estimator: Estimator) -> list[Answer]:
-        return place.call(run_estimator, estimator, jobs, limit_s, paths)
-
+    found = run_estimators(estimators, jobs, limit_s, executor, progress)
     out = {}
-    for done, (number, found) in enumerate(place.each(work, list(estimators)), 1):
-        progress("estimators", done, len(estimators))
-        whole = [one.whole(answer) for one, answer in zip(cut, found, strict=True)]
-        out[estimators[number].name] = dict(zip(groups, whole, strict=True))
+    for name, answers in found.items():
+        whole = [one.whole(answer) for one, answer in zip(cut, answers, strict=True)]
+        out[name] = dict(zip(groups, whole, strict=True))
     return out
 
 
@@ -480,3 +461,32 @@ def _sha256(path: Path) -> str:
         return hashlib.sha256(source.read_bytes()).hexdigest()
     except OSError as error:
         raise DataError(f"{source}: cannot be read ({error.strerror})") from None
+
+
+def score_own(truth: Path, results: Path, config: Config, *, command: str = "") -> dict[str, Any]:
+    """Score one table against another, row by row or by event."""
+    pixel = config.camera.pixel_size_nm
+    if pixel is None:
+        raise ConfigError(
+            "camera.pixel_size_nm is needed: give it, as in camera.pixel_size_nm = 84.4"
+        )
+    mode = config.fit.mode if config.fit.mode != "track" else "joint"
+    free = FREE_PARAMETERS[mode]
+    known, found = (read_results(path, pixel, rows=True) for path in (truth, results))
+    columns, truths = matched(found.table, known.table, config, free)
+    placed = found.table if "event" not in known.table or "event" not in found.table else None
+    if placed is not None:
+        refuse_other_units(found.name, placed, known.table, pixel)
+    if not columns:
+        raise DataError(f"{results}: has none of the columns {', '.join(free)}")
+    limits = limits_of_many(config, free, np.asarray(truths))
+    scored = score_tables(columns, truths, limits, found.name, config)
+    hashes = {path.name: sha256_of_files([path]) for path in (truth, results)}
+    return {
+        "title": "Estimates of one's own simulation",
+        "challenge": None,
+        "results_sha256": hashes,
+        "command": command,
+        "versions": versions(),
+        **scored,
+    }

@@ -18,23 +18,29 @@ from iscat_analysis.records import PARAMETERS, FloatArray, Progress, Status, sil
 from iscat_analysis.report import atomic_folder, check_output
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, render_benchmark
 from iscat_analysis.schemas import to_json
-from iscat_analysis.study.baselines import Baselines
-from iscat_analysis.study.challenge_scores import ranking
-from iscat_analysis.study.contest import compare_estimators
-from iscat_analysis.study.estimators import Estimator
-from iscat_analysis.study.posteriors import RANKS, PosteriorRanks, calibrate_posterior
-from iscat_analysis.study.publish_scores import bibtex
-from iscat_analysis.study.scores import (
+from iscat_analysis.study import (
     MIN_TRIALS,
+    OF_DIPOLES,
+    OF_SPHERES,
+    RANKS,
+    PosteriorRanks,
+    Setting,
+    Trials,
+    calibrate_posterior,
+    make_setting,
     pull_histogram,
     rank_test,
+    run_trials,
     score,
     share,
     share_interval,
     spread_interval,
 )
-from iscat_analysis.study.setting import OF_DIPOLES, OF_SPHERES, Setting, make_setting
-from iscat_analysis.study.trials import Trials, run_trials
+from iscat_contest.compare import compare_estimators
+from iscat_contest.estimators import Estimator
+from iscat_contest.publish import bibtex
+from iscat_contest.scoring import ranking
+from iscat_contest.simple import Baselines
 
 PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 """Collected scattered photons of the first curve."""
@@ -99,7 +105,8 @@ def run_benchmark(
         stream = 100 * number
         found = run_trials(
             setting, trials, seed=seed, stream=stream, workers=threads,
-            baselines=None if mode == "size" else Baselines.calibrated(setting), advance=tally,
+            baselines=None if mode == "size" else Baselines.calibrated(setting).measure,
+            advance=tally,
         )  # fmt: skip
         lower, upper = _prior(setting)
         ranked = calibrate_posterior(
@@ -163,7 +170,7 @@ def run_benchmark(
         "scheme": config.optics.scheme,
         "emission": config.optics.emission,
         "convention": config.optics.convention,
-        "command": command or "iscat_analysis.study.run_benchmark",
+        "command": command or "iscat_contest.benchmark.run_benchmark",
         "config": config_to_toml(config),
         "versions": {
             "python": platform.python_version(),

@@ -12,18 +12,20 @@ from microscopes import configuration
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
-from iscat_analysis.study.challenge import (
+from iscat_contest.challenge import (
+    ABOUT,
     Challenge,
     make_challenge,
     manifest_sha256,
+    parts_of_config,
+    preset_parts,
     read_challenge,
     truth_beside,
 )
-from iscat_analysis.study.challenge_presets import ABOUT, parts_of_config, preset_parts
-from iscat_analysis.study.challenge_scores import score_challenge
-from iscat_analysis.study.estimators import find_estimator
-from iscat_analysis.study.publish_scores import write_archive, write_scores
-from iscat_analysis.study.results import Results, match_movie, read_results
+from iscat_contest.estimators import find_estimator
+from iscat_contest.publish import write_archive, write_scores
+from iscat_contest.results import Results, match_movie, read_results
+from iscat_contest.scoring import score_challenge
 
 PIXEL_NM = 84.4
 STACKS = 24

@@ -14,10 +14,17 @@ from microscopes import configuration
 import iscat_analysis as ia
 from iscat_analysis.config import Config
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS
-from iscat_analysis.study.contest import draw
-from iscat_analysis.study.efficiency import limits_of_many
-from iscat_analysis.study.estimator_process import answer, run_estimator
-from iscat_analysis.study.estimators import (
+from iscat_analysis.study import (
+    limits_of_many,
+    make_setting,
+    paired,
+    power_bound,
+    recall_at,
+    resamples,
+    score_estimates,
+)
+from iscat_contest.compare import draw
+from iscat_contest.estimators import (
     BUILT_IN,
     GROUP,
     Estimate,
@@ -25,14 +32,7 @@ from iscat_analysis.study.estimators import (
     find_estimator,
     known_estimators,
 )
-from iscat_analysis.study.setting import make_setting
-from iscat_analysis.study.yardstick import (
-    paired,
-    power_bound,
-    recall_at,
-    resamples,
-    score_estimates,
-)
+from iscat_contest.process import answer, run_estimator
 
 COUNT = 400
 COUNTED = 12
@@ -186,7 +186,7 @@ def test_estimators_are_found_by_name_or_function(monkeypatch: pytest.MonkeyPatc
     assert find_estimator("json:dumps").target == "json:dumps"
     with pytest.raises(ia.ConfigError, match="neither PACKAGE:FUNCTION nor one of iscat"):
         find_estimator("gauss")
-    monkeypatch.setattr("iscat_analysis.study.estimators.find_spec", lambda _: None)
+    monkeypatch.setattr("iscat_contest.estimators.find_spec", lambda _: None)
     with pytest.raises(ia.ConfigError, match="--no-deps piscat"):
         find_estimator("piscat").load()
 
@@ -194,9 +194,7 @@ def test_estimators_are_found_by_name_or_function(monkeypatch: pytest.MonkeyPatc
 def test_other_packages_offer_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
     theirs = EntryPoint("theirs", "json:dumps", GROUP)
     found = {GROUP: [theirs]}
-    monkeypatch.setattr(
-        "iscat_analysis.study.estimators.entry_points", lambda *, group: found[group]
-    )
+    monkeypatch.setattr("iscat_contest.estimators.entry_points", lambda *, group: found[group])
     assert known_estimators()[-1].name == "theirs"
     assert find_estimator("theirs").load() is json.dumps
 

@@ -13,22 +13,21 @@ from microscopes import configuration, setting
 from sketches import sketch_figures
 
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.prior import van_trees
 from iscat_analysis.records import FREE_PARAMETERS, Candidate
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
 from iscat_analysis.study import (
-    Baselines,
     make_setting,
     pull_histogram,
     rank_test,
-    run_benchmark,
     run_trials,
     score,
     share_interval,
     spread_error,
     spread_interval,
-    van_trees,
-    write_benchmark,
 )
+from iscat_contest.benchmark import run_benchmark, write_benchmark
+from iscat_contest.simple import Baselines
 
 FIELDS = {
     "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",

@@ -19,9 +19,11 @@ from typing import Any
 
 import numpy as np
 
+from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.reading import first_line
 from iscat_analysis.records import FloatArray, Progress, silent
-from iscat_analysis.study.estimators import Estimate, Estimator, EstimatorSetup, checked_table
+from iscat_analysis.study import EstimatorSetup
+from iscat_contest.estimators import Estimate, Estimator, checked_table
 
 _MEGABYTE = 2.0**20
 _TOLD = 200  # characters of what a process said last
@@ -96,6 +98,27 @@ def run_estimator(
         done = _read(answers)
     missing = [Answer(failures={why: len(job.before)}) for job in jobs[len(done) :]]
     return [*done, *missing]
+
+
+def run_estimators(
+    estimators: Sequence[Estimator],
+    jobs: Sequence[Job],
+    limit_s: float,
+    executor: Executor | None,
+    progress: Progress,
+) -> dict[str, list[Answer]]:
+    """Give all estimators the same jobs; their answers, by name."""
+    place = executor or LocalExecutor()
+    paths = [path for path in sys.path if path]
+
+    def work(estimator: Estimator) -> list[Answer]:
+        return place.call(run_estimator, estimator, jobs, limit_s, paths)
+
+    answers: dict[str, list[Answer]] = {}
+    for done, (number, found) in enumerate(place.each(work, list(estimators)), 1):
+        answers[estimators[number].name] = found
+        progress("estimators", done, len(estimators))
+    return answers
 
 
 def _read(path: Path) -> list[Answer]:
@@ -188,6 +211,6 @@ def main(request: str, answers: str) -> int:
 
 if __name__ == "__main__":
     # what is pickled has to be of the module that the parent knows, which is not __main__
-    from iscat_analysis.study.estimator_process import main as run
+    from iscat_contest.process import main as run
 
     sys.exit(run(*sys.argv[1:]))

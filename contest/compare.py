@@ -7,7 +7,6 @@ gradient of its bias can be measured (`yardstick`).
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,21 +15,27 @@ import numpy as np
 
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ContrastError
-from iscat_analysis.executors import Executor, LocalExecutor
+from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.records import PARAMETERS, FloatArray, Progress, silent
-from iscat_analysis.study.estimator_process import Answer, Job, run_estimator
-from iscat_analysis.study.estimators import Estimator, EstimatorSetup
-from iscat_analysis.study.limits import Limits, detection_snr, limits_of_alike
-from iscat_analysis.study.setting import OF_DIPOLES, Setting, make_setting
-from iscat_analysis.study.trials import trial_generator
-from iscat_analysis.study.yardstick import (
+from iscat_analysis.study import (
+    OF_DIPOLES,
+    Limits,
+    Setting,
+    beside_best,
+    detection_snr,
+    limits_of_alike,
+    make_setting,
     paired,
     power_bound,
     recall_at,
     resamples,
     score_estimates,
+    setup_of,
+    trial_generator,
 )
+from iscat_contest.estimators import Estimator
+from iscat_contest.process import Answer, Job, run_estimators
 
 RANGE_CRB = 5.0
 """Half-width of the truths' range, in bounds, as long as the following are not exceeded."""
@@ -119,33 +124,6 @@ def draw(
     return Draws(Job(np.stack(before), np.stack(after), setup, reference, known), truths, limits)
 
 
-def setup_of(setting: Setting, start: FloatArray) -> EstimatorSetup:
-    """Say what an estimator may know.
-
-    Shapes: `start` (n, 4).
-    """
-    config, optics = setting.config, setting.config.optics
-    signal = setting.signal_e(setting.truth)
-    return EstimatorSetup(
-        mode=setting.mode,
-        free=setting.free,
-        optics=optics,
-        particle=config.particle,
-        camera=config.camera,
-        calibration=config.calibration,
-        pixel_size_nm=setting.context.pixel_nm,
-        photons_per_pixel=setting.level_e(),
-        n_before=config.bounds.n_before,
-        n_after=config.bounds.n_after,
-        interferes=not setting.context.additive,
-        polarity=int(np.sign(signal.flat[np.argmax(np.abs(signal))])) or 1,
-        psf_sigma_nm=0.21 * optics.wavelength_nm / optics.na,
-        z_range_nm=config.fit.z_range_nm,
-        level_fitted=setting.level,
-        start=start,
-    )
-
-
 def compare_estimators(
     config: Config,
     estimators: Sequence[Estimator],
@@ -157,7 +135,6 @@ def compare_estimators(
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Let estimators see the same counts, and score them: ``estimators``, ``paired``, curves."""
-    place = executor or LocalExecutor()
     mode = config.fit.mode if config.fit.mode in OF_DIPOLES else "mass"
     settings = {m: make_setting(config, m) for m in OF_DIPOLES}
     tables = {
@@ -171,22 +148,16 @@ def compare_estimators(
     rate = max(config.bounds.false_alarm_probability, FALSE_ALARMS / max(trials, 2 * FALSE_ALARMS))
     empty = draw(settings["mass"], trials, seed=seed, stream=1900, empty=True)
     jobs = [*(d.job for d in tables.values()), *(d.job for _, _, d in points), empty.job]
-    paths = [path for path in ("", *sys.path) if path]
-
-    def work(estimator: Estimator) -> list[Answer]:
-        return place.call(run_estimator, estimator, jobs, time_limit_s, paths)
-
-    answers: dict[str, list[Answer]] = {}
-    for done, (number, found) in enumerate(place.each(work, list(estimators)), 1):
-        answers[estimators[number].name] = found
-        progress("estimators", done, len(estimators))
+    answers = run_estimators(estimators, jobs, time_limit_s, executor, progress)
     out: dict[str, Any] = {"estimators": {}, "estimator_curves": {}, "paired": {}}
     for one in estimators:
         out["estimators"][one.name] = _scores(tables, answers[one.name], seed)
         out["estimators"][one.name]["about"] = one.about
     for m, (k, drawn) in zip(tables, enumerate(tables.values()), strict=True):
-        seen = {name: given[k] for name, given in answers.items()}
-        out["paired"][m] = _paired(drawn, seen, out["estimators"], m, seed)
+        columns = {name: given[k].columns for name, given in answers.items()}
+        scores = {name: entry[m] for name, entry in out["estimators"].items()}
+        weights = resamples(trials, seed)
+        out["paired"][m] = beside_best(columns, scores, drawn.truths, drawn.limits, weights)
     named = {name: given[len(tables) :] for name, given in answers.items()}
     out["estimator_curves"] = {"mode": mode, "trials": fewer, **_curves(points, named, seed)}
     out["estimator_map"] = {"mode": mode, "trials": fewer, **_map(points, named, seed)}
@@ -208,32 +179,6 @@ def _scores(tables: Mapping[str, Draws], answers: Sequence[Answer], seed: int) -
             "seconds_per_fit": answer.seconds / count,
             "processor_seconds_per_fit": answer.processor_seconds / count,
             "peak_mb": answer.peak_mb,
-        }
-    return out
-
-
-def _paired(
-    drawn: Draws, answers: Mapping[str, Answer], scores: Mapping[str, Any], mode: str, seed: int
-) -> dict[str, Any]:
-    """Set every estimator beside the most efficient one that is not below its bound."""
-    weights = resamples(len(drawn.truths), seed)
-    out: dict[str, Any] = {}
-    for i, name in enumerate(drawn.limits.free):
-        ranked = {
-            who: entry[mode][name]["efficiency_crb"]
-            for who, entry in scores.items()
-            if "efficiency_crb" in entry[mode].get(name, {})
-            and not entry[mode][name]["below_bound"]
-        }
-        if not ranked:
-            continue
-        best = max(ranked, key=lambda who: ranked[who])
-        truth, crb = drawn.truths[:, PARAMETERS.index(name)], drawn.limits.crb[:, i]
-        errors = {who: a.columns[name] - truth for who, a in answers.items() if name in a.columns}
-        out[name] = {"to": best} | {
-            who: paired(error, errors[best], crb, weights)
-            for who, error in errors.items()
-            if who != best
         }
     return out
 
