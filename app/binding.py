@@ -14,7 +14,7 @@ from bokeh.plotting import figure
 
 import iscat_analysis as ia
 from iscat_analysis.answers.binding import CONCENTRATIONS
-from iscat_analysis.species.mass_action import Model
+from iscat_analysis.species.equilibrium import Model
 from iscat_app.chosen import Notice, masses_in, table_of
 
 _MODELS: dict[str, Model] = {"two M make a dimer": "dimer", "A and B make AB": "ab"}

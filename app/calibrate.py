@@ -12,7 +12,7 @@ from bokeh.models import ColumnDataSource, Range1d, Whisker
 from bokeh.plotting import figure
 
 from iscat_analysis.answers.calibrations import contrast_peaks, mass_calibration
-from iscat_analysis.calibration.mass import ContrastPeak, MassCalibration
+from iscat_analysis.calibration import ContrastPeak, MassCalibration
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import path_beside
 from iscat_app.calibrations import Taken

@@ -30,7 +30,7 @@ import numpy as np  # noqa: E402  # after the thread counts
 import pandas as pd  # noqa: E402
 
 import iscat_analysis as ia  # noqa: E402
-from iscat_analysis.species.mass_action import LANDING_POWER, at_equilibrium  # noqa: E402
+from iscat_analysis.species.equilibrium import LANDING_POWER, at_equilibrium  # noqa: E402
 
 RESULTS = Path(__file__).resolve().parent / "results"
 TOTALS_NM = np.array([1.0, 3.0, 10.0, 30.0, 100.0, 300.0])

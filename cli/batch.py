@@ -179,7 +179,7 @@ def _part(text: str | None, *, merge: bool) -> tuple[int, int] | None:
 
 def print_batch(found: Batch) -> None:
     """Print a line per movie, and what there is now."""
-    from iscat_analysis.day.equilibria import kd_name
+    from iscat_analysis.day.compare import kd_name
     from iscat_analysis.units import count
 
     done = int((found.movies["state"] == "done").sum())

@@ -12,7 +12,7 @@ from iscat_cli.console import Messages, failures, print_json, print_result, tabl
 from iscat_cli.options import ConfigOption, JsonOption, OverwriteOption, SetOption, command
 
 if TYPE_CHECKING:
-    from iscat_analysis.calibration.mass import MassCalibration
+    from iscat_analysis.calibration import MassCalibration
     from iscat_analysis.camera.calibration import CameraCalibration, Estimate
     from iscat_analysis.instrument.result import OpticsCalibration
 
@@ -330,7 +330,7 @@ def _contrasts(text: str) -> list[float]:
 
 def _standards(text: str) -> tuple[list[float], list[float]]:
     """Read ``66,146:1.5,480``."""
-    from iscat_analysis.calibration.mass import STANDARD_ERROR
+    from iscat_analysis.calibration import STANDARD_ERROR
     from iscat_analysis.errors import ConfigError
 
     masses, errors = [], []

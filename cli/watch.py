@@ -99,7 +99,7 @@ def watch(
                 "--scheduler-file": scheduler_file,
             }
             _refuse_options_of_folders(folder, given)
-            from iscat_analysis.calibration.mass.tables import with_line
+            from iscat_analysis.calibration.line import with_line
 
             setup = with_line(setup_of(folder, config, messages), calibration)
             _watch_one(messages, folder, out, setup, settings, workers, interval, as_json=as_json)
@@ -170,7 +170,7 @@ def _watch_one(
 ) -> None:
     """Watch one movie that is being recorded."""
     from iscat_analysis.config import configure
-    from iscat_analysis.day.growing import watch_movie
+    from iscat_analysis.day.watch import watch_movie
     from iscat_analysis.movie.addresses import path_beside
 
     folder = path_beside(movie, ".iscat") if out is None else out

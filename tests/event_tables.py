@@ -7,7 +7,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.species import Efficiency
-from iscat_analysis.species.mass_action import COMPOSITION, LANDING_POWER, Model, at_equilibrium
+from iscat_analysis.species.equilibrium import COMPOSITION, LANDING_POWER, Model, at_equilibrium
 
 
 def draw_table(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.day import run
+from iscat_analysis.day import jobs
 
 SMALL = [
     "simulation.frames=60",
@@ -100,5 +100,5 @@ def put_in_place_of_fits(made: Path, patch: pytest.MonkeyPatch) -> list[str]:
         summary = json.loads((out / "summary.json").read_text())
         return SimpleNamespace(summary={**summary, "input": {"sha256": sha256}})
 
-    patch.setattr(run, "fit_stack", fit_stack)
+    patch.setattr(jobs, "fit_stack", fit_stack)
     return done

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import tifffile
 
-from iscat_analysis.calibration.mass import (
+from iscat_analysis.calibration import (
     LEAST_EVENTS,
     ContrastPeak,
     Landing,
@@ -21,7 +21,7 @@ from iscat_analysis.calibration.mass import (
     find_contrast_peaks,
     standards_of,
 )
-from iscat_analysis.calibration.mass.tables import made_with, measured_contrasts
+from iscat_analysis.calibration.line import made_with, measured_contrasts
 from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
 from iscat_analysis.config import Config
 from iscat_analysis.instrument.learning import calibrate_movie

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.species import choice_of
-from iscat_analysis.calibration.mass.tables import Line
+from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import DataError
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.records import FloatArray, Progress, silent

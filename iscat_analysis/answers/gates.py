@@ -20,8 +20,7 @@ from scipy.special import betaincinv
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.checks import choice_in, number_in
 from iscat_analysis.records import BoolArray, FloatArray, is_event
-from iscat_analysis.species.curves import poisson_interval, round_width
-from iscat_analysis.species.describe import Branch
+from iscat_analysis.species.describe import Branch, poisson_interval, round_width
 from iscat_analysis.species.tables import EventTable, event_table
 
 MOST_BARS = 2000

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.answers.kinetics import Kinetics
-from iscat_analysis.calibration.mass.tables import Line
+from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import choice_in, number_in, path_in, shown, truth_in
 from iscat_analysis.report import atomic_folder, check_output

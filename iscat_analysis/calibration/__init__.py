@@ -1,1 +1,66 @@
-"""Which mass belongs to a contrast?  The mass scale from standards."""
+"""Contrast becomes mass: a line through standards, with errors in both coordinates.
+
+The calibration is odd-symmetric, so that a particle has the same mass when it lands and when it
+leaves: a landing particle of mass m has the contrast c = s·m + o, a leaving one −c.  If landing
+darkens (s < 0), this is m = sign(−c)·(−|c| − o)/s, as in Refeyn's programs.  A straight line
+through both branches is wrong by 2|o/s| for one of them.
+
+Peaks are fitted to events, not to bins: a normal distribution on a flat background, by maximum
+likelihood inside the peak's own window.  The line through the peaks is that of York et al., Am. J.
+Phys. 72, 367 (2004).
+
+`calibrate` runs all steps: `peaks` finds the peaks, `matching` assigns them to standards, `line`
+fits the line, and `result` converts contrasts.  `standards` stores the optics of the measurement.
+"""
+
+from __future__ import annotations
+
+from iscat_analysis.calibration.fit import (
+    LEAST_EVENTS,
+    STANDARD_ERROR,
+    calibrate_mass,
+    find_contrast_peaks,
+    york_line,
+)
+from iscat_analysis.calibration.line import (
+    ContrastPeak,
+    Landing,
+    Line,
+    MassCalibration,
+    Standards,
+    as_given,
+    contrast_over,
+    line_sigma_kda,
+    made_with,
+    mass_from_contrast,
+    mass_line,
+    measured_contrasts,
+    standards_of,
+    weighed,
+    with_line,
+    with_standards,
+)
+
+__all__ = [
+    "LEAST_EVENTS",
+    "STANDARD_ERROR",
+    "ContrastPeak",
+    "Landing",
+    "Line",
+    "MassCalibration",
+    "Standards",
+    "as_given",
+    "calibrate_mass",
+    "contrast_over",
+    "find_contrast_peaks",
+    "line_sigma_kda",
+    "made_with",
+    "mass_from_contrast",
+    "mass_line",
+    "measured_contrasts",
+    "standards_of",
+    "weighed",
+    "with_line",
+    "with_standards",
+    "york_line",
+]

@@ -15,23 +15,30 @@ from typing import Any
 
 import pandas as pd
 
-from iscat_analysis.calibration.mass.tables import Line, with_line
+from iscat_analysis.calibration.line import Line, with_line
 from iscat_analysis.config import configure
 from iscat_analysis.config.overrides import Source
 from iscat_analysis.day.calibrate import Day, calibrate_day
-from iscat_analysis.day.equilibria import Reaction, kd_name, reaction_of
+from iscat_analysis.day.compare import Reaction, kd_name, reaction_of
 from iscat_analysis.day.gather import Found, read_movie
-from iscat_analysis.day.plan import Movie, Plan, configured, make_plan, part_of
+from iscat_analysis.day.jobs import Outcome, Records, Runner, claim_folder, hash_of
 from iscat_analysis.day.publish import publish_day
-from iscat_analysis.day.run import Outcome, Runner
-from iscat_analysis.day.state import Records, claim_folder, hash_of
-from iscat_analysis.day.table import Table, read_standards, read_table
+from iscat_analysis.day.table import (
+    Movie,
+    Plan,
+    Table,
+    configured,
+    make_plan,
+    part_of,
+    read_standards,
+    read_table,
+)
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import path_in, shown
 from iscat_analysis.movie.folders import files_of
 from iscat_analysis.records import Progress, silent
-from iscat_analysis.species.mass_action import Model
+from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.text import from_table
 from iscat_analysis.units import count
 

@@ -15,12 +15,11 @@ from typing import Any
 import pandas as pd
 
 from iscat_analysis.answers.calibrations import camera_calibration, mass_calibration
-from iscat_analysis.calibration.mass import contrast_over, standards_of
+from iscat_analysis.calibration import contrast_over, standards_of
 from iscat_analysis.config import Calibration, Config, load_config
 from iscat_analysis.config.files import read_toml
-from iscat_analysis.day.plan import Movie, Plan, configured
-from iscat_analysis.day.run import Outcome, Runner
-from iscat_analysis.day.state import hash_of, sha256_of
+from iscat_analysis.day.jobs import Outcome, Runner, hash_of, sha256_of
+from iscat_analysis.day.table import Movie, Plan, configured
 from iscat_analysis.errors import DataError, SignError
 from iscat_analysis.movie import open_stack
 

@@ -10,8 +10,15 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.day.calibrate import Day
-from iscat_analysis.day.compare import match_species, shifts
-from iscat_analysis.day.equilibria import Reaction, Series, find_equilibria, kd_name, kd_table
+from iscat_analysis.day.compare import (
+    Reaction,
+    Series,
+    find_equilibria,
+    kd_name,
+    kd_table,
+    match_species,
+    shifts,
+)
 from iscat_analysis.day.gather import (
     MOVIE_COLUMNS,
     SPECIES_COLUMNS,
@@ -21,8 +28,8 @@ from iscat_analysis.day.gather import (
     species_table,
     write_events,
 )
-from iscat_analysis.day.plan import Plan
-from iscat_analysis.day.state import write_whole
+from iscat_analysis.day.jobs import write_whole
+from iscat_analysis.day.table import Plan
 from iscat_analysis.files import whole_file
 from iscat_analysis.report.batch import batch_page, summary_line
 from iscat_analysis.report.batch_figures import Curve

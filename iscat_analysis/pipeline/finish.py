@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.calibration.mass import as_given
+from iscat_analysis.calibration import as_given
 from iscat_analysis.config import config_to_toml
 from iscat_analysis.diagnosis.causes import (
     fixed_height_warning,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from iscat_analysis.calibration.mass import with_standards
+from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera.burnt_in import text_summary
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, Step, calibrated

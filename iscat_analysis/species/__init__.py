@@ -62,8 +62,7 @@ from iscat_analysis.species.motion import (
     anomalous_test,
     confinement_test,
 )
-from iscat_analysis.species.refraction import refractive_index
-from iscat_analysis.species.tracks import TrackSetup, describe_tracks
+from iscat_analysis.species.tracks import TrackSetup, describe_tracks, refractive_index
 
 __all__ = [
     "LEAST_EVENTS",

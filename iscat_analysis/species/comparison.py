@@ -34,11 +34,10 @@ import pandas as pd
 from scipy.special import chdtrc
 
 from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.species.choices import peaks
 from iscat_analysis.species.events import Events
-from iscat_analysis.species.intervals import TWO_SIDED_95
-from iscat_analysis.species.maximum import Maximum
+from iscat_analysis.species.maximum import TWO_SIDED_95, Maximum
 from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.search import peaks
 from iscat_analysis.species.structure import maximise_jointly, structure_of
 
 LEAST_COMPARED = 20

@@ -34,19 +34,19 @@ import pandas as pd
 from scipy.special import logsumexp
 
 from iscat_analysis.records import BoolArray, FloatArray
-from iscat_analysis.species.bootstrap import bootstrap
 from iscat_analysis.species.choices import Searched
-from iscat_analysis.species.curves import NOISES, histogram_of
 from iscat_analysis.species.describe import (
     LEAST_EVENTS,
     LEAST_SPECIES,
+    NOISES,
+    histogram_of,
     interval_of,
     selection_of,
     widening,
 )
-from iscat_analysis.species.edges import Possible
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.repeats import Possible, bootstrap
 from iscat_analysis.units import count
 
 UNIT_NM = 1e-3

@@ -6,16 +6,25 @@ the way along a profile, where those of the last point serve.  It also ends wher
 and not where second derivatives that it has not learned yet let it seem so.  Beside a saddle it is
 told what they are with all curvatures turned to be those of a maximum (Gill & Murray, Math.
 Program. 7, 311, 1974): with those of the saddle it took thousands.
+
+Where a likelihood, maximised over everything else, has fallen by 1.92 from its maximum.
+
+The square root of the deviance, twice that fall, is nearly a line in a well measured parameter, and
+reaches 1.96 at the ends of the 95 % interval (Venzon & Moolgavkar, Appl. Stat. 37, 87, 1988).  Each
+end is bracketed first: MINOS of iminuit, which follows the slope, ended elsewhere in 7 % of 400
+intervals of few events.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from warnings import catch_warnings, simplefilter
 
 import numpy as np
+import scipy
 from iminuit import Minuit
 from iminuit.warnings import IMinuitWarning
 
@@ -130,3 +139,33 @@ def _positive(curvature: FloatArray, scale: FloatArray) -> FloatArray:
         return curvature
     least = _LEAST_BEND * np.abs(values).max()
     return np.asarray((vectors * np.maximum(np.abs(values), least)) @ vectors.T / unit)
+
+
+TWO_SIDED_95 = 1.959964
+"""Standard errors from an estimate to an end of its 95 % interval."""
+
+_END_TOLERANCE = 1e-5  # of the parameter
+
+
+def interval(
+    deviance: Callable[[float], float], best: float, low: float, high: float, *, step: float
+) -> tuple[float, float]:
+    """Find both ends of the 95 % interval; a limit where the likelihood falls by less up to it.
+
+    Brackets widen from the first step on.
+    """
+
+    @cache
+    def beyond(value: float) -> float:
+        return math.sqrt(max(deviance(value), 0.0)) - TWO_SIDED_95
+
+    def end(limit: float) -> float:
+        reach, inner, outer = math.copysign(step, limit - best), best, best
+        while beyond(outer) < 0:
+            if outer == limit:
+                return limit
+            inner, outer = outer, min(max(best + reach, low), high)
+            reach *= 2
+        return float(scipy.optimize.brentq(beyond, inner, outer, xtol=_END_TOLERANCE))
+
+    return end(low), end(high)

@@ -37,11 +37,10 @@ from scipy.special import log_ndtr, ndtr
 
 from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.records import FloatArray
+from iscat_analysis.species.choices import top_of
 from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import Problem
-from iscat_analysis.species.search import top_of
-from iscat_analysis.species.structure import LOGIT_REACH
-from iscat_analysis.species.widths import width_prior
+from iscat_analysis.species.structure import LOGIT_REACH, width_prior
 
 _MASS_RANGE = 0.2  # of the masses that were given
 _OFFSET = 0.05  # of the lightest mass

@@ -26,7 +26,7 @@ import pandas as pd
 import scipy
 from scipy.special import log_ndtr
 
-from iscat_analysis.calibration.mass.tables import Line, mass_line, weighed
+from iscat_analysis.calibration.line import Line, mass_line, weighed
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.movie.event_tables import named, read_events, unit_note

@@ -1,4 +1,46 @@
-"""Tracks: what the frames of one particle say together.
+"""Rows of one track, and selections of them.
+
+One mass from many frames: a particle keeps its mass while it moves.
+
+Each frame k gives an estimate m_k with the information J_k = 1/σ_k².  Its σ_k is that of its own
+estimate, and follows it: J ∝ m^p makes w_k ∝ 1 + p (m_k − m)/m, and the weighted mean is too large
+by the share
+
+    E[m̂]/m − 1 = p (σ/m)² (1 − 1/n),
+
+which does not become less with more frames.  With shot noise alone C = m h gives
+J = B Σ h²/(1 + m h), so that p = −m Σ h³/Σ h² is some hundredths for a protein and the error below
+10⁻⁴; where the scattered light outshines its noise p is 2, and 10 % errors of single frames make
+2 %.  So information is taken at the common mass, J_k (m̂/m_k)^p: that is independent of what noise
+did to frame k.
+
+Frames that share a measured background share its noise where the particle is at the same place;
+then their errors are correlated, and the mean is that of generalised least squares.
+
+Masses that all tracks change together, as where the focus drifts.
+
+A track of its own cannot tell whether it changed or the microscope did, and a short one not even
+that it did; all of them can.  With the mean of each track taken off, the relative masses of all
+frames are fitted by one parabola in time.
+
+The refractive index of a particle whose light and whose size are both measured.
+
+A small sphere of volume V scatters light in proportion to its polarisability (Bohren & Huffman,
+Absorption and Scattering of Light by Small Particles, 1983, section 5.2)
+
+    α = 3 V (n² − n_s²)/(n² + 2 n_s²) = 3 V L.
+
+What light tells is α, here as a mass m of a known material: the contrast is that of V_m = m/ρ with
+its L_m, or, with a calibration, that of a particle like the standards.  What motion tells is the
+diameter d.  So L = L_m V_m/V_d, and
+
+    n² = n_s² (1 + 2 L)/(1 − L),      dn/n = 3 dL/[2 (1 − L)(1 + 2 L)],
+    (dL/L)² = (σ_m/m)² + (3 σ_d/d)²,
+
+for the errors of the mass and of the diameter are independent: noise moves a fitted place as often
+to either side.
+
+Tracks: what the frames of one particle say together.
 
 `describe_tracks` takes the fits, one row per particle and frame, and gives one row per track: the
 mass that its frames have in common (`common_mass`), D from its positions with their own errors and
@@ -14,38 +56,383 @@ that takes a neighbouring fringe makes a step that no particle made.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
-from scipy.special import logit, ndtri
+import scipy
+from numpy.polynomial import legendre
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtrc, chdtri, logit, ndtri
 
+from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.inference.checks import LARGEST, number_in, real_array
 from iscat_analysis.records import (
     TRACK_COLUMNS,
     TRACKS,
+    BoolArray,
     FloatArray,
     Progress,
+    Status,
     TrackStatus,
     silent,
     track_numbers,
 )
-from iscat_analysis.species.common_change import common_change
-from iscat_analysis.species.common_mass import CommonMass, combine_masses, information_power
 from iscat_analysis.species.diffusion import (
+    LEAST_POSITIONS,
     Diffusion,
     estimate_diffusion,
     fit_diffusion,
     hydrodynamic_diameter,
 )
-from iscat_analysis.species.displacements import LEAST_POSITIONS
 from iscat_analysis.species.motion import anomalous_test, confinement_test, steadiness_test
-from iscat_analysis.species.refraction import refractive_index
-from iscat_analysis.species.track_rows import TrackRows, nearest_nm, of_known, rows_by_track
 from iscat_analysis.threads import threads
+from iscat_analysis.units import KILODALTON_KG, NM
+
+NO_PLACE = (Status.NOT_CONVERGED, Status.SIDELOBE, Status.TOO_CLOSE)
+"""Of rows that do not say how a particle moves."""
+
+_LARGEST_ERROR_RATIO = 300.0  # times the median error: such a place says nothing
+
+
+@dataclass(frozen=True)
+class TrackRows:
+    """Some rows of one track, sorted by frame; the columns of ``fits.csv``."""
+
+    frame: FloatArray
+    x_nm: FloatArray
+    y_nm: FloatArray
+    z_nm: FloatArray
+    mass_kda: FloatArray
+    contrast: FloatArray
+    sigma_x_nm: FloatArray
+    sigma_y_nm: FloatArray
+    sigma_mass_kda: FloatArray
+    crb_mass_kda: FloatArray
+    status: NDArray[np.object_]
+
+    def only(self, kept: BoolArray | NDArray[np.int64]) -> TrackRows:
+        """Select some of the rows."""
+        return TrackRows(*(getattr(self, column.name)[kept] for column in fields(self)))
+
+    @property
+    def rejected(self) -> bool:
+        """Whether fewer than half of the rows are ok."""
+        return bool(np.mean(self.status == Status.OK) < 1 / 2)
+
+    def massive(self) -> TrackRows:
+        """Select rows whose mass can be used: poor fits too if the model is rejected.
+
+        The few that are ok would be a selection of the rows that are rejected like all others.
+        """
+        known = np.isfinite(self.sigma_mass_kda) & np.isfinite(self.crb_mass_kda)
+        judged = self.status == Status.OK
+        if self.rejected:
+            judged |= self.status == Status.POOR_FIT
+        return self.only(known & (self.mass_kda != 0) & judged)
+
+    def enlarged(self, factor: float) -> TrackRows:
+        """Multiply the errors by a factor."""
+        names = ("sigma_x_nm", "sigma_y_nm", "sigma_mass_kda")
+        return replace(self, **{name: factor * getattr(self, name) for name in names})
+
+    def placed(self) -> TrackRows:
+        """Select rows whose position can be used.
+
+        A flag that fast motion itself causes must not exclude a row, or fast steps would be
+        missing.
+        """
+        errors = np.fmax(self.sigma_x_nm, self.sigma_y_nm)
+        useful = errors <= _LARGEST_ERROR_RATIO * of_known(np.median, errors)
+        useful &= np.diff(self.frame, prepend=-1) > 0
+        for status in NO_PLACE:
+            useful &= self.status != status
+        return self.only(useful)
+
+    def timed(self, ticks: NDArray[np.int64] | None) -> TrackRows:
+        """Replace frame numbers by the count of camera intervals, where frames are missing.
+
+        Shapes: `ticks` (t,).
+        """
+        return self if ticks is None else replace(self, frame=1.0 * ticks[self.frame.astype(int)])
+
+    def positions(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Give frames, places and their errors, shapes (n,), (n, 2) and (n, 2) [nm]."""
+        places, errors = (self.x_nm, self.y_nm), (self.sigma_x_nm, self.sigma_y_nm)
+        return self.frame, np.stack(places, axis=1), np.stack(errors, axis=1)
+
+
+def rows_by_track(fits: pd.DataFrame) -> dict[int, TrackRows]:
+    """Divide a table by its tracks."""
+    numbers = track_numbers(fits)
+    known, track = fits[numbers.notna()], numbers.dropna().to_numpy(int)
+    rows = TrackRows(
+        *(
+            known[part.name].to_numpy(object if part.name == "status" else float)
+            for part in fields(TrackRows)
+        )
+    )
+    order = np.lexsort((rows.frame, track))
+    edges = np.flatnonzero(np.diff(track[order], prepend=-1, append=-1))
+    return {int(track[order[a]]): rows.only(order[a:b]) for a, b in pairwise(edges)}
+
+
+def nearest_nm(groups: Mapping[int, TrackRows]) -> dict[int, float]:
+    """Smallest distance of each track to any other in the same frame [nm]."""
+    own = np.repeat(np.arange(len(groups)), [len(rows.frame) for rows in groups.values()])
+    frame, x, y = (
+        np.concatenate([getattr(rows, name) for rows in groups.values()] or [[]])
+        for name in ("frame", "x_nm", "y_nm")
+    )
+    order = np.argsort(frame, kind="stable")
+    own, frame, x, y = (values[order] for values in (own, frame, x, y))
+    nearest, ahead = np.full(len(own), np.inf), 1  # of each row; others of a frame come next
+    while (together := frame[ahead:] == frame[:-ahead]).any():
+        one = np.flatnonzero(together & (own[ahead:] != own[:-ahead]))
+        apart = np.hypot(x[one + ahead] - x[one], y[one + ahead] - y[one])
+        for row in (one, one + ahead):
+            nearest[row] = np.fmin(nearest[row], apart)
+        ahead += 1
+    closest = np.full(len(groups), np.inf)
+    np.fmin.at(closest, own, nearest)
+    return dict(zip(groups, closest.tolist(), strict=True))
+
+
+def of_known(statistic: Callable[[FloatArray], Any], values: FloatArray) -> float:
+    """Apply a statistic to the values that are finite."""
+    known = values[~np.isnan(values)]
+    return float(statistic(known)) if known.size else np.nan
+
+
+_Factor = tuple[FloatArray, bool]
+
+_ROUNDS = 8  # of mass and weights in turn; each has an error (p σ/m)²/n of the one before
+_MASS_TOLERANCE = 1e-9  # of the mass
+
+
+@dataclass(frozen=True)
+class CommonMass:
+    """The mass of a track."""
+
+    mass_kda: float
+    sigma_mass_kda: float
+    crb_mass_kda: float
+    scatter: float
+    p_value: float
+    frames: int
+
+    @property
+    def enlargement(self) -> float:
+        """Factor by which frames scatter beyond their errors (Birge, Phys. Rev. 40, 207, 1932)."""
+        return max(self.scatter, 1.0) if self.frames > 1 else 1.0
+
+
+def combine_masses(
+    mass_kda: FloatArray,
+    sigma_kda: FloatArray,
+    crb_kda: FloatArray,
+    *,
+    power: float = 0.0,
+    correlation: FloatArray | None = None,
+) -> CommonMass:
+    """Combine the frames of one track.
+
+    Shapes: `mass_kda` (n,), `sigma_kda, crb_kda` (n,), `correlation` (n, n).
+    """
+    factor = None if correlation is None else scipy.linalg.cho_factor(correlation)
+    mass = float(np.median(mass_kda))
+    for _ in range(_ROUNDS):
+        before, there = mass, _at(mass, mass_kda, power)
+        mass, variance = _least_squares(mass_kda, sigma_kda * there, factor)
+        if abs(mass - before) <= _MASS_TOLERANCE * abs(mass):
+            break
+    there = _at(mass, mass_kda, power)
+    _, bound = _least_squares(mass_kda, crb_kda * there, factor)
+    off = (mass_kda - mass) / (sigma_kda * there)
+    inside = float(off @ _without_correlation(off, factor))
+    free = mass_kda.size - 1
+    return CommonMass(
+        mass_kda=mass,
+        sigma_mass_kda=float(np.sqrt(variance)),
+        crb_mass_kda=float(np.sqrt(bound)),
+        scatter=float(np.sqrt(inside / free)) if free else float("nan"),
+        p_value=float(chdtrc(free, inside)) if free else float("nan"),
+        frames=mass_kda.size,
+    )
+
+
+def information_power(tracks: Sequence[tuple[FloatArray, FloatArray]]) -> float:
+    """Estimate how the information of a frame grows with its own estimate: p of J ∝ m^p.
+
+    The line through ln J against ln m has one slope for all tracks and an intercept for each, so
+    that differences between particles do not matter.
+    """
+    product = square = 0.0
+    for mass, sigma in tracks:
+        size, information = np.log(np.abs(mass)), -2 * np.log(sigma)
+        size = size - size.mean()
+        product += float(size @ (information - information.mean()))
+        square += float(size @ size)
+    return product / square if square > 0 else 0.0
+
+
+def _at(common: float, own: FloatArray, power: float) -> FloatArray:
+    """Factor that scales each frame's σ from its own estimate to the common mass."""
+    return np.asarray(np.abs(own / common) ** (power / 2) if power else np.ones_like(own))
+
+
+def _least_squares(
+    values: FloatArray, sigma: FloatArray, factor: _Factor | None
+) -> tuple[float, float]:
+    """Weighted mean of correlated values, and its variance."""
+    weights = _without_correlation(1 / sigma, factor) / sigma
+    total = float(weights.sum())
+    return float(weights @ values) / total, 1 / total
+
+
+def _without_correlation(values: FloatArray, factor: _Factor | None) -> FloatArray:
+    """Solve correlation · x = values; without a factor the values are independent."""
+    return values if factor is None else np.asarray(scipy.linalg.cho_solve(factor, values))
+
+
+_DEGREE = 2
+_FEWEST_TRACKS = 3
+# p-value below which a common change is reported, whichever two tracks are left out.
+_LARGEST_CHANCE = 1e-4
+_SUSPECTS = 12  # that change most by themselves; two of these are left out in turn
+
+
+def common_change(
+    tracks: Sequence[tuple[FloatArray, FloatArray, FloatArray]], frames: tuple[int, int]
+) -> float:
+    """Range of the relative change of all masses with time; 0 where none is significant.
+
+    Shapes: `tracks` (n,).
+    """
+    first, last = frames
+    information, pull = [], []
+    for frame, mass, sigma in tracks:
+        if len(frame) <= _DEGREE + 1:
+            continue
+        mean = np.average(mass, weights=sigma**-2)
+        weight = (mean / sigma) ** 2
+        time = 2 * (frame - first) / max(last - 1 - first, 1) - 1
+        slopes = legendre.legvander(time, _DEGREE)[:, 1:]
+        slopes = slopes - np.average(slopes, axis=0, weights=weight)
+        information.append((slopes.T * weight) @ slopes)
+        pull.append(slopes.T @ (weight * (mass / mean - 1)))
+    if len(pull) < _FEWEST_TRACKS:
+        return 0.0
+    pulls, known = np.array(pull), np.array(information)
+    every, whole = pulls.sum(axis=0), known.sum(axis=0)
+    least = chdtri(_DEGREE, _LARGEST_CHANCE)
+    own = np.einsum("ni,nij,nj->n", pulls, np.linalg.pinv(known), pulls)
+    suspects = np.argsort(-own)[:_SUSPECTS].tolist()
+    for left_out in (*combinations(range(len(pulls)), 1), *combinations(suspects, 2)):
+        rest = every - pulls[[*left_out]].sum(axis=0)
+        if rest @ np.linalg.pinv(whole - known[[*left_out]].sum(axis=0)) @ rest < least:
+            return 0.0
+    found = np.linalg.pinv(whole) @ every
+    change = legendre.legval(np.linspace(-1, 1, last - first), np.append(0.0, found))
+    return float(np.ptp(change))
+
+
+_LARGEST_INDEX = 10.0
+
+
+def refractive_index(
+    mass_kda: ArrayLike,
+    diameter_nm: ArrayLike,
+    *,
+    sigma_mass_kda: ArrayLike = 0.0,
+    sigma_diameter_nm: ArrayLike = 0.0,
+    index: float = 1.46,
+    density_kg_m3: float = 1350.0,
+    n_medium: float = 1.33,
+) -> tuple[FloatArray, FloatArray]:
+    """Refractive index of spheres that scatter like a known mass and have a known diameter.
+
+    Parameters
+    ----------
+    mass_kda : array_like
+        Masses that the contrasts are, of the material below [kDa].
+    diameter_nm : array_like
+        Diameters, as of `hydrodynamic_diameter` [nm].
+    sigma_mass_kda, sigma_diameter_nm : array_like
+        Their standard errors [kDa, nm].
+    index : float
+        Refractive index of the material that the masses are of; default protein.
+    density_kg_m3 : float
+        Its density [kg/m³].
+    n_medium : float
+        Refractive index of the liquid.
+
+    Returns
+    -------
+    index : ndarray
+        NaN where no sphere of that diameter scatters as much, or the diameter is not finite.
+    sigma : ndarray
+        Its standard error, to first order.
+
+    Raises
+    ------
+    ConfigError
+        A refractive index or the density is not above zero, or the material scatters like the
+        liquid.
+    DataError
+        A number is not real, or shapes do not go together.
+
+    References
+    ----------
+    Bohren & Huffman, Absorption and Scattering of Light by Small Particles (1983), section 5.2.
+
+    Examples
+    --------
+    >>> import iscat_analysis as ia
+    >>> n, error = ia.refractive_index(150.0, 7.05, sigma_mass_kda=5.0, sigma_diameter_nm=0.2)
+    >>> print(f"{n:.3f} ± {error:.3f}")
+    1.460 ± 0.012
+    """
+    for name, value, most in (
+        ("index", index, _LARGEST_INDEX),
+        ("density_kg_m3", density_kg_m3, LARGEST),
+        ("n_medium", n_medium, _LARGEST_INDEX),
+    ):
+        number_in(name, value, above=0.0, most=most)
+    if index == n_medium:
+        raise ConfigError(f"index = {index:g} is that of the medium: such particles are not seen")
+    named = {
+        "mass_kda": mass_kda,
+        "diameter_nm": diameter_nm,
+        "sigma_mass_kda": sigma_mass_kda,
+        "sigma_diameter_nm": sigma_diameter_nm,
+    }
+    arrays = [real_array(name, value) for name, value in named.items()]
+    for name, array in zip(named, arrays, strict=True):
+        far = np.isfinite(array) & (np.abs(array) > LARGEST)  # D of 0 makes a diameter infinite
+        wrong = array < 0 if name.startswith("sigma") else far
+        if wrong.any():
+            raise DataError(f"{name} = {array[wrong].flat[0]:g}: no particle has that; check it")
+    try:
+        mass, diameter, sigma_mass, sigma_diameter = np.broadcast_arrays(*arrays)
+    except ValueError:
+        raise DataError(f"{', '.join(named)}: have shapes that do not go together") from None
+    contrast = (index**2 - n_medium**2) / (index**2 + 2 * n_medium**2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        volume_nm3 = mass * (KILODALTON_KG / density_kg_m3 / NM**3)
+        part = contrast * volume_nm3 / (np.pi / 6 * diameter**3)
+        sized = (diameter > 0) & np.isfinite(diameter)
+        usable = sized & np.isfinite(part) & (part < 1) & (part > -0.5)
+        part = np.where(usable, part, np.nan)
+        found = n_medium * np.sqrt((1 + 2 * part) / (1 - part))
+        relative = np.hypot(sigma_mass / mass, 3 * sigma_diameter / diameter)
+        sigma = found * 1.5 * np.abs(part) * relative / ((1 - part) * (1 + 2 * part))
+    return np.asarray(found), np.asarray(sigma)
+
 
 TESTED_POSITIONS = 300
 """Positions of a track whose motion is tested, from its first: the time of a test grows fast."""

@@ -15,7 +15,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.records import BoolArray, FloatArray, Status
-from iscat_analysis.species.track_rows import NO_PLACE
+from iscat_analysis.species.tracks import NO_PLACE
 
 FEWEST_PARTICLES = 3
 """Particles in a pair of frames, at least."""

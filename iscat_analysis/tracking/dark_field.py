@@ -23,7 +23,7 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import FloatArray, Windows, is_event
 from iscat_analysis.species.diffusion import estimate_diffusion
-from iscat_analysis.species.track_rows import rows_by_track
+from iscat_analysis.species.tracks import rows_by_track
 from iscat_analysis.tracking.moving_field import exposure_of
 from iscat_analysis.tracking.moving_table import loss_to_blur
 

@@ -35,8 +35,11 @@ from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.seated import LARGEST_INDEX, LEAST_CONTRAST
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FloatArray, Status, verdict
-from iscat_analysis.species.diffusion import estimate_diffusion, hydrodynamic_diameter
-from iscat_analysis.species.displacements import LEAST_POSITIONS
+from iscat_analysis.species.diffusion import (
+    LEAST_POSITIONS,
+    estimate_diffusion,
+    hydrodynamic_diameter,
+)
 from iscat_analysis.species.tracks import SLOWED_BY_WALL, Correlation
 from iscat_analysis.tracking.moving_field import exposure_of
 from iscat_analysis.tracking.paths import ALONG, path_shifts_at

@@ -21,7 +21,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from iscat_analysis.calibration.mass import line_sigma_kda
+from iscat_analysis.calibration import line_sigma_kda
 from iscat_analysis.config import Config, OpticsCovariance
 from iscat_analysis.optics.field_map import BASES, REFERENCE, WEIGHTS, centre_of, when
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, forward_model

@@ -16,13 +16,13 @@ from scipy.optimize import minimize
 from shared_errors import systematic
 
 from iscat_analysis.answers.calibrations import read_contrasts
-from iscat_analysis.calibration.mass import (
+from iscat_analysis.calibration import (
     calibrate_mass,
     find_contrast_peaks,
     mass_from_contrast,
-    peaks,
     york_line,
 )
+from iscat_analysis.calibration import fit as peaks
 from iscat_analysis.config import configure, parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie.event_tables import read_events, stored_calibration

@@ -10,13 +10,8 @@ import pytest
 import tifffile
 
 import iscat_analysis as ia
-from iscat_analysis.calibration.mass import (
-    calibrate_mass,
-    contrast_over,
-    standards_of,
-    with_standards,
-)
-from iscat_analysis.calibration.mass.tables import with_line
+from iscat_analysis.calibration import calibrate_mass, contrast_over, standards_of, with_standards
+from iscat_analysis.calibration.line import with_line
 from iscat_analysis.species.tables import event_table, sentences
 from iscat_cli import main
 
@@ -186,7 +181,7 @@ def test_commands_for_movies_take_it(
         raise ia.DataError("enough")
 
     monkeypatch.setattr("iscat_analysis.pipeline.fit_stack", fit_stack)
-    monkeypatch.setattr("iscat_analysis.day.run.fit_stack", fit_stack)
+    monkeypatch.setattr("iscat_analysis.day.jobs.fit_stack", fit_stack)
     tifffile.imwrite(tmp_path / "m.tif", np.ones((5, 8, 8), np.uint16))
     (tmp_path / "iscat.toml").write_text("[calibration]\ngradient_per_kda = -9e-5\n")
     assert main(["fit", str(tmp_path / "m.tif"), "--calibration", str(line)]) == 1

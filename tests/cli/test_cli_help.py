@@ -123,7 +123,7 @@ def test_every_example_runs(
     if "watch" in arguments:
         Path("movies").mkdir()
         monkeypatch.setattr("iscat_analysis.day.watch.WatchedFolder.check", _interrupt)
-        monkeypatch.setattr("iscat_analysis.day.growing.RESTS", 0)
+        monkeypatch.setattr("iscat_analysis.day.watch.RESTS", 0)
     if "app" in arguments:  # test_app goes the whole way, in a browser
         pytest.importorskip("panel", reason="needs the Python package panel")
         Path("measurements/monday").mkdir(parents=True)

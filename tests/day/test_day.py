@@ -20,10 +20,10 @@ from event_tables import draw_series
 from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
-from iscat_analysis.day import Batch, run
-from iscat_analysis.day.equilibria import KD_COLUMNS
+from iscat_analysis.day import Batch, jobs
+from iscat_analysis.day.compare import KD_COLUMNS
 from iscat_analysis.day.gather import MOVIE_COLUMNS, SPECIES_COLUMNS
-from iscat_analysis.day.state import STATE, Records
+from iscat_analysis.day.jobs import STATE, Records
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.schemas import schema, to_json
 from iscat_cli import main
@@ -201,19 +201,19 @@ def test_a_movie_that_fails_costs_only_itself(lab: Path, capsys, tmp_path: Path)
 
 
 def test_an_unexpected_error_costs_only_its_movie(lab: Path, monkeypatch) -> None:
-    real = run.fit_stack
+    real = jobs.fit_stack
 
     def broken(stack: Path, *arguments: object, **options: object) -> object:
         if stack.name == "b.tif":
             raise ZeroDivisionError("by chance")
         return real(stack, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(run, "fit_stack", broken)
+    monkeypatch.setattr(jobs, "fit_stack", broken)
     assert _run(lab).failed == (("b", "unexpected ZeroDivisionError: by chance"),)
 
 
 def test_an_interrupt_keeps_what_is_finished(lab: Path, monkeypatch) -> None:
-    real = run.fit_stack
+    real = jobs.fit_stack
 
     def stopped(stack: Path, *arguments: object, **options: object) -> object:
         if stack.name == "b.tif":
@@ -221,7 +221,7 @@ def test_an_interrupt_keeps_what_is_finished(lab: Path, monkeypatch) -> None:
         return real(stack, *arguments, **options)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patch:
-        patch.setattr(run, "fit_stack", stopped)
+        patch.setattr(jobs, "fit_stack", stopped)
         with pytest.raises(KeyboardInterrupt, match="1 of 3 movies are finished"):
             _run(lab)
     assert _run(lab).analysed == ("b", "c")
@@ -231,7 +231,7 @@ def test_an_interrupt_that_reached_compiled_code_is_one(lab: Path, monkeypatch) 
     def stopped(*_: object, **__: object) -> None:
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr(run, "fit_stack", stopped)
+    monkeypatch.setattr(jobs, "fit_stack", stopped)
     with pytest.raises(KeyboardInterrupt):
         _run(lab)
 
@@ -246,7 +246,7 @@ def test_a_result_that_was_interrupted_under_another_configuration_is_not_taken(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(run, "fit_stack", stopped)
+        patch.setattr(jobs, "fit_stack", stopped)
         with pytest.raises(KeyboardInterrupt):
             _run(finished, settings={"fit.roi_nm": 2000.0})
     assert _run(finished).analysed == ("a",)

@@ -16,9 +16,8 @@ from tiff_files import write_ome_set
 
 import iscat_analysis as ia
 from iscat_analysis.config import configure
-from iscat_analysis.day.plan import make_plan
-from iscat_analysis.day.state import saw, seen, sha256_of
-from iscat_analysis.day.table import Table, read_table
+from iscat_analysis.day.jobs import saw, seen, sha256_of
+from iscat_analysis.day.table import Table, make_plan, read_table
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.movie import open_stack
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from iscat_analysis.config import configure
-from iscat_analysis.day.plan import configured, make_plan, part_of
-from iscat_analysis.day.table import read_standards, read_table
+from iscat_analysis.day.table import configured, make_plan, part_of, read_standards, read_table
 from iscat_analysis.errors import ConfigError
 
 HEADING = "path,sample,condition,concentration_nm,replicate,role,standards,fit.roi_nm,operator\n"

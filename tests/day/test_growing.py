@@ -17,8 +17,8 @@ import zarr
 from small_movies import LANDING
 
 from iscat_analysis.config import Config, configure
-from iscat_analysis.day import growing
-from iscat_analysis.day.growing import RESTS, histogram, watch_movie
+from iscat_analysis.day import watch as growing
+from iscat_analysis.day.watch import RESTS, histogram, watch_movie
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import fit_stack

@@ -21,7 +21,7 @@ from tiff_files import write_ome_set
 
 import iscat_analysis as ia
 import iscat_analysis.day as day_module
-from iscat_analysis.day import run
+from iscat_analysis.day import jobs
 from iscat_analysis.day.watch import MOST_CHECKS, Ready, WatchedFolder
 from iscat_analysis.errors import ConfigError, DataError, SchedulerError
 from iscat_cli import main
@@ -257,7 +257,7 @@ def test_what_failed_is_tried_again_when_the_watching_begins(
 ) -> None:
     shutil.copy(made / "movie.tif", folder / "a.tif")
     with monkeypatch.context() as patch:
-        patch.setattr(run, "fit_stack", lambda *_, **__: 1 / 0)
+        patch.setattr(jobs, "fit_stack", lambda *_, **__: 1 / 0)
         day = Day(("a: failed", lambda: None), ("1 failed", lambda: None))
         first = day.watch(folder)
     assert first is not None
@@ -270,7 +270,7 @@ def test_what_failed_is_tried_again_when_the_watching_begins(
 def test_an_interrupt_ends_with_a_page_of_what_is_finished(
     folder: Path, made: Path, fits: list[str], monkeypatch, capsys, tmp_path: Path
 ) -> None:
-    finish = run.fit_stack
+    finish = jobs.fit_stack
 
     def stopped(movie: Path, *arguments: object, **options: object) -> object:
         if movie.name == "b.tif":
@@ -283,7 +283,7 @@ def test_an_interrupt_ends_with_a_page_of_what_is_finished(
     setup.write_text(ia.config_to_toml(ia.configure(SETUP)), encoding="utf-8")
     command = ["watch", str(folder), "--config", str(setup), "--interval", str(INTERVAL_S)]
     with monkeypatch.context() as patch:
-        patch.setattr(run, "fit_stack", stopped)
+        patch.setattr(jobs, "fit_stack", stopped)
         assert main([*command, "--out", str(tmp_path / "day")]) == 130
     said = capsys.readouterr()
     assert "1 of 3 movies done, 1 of them now" in said.out

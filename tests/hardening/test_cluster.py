@@ -378,7 +378,7 @@ def test_a_worker_that_does_not_see_a_movie_says_which(
 ) -> None:
     """What the command sees of the file is not what the worker sees of it."""
     cluster.add(1)
-    monkeypatch.setattr("iscat_analysis.day.run.seen", lambda path: f"another {path}")
+    monkeypatch.setattr("iscat_analysis.day.jobs.seen", lambda path: f"another {path}")
     (day / "one.csv").write_text("path\na.tif\n")
     found = ia.batch(day / "one.csv", out=day / "blind", config=SETUP, scheduler_file=cluster.file)
     ((name, why),) = found.failed

@@ -17,7 +17,7 @@ import pytest
 from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
-from iscat_analysis.day.state import STATE, Records
+from iscat_analysis.day.jobs import STATE, Records
 from iscat_analysis.errors import DataError
 from iscat_analysis.report.output import FILE_LIST, atomic_folder, check_output, claim_output
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from iscat_analysis.species.common_change import common_change
+from iscat_analysis.species.tracks import common_change
 
 FRAMES = (100, 900)
 LENGTH = 300  # of a track

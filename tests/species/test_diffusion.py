@@ -19,8 +19,8 @@ from scipy.stats import multivariate_normal, norm
 import iscat_analysis as ia
 from iscat_analysis._kernels.diffusion import displacement_likelihoods
 from iscat_analysis._kernels.harmonic_trap import harmonic_likelihoods, most_likely_well
-from iscat_analysis.species import diffusion, fractional, motion
-from iscat_analysis.species.displacements import Displacements, gather
+from iscat_analysis.species import diffusion, motion
+from iscat_analysis.species.diffusion import Displacements, gather
 
 EXACT = 1e-9  # of float64, after a factorisation of a hundred rows
 SLOPE = 1e-5  # central differences
@@ -250,9 +250,9 @@ def test_the_covariance_based_estimate_has_its_error() -> None:
 @pytest.mark.parametrize("exposure", [0.0, 0.005, 0.6, 1.0])
 def test_blur_of_anomalous_motion(exponent: float, exposure: float) -> None:
     track = make_track(n=5, missing=0.5, exposure=exposure)
-    lags = fractional.Lags.of(track)
-    found = fractional.covariance(
-        lags, fractional.mean_squared_displacement(track, lags.distinct, exponent)
+    lags = motion.Lags.of(track)
+    found = motion.covariance(
+        lags, motion.mean_squared_displacement(track, lags.distinct, exponent)
     )
     dt, start = track.interval_s, track.frames.astype(float)
 
@@ -392,16 +392,14 @@ def test_a_track_that_another_took_over_has_no_one_d() -> None:
 @pytest.mark.parametrize("exponent", [0.4, 1.0, 1.7])
 def test_slopes_of_the_likelihood_of_an_exponent(exponent: float) -> None:
     track = make_track(n=40, missing=0.3, exposure=0.7)
-    lags, at = fractional.Lags.of(track), np.array([math.log(0.1e6), exponent])
+    lags, at = motion.Lags.of(track), np.array([math.log(0.1e6), exponent])
     part = 1e-5 * np.eye(2)
 
     def told(at: np.ndarray) -> Any:
-        return fractional.likelihood_at(track, lags, math.exp(at[0]), at[1])
+        return motion.likelihood_at(track, lags, math.exp(at[0]), at[1])
 
     def covariances(at: np.ndarray) -> np.ndarray:
-        one = fractional.covariance(
-            lags, fractional.mean_squared_displacement(track, lags.distinct, at[1])
-        )
+        one = motion.covariance(lags, motion.mean_squared_displacement(track, lags.distinct, at[1]))
         sigma = np.array([math.exp(at[0]) * one + np.diag(main) for main in track.error[0]])
         for among, beside in zip(sigma, track.error[1], strict=True):
             among += np.diag(beside, 1) + np.diag(beside, -1)
@@ -428,16 +426,16 @@ def test_slopes_of_the_likelihood_of_an_exponent(exponent: float) -> None:
 def test_the_most_likely_exponent() -> None:
     """From a start far off, against a search that knows no slopes; at the end of its range too."""
     track = make_track(n=80, missing=0.2)
-    lags = fractional.Lags.of(track)
+    lags = motion.Lags.of(track)
     straight = np.outer([30.0, -30.0], track.frames)
     for moved in (track, replace(track, positions_nm=track.positions_nm + straight)):
 
         def lost(at: np.ndarray, moved: Displacements = moved) -> float:
             exponent = min(max(at[1], 0.02), 1.98)
-            return -fractional.likelihood_at(moved, lags, math.exp(at[0]), exponent).value
+            return -motion.likelihood_at(moved, lags, math.exp(at[0]), exponent).value
 
         best = minimize(lost, [12.0, 1.2], method="Nelder-Mead", options={"xatol": 1e-6})
-        found = fractional.most_likely_power(moved, 0.5 * math.exp(best.x[0]))
+        found = motion.most_likely_power(moved, 0.5 * math.exp(best.x[0]))
         assert found.value == pytest.approx(-best.fun, abs=1e-3)
         assert abs(found.exponent - best.x[1]) < 0.03 * found.sigma_exponent
 

@@ -28,7 +28,7 @@ from scipy.optimize import minimize_scalar
 
 import iscat_analysis as ia
 from iscat_analysis.species import motion
-from iscat_analysis.species.displacements import Displacements, gather
+from iscat_analysis.species.diffusion import Displacements, gather
 
 pytestmark = pytest.mark.large
 

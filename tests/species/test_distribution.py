@@ -21,9 +21,9 @@ from iscat_analysis.species import (
     Searched,
     describe,
 )
-from iscat_analysis.species.bootstrap import draw_events
 from iscat_analysis.species.events import Edge, Events
 from iscat_analysis.species.mixture import Mixture
+from iscat_analysis.species.repeats import draw_events
 
 
 def sample(seed: int = 1, n: int = 200) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,15 +18,15 @@ import iscat_analysis as ia
 from iscat_analysis._kernels.mixture import mixture_score
 from iscat_analysis.day.table import read_table
 from iscat_analysis.species import Efficiency
-from iscat_analysis.species.equilibrium import _Equilibrium
-from iscat_analysis.species.events import Events
-from iscat_analysis.species.mass_action import (
+from iscat_analysis.species.equilibrium import (
     COMPOSITION,
     LANDING_POWER,
     Model,
+    _Equilibrium,
     at_equilibrium,
     landing_logits,
 )
+from iscat_analysis.species.events import Events
 from iscat_analysis.species.maximum import Problem, maximise
 from iscat_analysis.species.series import MEANS, SHARES, VARIANCES, Series
 from iscat_analysis.species.tables import event_table

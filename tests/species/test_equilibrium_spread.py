@@ -15,8 +15,7 @@ from scipy.stats import kstest
 import iscat_analysis as ia
 from iscat_analysis.answers.binding import Binding
 from iscat_analysis.species import Efficiency
-from iscat_analysis.species.equilibrium import EquilibriumFit
-from iscat_analysis.species.mass_action import LANDING_POWER, at_equilibrium
+from iscat_analysis.species.equilibrium import LANDING_POWER, EquilibriumFit, at_equilibrium
 
 pytestmark = pytest.mark.large
 

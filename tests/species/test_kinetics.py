@@ -11,7 +11,7 @@ import pytest
 from event_tables import draw_visits
 
 import iscat_analysis as ia
-from iscat_analysis.species.kinetics import landing_rate, pair_events, unbinding_rate
+from iscat_analysis.answers.kinetics import landing_rate, pair_events, unbinding_rate
 
 WHOLE = (0, 6000)
 

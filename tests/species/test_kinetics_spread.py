@@ -10,8 +10,8 @@ from event_tables import draw_visits
 
 import iscat_analysis as ia
 from iscat_analysis import Kinetics
+from iscat_analysis.answers.kinetics import UnbindingRate
 from iscat_analysis.species import Efficiency
-from iscat_analysis.species.kinetics import UnbindingRate
 
 MISSING = Efficiency(5.0, 27.0)  # 71 % of 150 kDa are seen
 DEPLETION, LEAVING = 0.03, 0.02

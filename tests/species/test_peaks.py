@@ -11,13 +11,11 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 import iscat_analysis as ia
-from iscat_analysis.species.background import broad
-from iscat_analysis.species.choices import Searched
-from iscat_analysis.species.edges import possible_edges
+from iscat_analysis.species.choices import Searched, by_peaks, top_of
 from iscat_analysis.species.events import Edge, Events
-from iscat_analysis.species.mixture import Mixture
-from iscat_analysis.species.search import by_peaks, top_of
-from iscat_analysis.species.widths import width_prior
+from iscat_analysis.species.mixture import Mixture, broad
+from iscat_analysis.species.repeats import possible_edges
+from iscat_analysis.species.structure import width_prior
 
 Array = NDArray[np.float64]
 SHARES = (0.5, 0.3, 0.2)

@@ -14,7 +14,7 @@ from iscat_analysis.config import parse_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.records import TRACK_COLUMNS, TrackStatus
 from iscat_analysis.species import describe_tracks
-from iscat_analysis.species.common_mass import combine_masses, information_power
+from iscat_analysis.species.tracks import combine_masses, information_power
 from iscat_analysis.tracking.tracks import SHORT_MOVIE, cut_steps, judge_times
 from iscat_analysis.units import sphere_mass_kda
 

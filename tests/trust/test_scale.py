@@ -14,7 +14,7 @@ from shared_errors import systematic
 
 import iscat_analysis as ia
 from iscat_analysis.answers.calibrations import mass_calibration
-from iscat_analysis.calibration.mass import as_given, contrast_over, standards_of, with_standards
+from iscat_analysis.calibration import as_given, contrast_over, standards_of, with_standards
 from iscat_analysis.config import Config, config_to_toml, configure
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood

@@ -3,6 +3,8 @@
 A result is as its job asks for if its record holds the job's key, a hash of the program's version
 and the resolved configuration, if its files are whole, and if the movie is the one
 that the record saw: of the same size, time and ends, or, where it was copied, of the same SHA-256.
+
+Jobs of a batch: finished ones are skipped, and a failure affects only its own job.
 """
 
 from __future__ import annotations
@@ -11,21 +13,28 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 from filelock import FileLock, Timeout
 
-from iscat_analysis.config import Config, config_to_toml
-from iscat_analysis.errors import DataError
+from iscat_analysis.config import Config, config_to_toml, with_absolute_paths
+from iscat_analysis.errors import DataError, IscatError, SchedulerError
+from iscat_analysis.executors import Executor
 from iscat_analysis.files import take, whole_file
 from iscat_analysis.hashing import fingerprint, sha256_of_files
+from iscat_analysis.movie import open_stack
 from iscat_analysis.movie.addresses import split_address
 from iscat_analysis.movie.folders import files_of
+from iscat_analysis.movie.stack import not_shared
+from iscat_analysis.pipeline import fit_stack
+from iscat_analysis.records import Progress, silent
+from iscat_analysis.threads import one_thread_algebra
 
 STATE = ".batch"
 """Folder of records and locks; it marks a folder as that of a batch."""
@@ -187,3 +196,131 @@ def seen(path: Path) -> str:
 
 def _fingerprint(address: Path) -> str:
     return fingerprint(files_of(address), split_address(address)[1])
+
+
+Notify = Callable[[str], None]
+
+State = Literal["done", "failed", "missing"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Result of a job."""
+
+    state: State
+    why: str = ""
+    ran: bool = False
+    record: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Runner:
+    """Runs jobs that are not finished yet."""
+
+    out: Path
+    records: Records
+    dry: bool
+    progress: Progress
+    notify: Notify
+    command: str
+    executor: Executor
+    retry: bool = True
+
+    def job(
+        self,
+        name: str,
+        key: str,
+        inputs: Mapping[str, Path],
+        result: Path,
+        work: Callable[[], Mapping[str, Any]],
+    ) -> Outcome:
+        """Do a job unless it is done."""
+        with self.records.held(name, self.notify):
+            record = self.records.read(name)
+            files = record.get("inputs", {})
+            current = record.get("key") == key and set(files) == set(inputs)
+            current = current and all(saw(files[each], path) for each, path in inputs.items())
+            if current and record["state"] == "done" and result.is_file():
+                found = results_in(result.parent)
+                whole = record.get("results", found)
+                if "damaged" not in found.values() and found == whole:
+                    return Outcome("done", record=record)
+                if not self.dry:
+                    self.notify(f"{result.parent}: is damaged, and is made anew")
+            failed = current and record["state"] == "failed"
+            if self.dry or (failed and not self.retry):
+                return Outcome("failed" if failed else "missing", record.get("why", ""))
+            self.records.drop(name)
+            before = {each: {"fingerprint": seen(path)} for each, path in inputs.items()}
+            kept: Mapping[str, Any] = {}
+            why = ""
+            try:
+                kept = work()
+            except SchedulerError:  # the cluster failed, not this job
+                raise
+            except IscatError as error:
+                why = str(error)
+            except Exception as error:  # noqa: BLE001  (the other movies go on)
+                if isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+                    raise KeyboardInterrupt from None  # compiled code wraps it in another error
+                why = f"unexpected {type(error).__name__}: {error}"
+            state: State = "failed" if why else "done"
+            hashes = kept.get("inputs", {})
+            record = {
+                **kept,
+                "key": key,
+                "state": state,
+                "why": why,
+                "results": {} if why else results_in(result.parent),
+                "inputs": {
+                    each: {**found, **hashes.get(each, {})} for each, found in before.items()
+                },
+            }
+            self.records.write(name, record)
+            return Outcome(state, why, ran=True, record=record)
+
+    def analyse(self, name: str, movie: Path, config: Config, folder: Path) -> Outcome:
+        """Fit a movie unless that is done."""
+
+        def work() -> dict[str, Any]:
+            return self.executor.call(
+                analyse_movie,
+                self.out.absolute(),
+                name,
+                (movie, seen(movie)),
+                with_absolute_paths(config),
+                folder.absolute(),
+                self.command,
+                progress=self.progress,
+            )
+
+        return self.job(name, key_of(config), {"movie": movie}, folder / "summary.json", work)
+
+
+def analyse_movie(
+    out: Path,
+    name: str,
+    movie: tuple[Path, str],
+    config: Config,
+    folder: Path,
+    command: str,
+    *,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Fit a movie of a batch, wherever that is."""
+    path, known = movie
+    if not (out / STATE).is_dir():
+        raise not_shared(out)
+    if known and seen(path) != known:
+        raise not_shared(path)
+    with Records(out).held(f"{name}.work", lambda _: None), one_thread_algebra():
+        with open_stack(path) as stack:
+            shape = [int(n) for n in stack.shape]
+        summary = fit_stack(
+            path, config, out=folder, overwrite=True, progress=progress, command=command
+        ).summary
+    return {
+        "shape": shape,
+        "events": summary["events"],
+        "inputs": {"movie": {"sha256": summary["input"]["sha256"]}},
+    }
