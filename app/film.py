@@ -21,7 +21,7 @@ from bokeh.models import (
 from bokeh.plotting import figure
 
 import iscat_analysis as ia
-from iscat_analysis.pipeline.ratio_film import RatioFilm
+from iscat_analysis.pipeline.preview import RatioFilm
 from iscat_analysis.report.pictures import SHOWN_FRAMES
 from iscat_app.chosen import Chosen, Notice
 

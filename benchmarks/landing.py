@@ -38,7 +38,8 @@ from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.search.sliding import make_chunk, make_filter, measure_frames, sliding_maps
+from iscat_analysis.search.frames import make_chunk, measure_frames
+from iscat_analysis.search.sliding import make_filter, sliding_maps
 from iscat_analysis.study import write_stack
 
 ROOT = Path(__file__).resolve().parent

@@ -26,7 +26,7 @@ from qtpy.QtWidgets import (
 from superqt import QLabeledDoubleSlider, QLabeledSlider
 
 import iscat_analysis as ia
-from iscat_analysis.pipeline.ratio_film import film_limits
+from iscat_analysis.pipeline.preview import film_limits
 from iscat_napari.events import EventPanel
 from iscat_napari.frames import LazyFrames, LazyMovie
 from iscat_napari.readers import RESULT, ROW

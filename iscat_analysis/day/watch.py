@@ -35,7 +35,7 @@ from iscat_analysis.day.jobs import Records, claim_folder
 from iscat_analysis.day.table import TABLES, Table, read_growing, read_standards
 from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerError
 from iscat_analysis.executors import THREADS
-from iscat_analysis.fitting.checkpoint import is_resumable
+from iscat_analysis.fitting.run import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack
 from iscat_analysis.movie.folders import files_of, find_movies, is_open_to_write

@@ -34,13 +34,11 @@ from iscat_analysis.diagnosis.stretches import Stretches, find_stretches
 from iscat_analysis.diagnosis.turns import refuse_channels
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import Finding, aside, remark, unreported
-from iscat_analysis.fitting.background_mode import describe_background_mode
-from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.ranges import describe_background_mode, fitted_frames
 from iscat_analysis.fitting.run import Notify, notify_nobody
 from iscat_analysis.movie import Stack
 from iscat_analysis.pieces.setups import darkfield_photons
-from iscat_analysis.search.sliding.chunks import reader_of
-from iscat_analysis.search.sliding.planning import sum_first_chunk
+from iscat_analysis.search.chunks import reader_of, sum_first_chunk
 from iscat_analysis.threads import one_thread_algebra, start_in_thread
 
 Step = Callable[[Prepared], tuple[Prepared, Sequence[Finding]]]

@@ -23,7 +23,7 @@ from iscat_analysis.optics.scale import MassScale
 from iscat_analysis.optics.seated import VESICLE
 from iscat_analysis.optics.spheres import has_shells
 from iscat_analysis.records import FloatArray, Status, Windows, has_flag
-from iscat_analysis.search.sliding import DARK, well_lit
+from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.trust.systematic import is_bent
 from iscat_analysis.units import count, listed
 

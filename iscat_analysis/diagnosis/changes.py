@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.medians import middle
+from iscat_analysis.search.bright import smoothed, spot_response
 from iscat_analysis.search.peaks import maxima
-from iscat_analysis.search.smoothing import smoothed, spot_response
 
 LEAST_CHANGE_SIGMAS = 12.0
 """Standard deviations of noise that a change must exceed: the ratios below then have errors of a

@@ -12,7 +12,7 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.selected_frames import ChangedFrames
 from iscat_analysis.records import Windows
-from iscat_analysis.search.sliding import DARK, cut_off, well_lit
+from iscat_analysis.search.frames import DARK, cut_off, well_lit
 from iscat_analysis.units import listed
 
 _DIM = 0.97

@@ -12,7 +12,8 @@ from iscat_analysis.camera.drift import follow_pattern
 from iscat_analysis.diagnosis.noise import first_counts, is_lit
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, Windows
-from iscat_analysis.search.sliding import measure_noise, well_lit
+from iscat_analysis.search.frames import well_lit
+from iscat_analysis.search.noise import measure_noise
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""

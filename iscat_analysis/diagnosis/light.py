@@ -18,9 +18,10 @@ from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import least_beside, spot_of
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
-from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.movie import Stack
-from iscat_analysis.search.sliding import good_frames, longest_window, measure_frames, well_lit
+from iscat_analysis.search.frames import good_frames, measure_frames, well_lit
+from iscat_analysis.search.noise import longest_window
 from iscat_analysis.threads import one_thread_algebra
 
 PAIRS = 12

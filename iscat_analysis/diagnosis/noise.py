@@ -31,17 +31,15 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, FrameSource, Windows
-from iscat_analysis.search.sliding import (
+from iscat_analysis.search.chunks import NOISE_FRAMES, Reader, reader_of
+from iscat_analysis.search.frames import good_frames, measure_frames, well_lit
+from iscat_analysis.search.noise import (
     SHORTEST_MOVIE,
     NoiseCurve,
     choose_window,
-    good_frames,
     longest_window,
-    measure_frames,
     measure_noise,
-    well_lit,
 )
-from iscat_analysis.search.sliding.chunks import NOISE_FRAMES, Reader, reader_of
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import one_thread_algebra
 

@@ -17,8 +17,7 @@ from iscat_analysis.diagnosis.changes import Changes
 from iscat_analysis.diagnosis.noise import NoiseSurvey
 from iscat_analysis.diagnosis.repeated_frames import KeptFrames
 from iscat_analysis.diagnosis.stretches import Stretches
-from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
-from iscat_analysis.fitting.ranges import fitted_frames
+from iscat_analysis.fitting.ranges import BackgroundMode, background_mode, fitted_frames
 from iscat_analysis.fitting.run import Notify, notify_nobody
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import Status

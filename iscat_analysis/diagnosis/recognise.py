@@ -14,7 +14,7 @@ from iscat_analysis.camera.field_sample import sampled
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.changes import NO_CHANGES, Changes, find_changes, spot_of
 from iscat_analysis.records import CountSource, FloatArray
-from iscat_analysis.search.sliding import summed
+from iscat_analysis.search.frames import summed
 
 MOST_FRAMES = 2000
 """Of a movie that are looked at, from its first."""

@@ -18,7 +18,7 @@ from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.selected_frames import StackFrames
 from iscat_analysis.records import BoolArray
-from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
+from iscat_analysis.search.frames import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed
 
 IntArray = NDArray[np.int64]

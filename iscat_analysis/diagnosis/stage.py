@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey
-from iscat_analysis.search.sliding import good_frames, measure_motion
+from iscat_analysis.search.frames import good_frames
+from iscat_analysis.search.noise import measure_motion
 
 # Share of the variance of averages that motion must add; noise alone adds 1e-3.
 _LEAST_VARIANCE_SHARE = 0.03

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray
-from iscat_analysis.search.sliding import SHORTEST_MOVIE
+from iscat_analysis.search.noise import SHORTEST_MOVIE
 
 _GROUP, _READ = 16, 4  # frames from one group to the next, and how many of them are looked at
 _CELLS, _SMALLEST = 32, 4  # cells along the longer side, and their least side [px]

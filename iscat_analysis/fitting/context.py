@@ -25,7 +25,8 @@ from iscat_analysis.optics.local import (
 from iscat_analysis.optics.seated import SeatedModel, seated_models
 from iscat_analysis.optics.stamp import margin_nm
 from iscat_analysis.records import FREE_PARAMETERS, FloatArray
-from iscat_analysis.search.sliding import CORRELATION, Tile
+from iscat_analysis.search.frames import Tile
+from iscat_analysis.search.sliding import CORRELATION
 from iscat_analysis.search.templates import LARGEST_IMAGE, Templates, make_templates
 
 SPREAD_NM = 10_000.0

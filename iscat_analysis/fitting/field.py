@@ -17,15 +17,20 @@ import numpy as np
 
 from iscat_analysis.camera.background import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
-from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass, fit_flags
-from iscat_analysis.fitting.large import IN_VAIN, brightest_place, with_spheres
-from iscat_analysis.fitting.regions import (
+from iscat_analysis.fitting.events import (
+    IN_VAIN,
+    Event,
+    Fitted,
+    PlaceAndMass,
     Region,
+    brightest_place,
+    fit_flags,
     noise_cumulants,
     photons_scale,
     region_around,
     region_likelihood,
     search_likelihood,
+    with_spheres,
 )
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.recognition import may_be_large, refitted
@@ -40,7 +45,7 @@ from iscat_analysis.records import (
     Windows,
     silent,
 )
-from iscat_analysis.search.residue import EXCEEDS, EXPLAINS, is_hidden
+from iscat_analysis.search.peaks import EXCEEDS, EXPLAINS, is_hidden
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, find_particles
 
 MAX_ROUNDS = 8

@@ -33,9 +33,10 @@ from iscat_analysis.camera.drift import (
     still_light,
     trusted,
 )
-from iscat_analysis.fitting.regions import Region
+from iscat_analysis.fitting.events import Region
 from iscat_analysis.records import FloatArray, Mapper
-from iscat_analysis.search.sliding import STRIDES, Chunk
+from iscat_analysis.search.frames import Chunk
+from iscat_analysis.search.sliding import STRIDES
 
 SPAN = 2
 """Windows before a step, and as many after it, whose frames make the pattern."""

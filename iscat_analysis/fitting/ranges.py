@@ -1,21 +1,67 @@
-"""Which frames are background and which are fitted, and their sums."""
+"""Which frames stand against which, and their sums.
+
+==========  ====================================================================  ================
+way         frames                                                                method
+==========  ====================================================================  ================
+"fixed"     those with particles, together or one by one, against a background    fixed, median,
+            recorded before them, or against a known level                        known
+"sliding"   windows just after each frame against those just before it            sliding
+"tracks"    each frame against what all frames have in common without particles   tracks; median,
+                                                                                  or fixed (mean),
+                                                                                  of all frames
+==========  ====================================================================  ================
+"""
 
 from __future__ import annotations
 
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import Check, measure_windows
 from iscat_analysis.camera.counts import Camera, check_counts
-from iscat_analysis.config import Config
+from iscat_analysis.config import ALL, Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FrameSource, Progress, Windows, silent
-from iscat_analysis.search.sliding import cut_off
+from iscat_analysis.search.frames import cut_off
 from iscat_analysis.units import count
+
+BackgroundMode = Literal["fixed", "sliding", "tracks"]
+
+
+def background_mode(config: Config) -> BackgroundMode:
+    """Tell which frames are compared with which."""
+    method = config.background.method
+    if method == "sliding":
+        if config.fit.likelihood == "poisson":
+            raise ConfigError(
+                'fit.likelihood = "poisson" takes the background for known, but background.method '
+                '= "sliding" measures it: use "auto", give the frames before the particles as '
+                'background.frames = [0, 200], or a known level with background.method = "known"'
+            )
+        return "sliding"
+    learnt = method == "tracks" or config.background.frames == ALL
+    return "tracks" if learnt else "fixed"
+
+
+def describe_background_mode(config: Config) -> str:
+    """Describe in words which frames are compared with which."""
+    background = config.background
+    those = "all of them" if background.frames == ALL else "background.frames"
+    if background.recorded:
+        those = "frames {}:{}".format(*background.recorded)
+    others = "frames are compared with"
+    words = {
+        "fixed": f"{others} the mean of {those}",
+        "median": f"{others} the median of {those}",
+        "known": f"{others} background.level_e = {background.level_e or 0:g}",
+        "sliding": "frames just after each frame are compared with those just before it",
+        "tracks": f"{others} the light that all have in common, learnt with the tracks",
+    }
+    return f'background.method = "{background.method}": {words[str(background.method)]}'
 
 
 def frame_ranges(movie: Stack, config: Config) -> tuple[tuple[int, int] | None, tuple[int, int]]:

@@ -13,8 +13,7 @@ from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
 from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event, Fitted
-from iscat_analysis.fitting.regions import photons_scale
+from iscat_analysis.fitting.events import Event, Fitted, photons_scale
 from iscat_analysis.inference.nuisances import NOTHING, Evidence, evidence_of
 from iscat_analysis.inference.pairs import pair_of
 from iscat_analysis.optics.collected import collected_area_nm2

@@ -15,10 +15,14 @@ import numpy as np
 from iscat_analysis.camera.counts import Camera, check_counts
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import NoiseSurvey, judge_window
-from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import is_counted, variance_of_background
 from iscat_analysis.fitting.pattern import corrected
-from iscat_analysis.fitting.ranges import fitted_frames, frame_ranges, measured_windows
+from iscat_analysis.fitting.ranges import (
+    background_mode,
+    fitted_frames,
+    frame_ranges,
+    measured_windows,
+)
 from iscat_analysis.inference.counts import choose_noise, counts_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
@@ -43,9 +47,9 @@ from iscat_analysis.search.bright import (
     find_bright_places,
     find_bright_steps,
 )
-from iscat_analysis.search.sliding import FieldSums, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import Reader, reader_of
-from iscat_analysis.search.sliding.planning import plan_parts
+from iscat_analysis.search.chunks import Reader, plan_parts, reader_of
+from iscat_analysis.search.frames import FieldSums, Tile
+from iscat_analysis.search.sliding import stride_of
 
 APART_NM = 2000.0
 """Particles that all bound at once are used if no other is nearer; the rings are accounted for."""

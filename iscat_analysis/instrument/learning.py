@@ -19,8 +19,7 @@ from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_backgr
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_counts
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import printing
-from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
+from iscat_analysis.fitting.ranges import background_mode, frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody
 from iscat_analysis.inference.checks import number_in
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of, scan_particle_images
@@ -58,7 +57,7 @@ from iscat_analysis.optics.parameters import (
     settings_of,
 )
 from iscat_analysis.records import Progress, Windows, silent
-from iscat_analysis.search.sliding import measure_frames, well_lit
+from iscat_analysis.search.frames import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
 

@@ -26,7 +26,7 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import printing
-from iscat_analysis.fitting.background_mode import background_mode
+from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge

@@ -1,4 +1,7 @@
-"""The picture of a bright step as the movie shows it, where the model does not describe it.
+"""Bright steps that no dipole describes: spheres, and images as the movie shows them.
+
+The search for dipoles would take the rings of a large particle for steps of their own; spheres are
+therefore found by their light and fitted before all others.
 
 A vesicle or an aggregate is no point, and what the model leaves over of it hides what lands in the
 same frames, all over the field: each peak of it may be a particle with lobes of its own, for which
@@ -20,12 +23,20 @@ from dataclasses import replace
 import numpy as np
 from scipy import fft
 
-from iscat_analysis.fitting.regions import Region
+from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.events import BRIGHT_SNR, IN_VAIN, Region
+from iscat_analysis.inference.fit import fit_particle
+from iscat_analysis.inference.likelihood import Likelihood
+from iscat_analysis.inference.noise import conditional
+from iscat_analysis.inference.recognition import may_be_large, model_of, recognised
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
-from iscat_analysis.records import FloatArray
-from iscat_analysis.search.peaks import summits
-from iscat_analysis.search.residue import RINGS, chi2_excess
-from iscat_analysis.search.sliding import STRIDES, Chunk
+from iscat_analysis.optics.forward import PixelGrid
+from iscat_analysis.records import Candidate, FloatArray, Mapper
+from iscat_analysis.search.bright import BrightStep, find_bright_steps
+from iscat_analysis.search.dating import StepFrame
+from iscat_analysis.search.frames import Chunk
+from iscat_analysis.search.peaks import RINGS, chi2_excess, summits
+from iscat_analysis.search.sliding import STRIDES
 
 _KNOT_PX = 0.6  # between knots; rings are half a wavelength apart, some two pixels
 _OUTLIER_SIGMAS = 3.0  # standard deviations from which a pixel counts less
@@ -35,6 +46,76 @@ _LITTLE, _MUCH = 0.1, 4.0  # χ² in excess over what the fit explains
 _LEAST_MISFIT_SHARE = 0.1  # share of a misfit that alone passes the threshold where it hides others
 # Farthest that the centre may lie from the fit of the model, in sides of the region.
 _LARGEST_SHIFT_SHARE = 0.35
+
+
+def large_steps(
+    context: AnalysisContext, chunk: Chunk, window: int, neighbours: Neighbours, mapper: Mapper
+) -> list[Step]:
+    """Find bright steps that a sphere describes and a dipole does not."""
+    if not context.spheres_of(context.model):
+        return []
+    optics = context.config.optics
+    _, bright = find_bright_steps(
+        chunk, window, pixel_nm=context.pixel_nm, resolution_nm=optics.wavelength_nm / optics.na,
+        roi_px=context.roi_px, most=0, mapper=mapper,
+    )  # fmt: skip
+    stride = int(chunk.edges[1] - chunk.edges[0])
+    steps: list[Step] = []
+    vain = 0
+    for step in bright:
+        if step.snr < BRIGHT_SNR or vain == IN_VAIN:
+            break
+        vain += 1
+        landing = _likelihood_of(context, chunk, step, 1)
+        nominal = context.model.material.mass_kda
+        start = Candidate(step.x_px, step.y_px, context.height_nm(nominal), nominal, step.snr)
+        z_range = context.config.fit.z_range_nm
+        dipole = fit_particle(landing, start, context.mode, z_range, level=True)
+        if not may_be_large(landing, dipole):
+            continue
+        found = []
+        for sign in (1, -1):
+            likelihood = landing if sign > 0 else _likelihood_of(context, chunk, step, sign)
+            spheres = context.spheres_of(likelihood.model)
+            sphere = recognised(likelihood, dipole, spheres, z_range, level=True)
+            if sphere is not None:
+                found.append((sign, *sphere))
+        if found:
+            sign, seated, fit = max(found, key=lambda one: one[2].log_likelihood)
+            at = StepFrame.undated(step.frame, stride)
+            steps.append(neighbours.draw_sphere(sign, at, model_of(seated), fit))
+            vain = 0
+    return steps
+
+
+def _likelihood_of(
+    context: AnalysisContext, chunk: Chunk, step: BrightStep, sign: int
+) -> Likelihood:
+    """Make the likelihood of a step that lands or leaves, in the square that is fitted at most."""
+    rows, columns = (_middle(part, context.roi_px) for part in (step.rows, step.columns))
+    inside = (
+        slice(rows[0] - step.rows[0], rows[1] - step.rows[0]),
+        slice(columns[0] - step.columns[0], columns[1] - step.columns[0]),
+    )
+    grid = PixelGrid.region(rows, columns, context.pixel_nm)
+    before, after, ratio = step.before_e[inside], step.after_e[inside], step.power_ratio
+    frames = [step.n_before, step.n_after]
+    if sign < 0:
+        before, after, ratio = after, before, 1 / ratio
+        frames.reverse()
+    read = chunk.camera.read_variance_e2(chunk.shape)[slice(*rows), slice(*columns)]
+    place = step.x_px * context.pixel_nm, step.y_px * context.pixel_nm
+    return conditional(
+        context.model_at(*place, step.frame), grid, before, after, ratio,
+        read_variance_before_e2=frames[0] * read, read_variance_after_e2=frames[1] * read,
+        masked=~step.usable[inside],
+    )  # fmt: skip
+
+
+def _middle(span: tuple[int, int], most: int) -> tuple[int, int]:
+    """Give the middle of a range of pixels, as many as that at most."""
+    first = span[0] + max(span[1] - span[0] - most, 0) // 2
+    return first, first + min(span[1] - span[0], most)
 
 
 def with_measured_images(

@@ -29,14 +29,16 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.stepping import add_image, times_change
 from iscat_analysis.camera.drift import derivatives
 from iscat_analysis.fitting.context import AnalysisContext, farthest_px
+from iscat_analysis.fitting.events import Region
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern
-from iscat_analysis.fitting.regions import Region
 from iscat_analysis.last_used import LastUsed
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.optics.model import ComplexArray
 from iscat_analysis.optics.seated import SeatedModel
 from iscat_analysis.records import Candidate, FitResult, FloatArray
-from iscat_analysis.search.sliding import Chunk, MapArray, StepFrame
+from iscat_analysis.search.dating import StepFrame
+from iscat_analysis.search.frames import Chunk
+from iscat_analysis.search.sliding import MapArray
 from iscat_analysis.search.templates import LARGEST_IMAGE
 
 _IMAGE_BYTES = 40_000_000  # of the images of steps that a chunk holds

@@ -19,9 +19,7 @@ import numpy as np
 
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
-from iscat_analysis.fitting.events import Event, fit_flags, standing_out
-from iscat_analysis.fitting.indices import Told, with_index
-from iscat_analysis.fitting.large import with_spheres
+from iscat_analysis.fitting.events import Event, fit_flags, standing_out, with_index, with_spheres
 from iscat_analysis.fitting.pattern import MovingPattern
 from iscat_analysis.inference.fit import (
     POOR_FIT_P,
@@ -31,29 +29,25 @@ from iscat_analysis.inference.fit import (
     start_theta,
 )
 from iscat_analysis.inference.recognition import model_of, refitted
-from iscat_analysis.landing.large_steps import large_steps
-from iscat_analysis.landing.measured_images import with_measured_images
+from iscat_analysis.landing.maps import Searched, SidelobeFilter, StepMaps, searched_shares
+from iscat_analysis.landing.measured_images import large_steps, with_measured_images
 from iscat_analysis.landing.neighbours import Neighbours, Step, distance_px
-from iscat_analysis.landing.searched import Searched, searched_shares
-from iscat_analysis.landing.sidelobes import SidelobeFilter
-from iscat_analysis.landing.split_frame_estimates import step_controls, step_repeats
-from iscat_analysis.landing.step_maps import StepMaps
-from iscat_analysis.landing.tasks import TRACE_FRAMES, Task, TaskBuilder
-from iscat_analysis.landing.traces import clip_of, patch_of, trace_of
-from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
-from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.residue import Described, chi2_excess
-from iscat_analysis.search.sliding import (
-    Chunk,
-    MapArray,
-    Peak,
-    StepFrame,
-    common_rise,
-    find_steps,
-    go_on_rising,
-    make_filter,
+from iscat_analysis.landing.split_frames import step_controls, step_repeats
+from iscat_analysis.landing.tasks import (
+    TRACE_FRAMES,
+    StepEvent,
+    Task,
+    TaskBuilder,
+    clip_of,
+    patch_of,
+    trace_of,
 )
-from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, is_within
+from iscat_analysis.records import FREE_PARAMETERS, Candidate, Clip, FloatArray, Trace
+from iscat_analysis.search.dating import StepFrame, common_rise, go_on_rising
+from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.search.frames import EVERYWHERE, Box, Chunk, is_within
+from iscat_analysis.search.peaks import Described, chi2_excess
+from iscat_analysis.search.sliding import MapArray, Peak, find_steps, make_filter
 from iscat_analysis.search.templates import LARGEST_IMAGE, ExcessNoise, refuse_flood
 
 ROUNDS = 10
@@ -65,17 +59,6 @@ _LEAST_THRESHOLD_SHARE = 0.7
 _SAME_PX = 1.5
 _CORE_MARGIN_PX = 4.0  # beyond the core of a tile, from which a last fit may lead into it
 _LEAST_MASS_RATIO = 5.0  # times the mass of a step that another has, of whose light it may be
-
-
-@dataclass(frozen=True)
-class StepEvent:
-    """A step after its last fit, with the estimates from parts of its frames."""
-
-    event: Event
-    step: Step
-    others: tuple[Step, ...]
-    repeats: FloatArray
-    told: Told | None = None  # of a sphere whose picture does not tell its index
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,18 @@ from iscat_analysis.config import Config, refuse_rod
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
-from iscat_analysis.fitting.background_mode import BackgroundMode, background_mode
-from iscat_analysis.fitting.checkpoint import is_resumable, partial_folder, parts_kept, remove_parts
-from iscat_analysis.fitting.compilation import compiling
+from iscat_analysis.fitting.ranges import BackgroundMode, background_mode
 from iscat_analysis.fitting.results import DetectionResult
-from iscat_analysis.fitting.run import Notify, Run, notify_nobody
+from iscat_analysis.fitting.run import (
+    Notify,
+    Run,
+    compiling,
+    is_resumable,
+    notify_nobody,
+    partial_folder,
+    parts_kept,
+    remove_parts,
+)
 from iscat_analysis.inference.checks import number_in, path_in
 from iscat_analysis.movie import Stack, open_stack, path_beside
 from iscat_analysis.pipeline.finish import make_analysis

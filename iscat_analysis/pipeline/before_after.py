@@ -23,11 +23,17 @@ from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_backgr
 from iscat_analysis.diagnosis.noise import Noise, judge_background, judge_beside
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.events import Event, posterior_of
+from iscat_analysis.fitting.events import (
+    Event,
+    Region,
+    contrast_image,
+    photons_scale,
+    posterior_of,
+    untold_message,
+    with_index,
+)
 from iscat_analysis.fitting.field import add_signal, fit_field
-from iscat_analysis.fitting.indices import untold_message, with_index
 from iscat_analysis.fitting.ranges import checked, frame_ranges, measured_windows
-from iscat_analysis.fitting.regions import Region, contrast_image, photons_scale
 from iscat_analysis.fitting.results import (
     Compared,
     DetectionResult,
@@ -36,7 +42,7 @@ from iscat_analysis.fitting.results import (
     view_of,
 )
 from iscat_analysis.fitting.run import Run
-from iscat_analysis.landing.split_frame_estimates import field_repeats
+from iscat_analysis.landing.split_frames import field_repeats
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import (
     FREE_PARAMETERS,

@@ -31,7 +31,7 @@ from iscat_analysis.fitting.ranges import fitted_frames
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.fitting.run import Run, notify_nobody
 from iscat_analysis.optics.forward import PixelGrid
-from iscat_analysis.pipeline.rows import reported_rows
+from iscat_analysis.pipeline.finish import reported_rows
 from iscat_analysis.records import FRAME_COLUMN, CountSource, FloatArray, Progress, Status, counted
 from iscat_analysis.search.templates import LARGEST_IMAGE
 

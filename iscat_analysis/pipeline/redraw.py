@@ -25,18 +25,23 @@ from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.calibrated import calibrated
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.events import Event, Fitted, PlaceAndMass
+from iscat_analysis.fitting.events import (
+    Event,
+    Fitted,
+    PlaceAndMass,
+    Region,
+    photons_scale,
+    region_around,
+    region_likelihood,
+)
 from iscat_analysis.fitting.field import add_signal
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import checked, fitted_frames, frame_ranges, measured_windows
-from iscat_analysis.fitting.regions import Region, photons_scale, region_around, region_likelihood
 from iscat_analysis.fitting.results import view_of
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.landing.chunk_work import view_moved
+from iscat_analysis.landing.chunks import view_moved
 from iscat_analysis.landing.neighbours import Neighbours, Step
-from iscat_analysis.landing.steps import StepEvent
-from iscat_analysis.landing.tasks import TaskBuilder
-from iscat_analysis.landing.traces import patch_of, trace_of
+from iscat_analysis.landing.tasks import StepEvent, TaskBuilder, patch_of, trace_of
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import (
     Candidate,
@@ -47,9 +52,10 @@ from iscat_analysis.records import (
     is_event,
     silent,
 )
-from iscat_analysis.search.sliding import StepFrame, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import Reader, reader_of
-from iscat_analysis.search.sliding.planning import HALO, halo_px
+from iscat_analysis.search.chunks import HALO, Reader, halo_px, reader_of
+from iscat_analysis.search.dating import StepFrame
+from iscat_analysis.search.frames import Tile
+from iscat_analysis.search.sliding import stride_of
 from iscat_analysis.threads import threads
 from iscat_analysis.tracking.block_store import row_view
 from iscat_analysis.tracking.dark_field import beside_particles

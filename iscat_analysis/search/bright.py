@@ -4,6 +4,11 @@ No picture of a particle is needed.  At every boundary between blocks the square
 variance, less one, is averaged over a spot of the size of the diffraction limit; noise averages to
 zero there and a step does not.  It takes a step some three times brighter than a matched filter
 needs, and it finds it with a microscope of which nothing is known.
+
+Images are smoothed as products with what a Gaussian leaves of each cosine: mirrored at its border,
+an image is a sum of cosines, its discrete cosine transform, and a symmetric filter makes each of
+them weaker by a factor.  For a spot of some pixels this takes a sixth of the time of sums over the
+spot, and gives what `scipy.ndimage.gaussian_filter` gives.
 """
 
 from __future__ import annotations
@@ -11,18 +16,54 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import islice
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from iscat_analysis._kernels.sliding import step_energy
 from iscat_analysis.records import BoolArray, FloatArray, Mapper
+from iscat_analysis.search.dating import locate_step
+from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import maxima
-from iscat_analysis.search.sliding import STRIDES, Chunk, locate_step
-from iscat_analysis.search.smoothing import smoothed, spot_response
+from iscat_analysis.search.sliding import STRIDES
+
+_REACH = 4.0  # standard deviations, beyond which the spot is cut off
+
+T = TypeVar("T", np.float32, np.float64)
+
+
+def spot_response(shape: tuple[int, ...], sigma_px: float) -> NDArray[np.float64]:
+    """Factors by which a Gaussian filter weakens each cosine of an image.
+
+    Shapes: result (y, x).
+    """
+    rows, columns = (_along(n, sigma_px) for n in shape)
+    return np.multiply.outer(rows, columns)
+
+
+@lru_cache(maxsize=16)
+def _along(length: int, sigma_px: float) -> NDArray[np.float64]:
+    """Response along one axis."""
+    place = np.arange(1, math.floor(_REACH * sigma_px + 0.5) + 1)
+    weight = np.exp(-0.5 * (place / sigma_px) ** 2)
+    waves = np.cos(np.pi * np.multiply.outer(np.arange(length), place) / length)
+    return np.asarray((1 + 2 * waves @ weight) / (1 + 2 * weight.sum()))
+
+
+def smoothed(image: NDArray[T], response: NDArray[np.floating]) -> NDArray[T]:
+    """Filter an image that is mirrored at its border.
+
+    Shapes: `image` (y, x), `response` (y, x), result (y, x).
+    """
+    waves = scipy.fft.dctn(image)
+    waves *= response
+    return np.asarray(scipy.fft.idctn(waves, overwrite_x=True))
+
 
 THRESHOLD = 7.0
 """Excess of the smoothed energy over its noise; the noise of a movie of 10⁸ pixels stays below."""

@@ -25,8 +25,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.random_field import LOWEST, Excursions, extent
 from iscat_analysis.optics.forward import ForwardModel, MassScale, PixelGrid, check_table
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.search.peaks import SAMPLED, summits, vertices
-from iscat_analysis.search.residue import EXCEEDS, is_hidden, size_on_ring
+from iscat_analysis.search.peaks import EXCEEDS, SAMPLED, is_hidden, size_on_ring, summits, vertices
 
 HEIGHTS_PER_FRINGE = 8
 """Templates per interference fringe where z is free: half-way between two the match loses 4 %."""

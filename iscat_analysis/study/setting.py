@@ -17,7 +17,7 @@ from iscat_analysis.bounds import EventBounds, Experiment, plan
 from iscat_analysis.config import MOVING, Config, refuse_rod, refuse_sphere
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
-from iscat_analysis.fitting.regions import Region, region_likelihood
+from iscat_analysis.fitting.events import Region, region_likelihood
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.optics.collected import photons_per_intensity
 from iscat_analysis.optics.forward import PixelGrid

@@ -15,8 +15,8 @@ from iscat_analysis._kernels.canvas import box_of
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.diagnosis.causes import smear_warning
 from iscat_analysis.diagnosis.noise import Noise, judge_beside
-from iscat_analysis.fitting.checkpoint import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.run import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows
 from iscat_analysis.threads import start_in_thread
 from iscat_analysis.tracking.aligned import Aligned, align

@@ -17,8 +17,8 @@ import pandas as pd
 
 from iscat_analysis.config import Config
 from iscat_analysis.fitting.context import AnalysisContext
+from iscat_analysis.fitting.events import Region, photons_scale
 from iscat_analysis.fitting.field import add_signal
-from iscat_analysis.fitting.regions import Region, photons_scale
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.optics.blur import PATH_SPREAD, blurred, path_variance_nm2
 from iscat_analysis.records import FloatArray, Windows, is_event

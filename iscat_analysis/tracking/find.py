@@ -28,14 +28,12 @@ from iscat_analysis.diagnosis.causes import (
 )
 from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, saying
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.events import Event, contrast_image
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.ranges import checked, fitted_frames, measured_windows
-from iscat_analysis.fitting.regions import contrast_image
 from iscat_analysis.fitting.results import Compared, DetectionResult, Followed, lines_of, view_of
-from iscat_analysis.fitting.run import Run
+from iscat_analysis.fitting.run import RESUMPTION_HINT, Run, saying
 from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import (
@@ -48,7 +46,7 @@ from iscat_analysis.records import (
     Windows,
     make_rows,
 )
-from iscat_analysis.search.sliding import DARK, well_lit
+from iscat_analysis.search.frames import DARK, well_lit
 from iscat_analysis.threads import start_in_thread, threads
 from iscat_analysis.tracking.block_store import Block, BlockStore, analyse_block
 from iscat_analysis.tracking.blocks import Plan, plan_blocks

@@ -17,7 +17,7 @@ from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.movie import Stack
 from iscat_analysis.movie.selected_frames import StackFrames
 from iscat_analysis.records import BoolArray, FloatArray, Windows
-from iscat_analysis.search.sliding import DARK, measure_frames, well_lit
+from iscat_analysis.search.frames import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed
 
 MANY = 0.05

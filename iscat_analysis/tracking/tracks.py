@@ -16,9 +16,9 @@ from iscat_analysis.camera.background import add_frames, start_power
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.regions import Region, region_likelihood
+from iscat_analysis.fitting.events import Region, region_likelihood
+from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.optics.blur import blurred, path_variance_nm2
 from iscat_analysis.optics.drawing import signals_within
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid

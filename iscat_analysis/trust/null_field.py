@@ -1,6 +1,6 @@
 """Estimates at places without a particle, which show the noise.
 
-`landing.split_frame_estimates` compares windows of frames there; `FrameNoise` compares single
+`landing.split_frames` compares windows of frames there; `FrameNoise` compares single
 frames with their background, for tracks.
 """
 
@@ -13,9 +13,8 @@ import numpy as np
 
 from iscat_analysis.camera.background import smooth_background
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.events import Event, photons_scale
 from iscat_analysis.fitting.field import total_signal
-from iscat_analysis.fitting.regions import photons_scale
 from iscat_analysis.inference.likelihood import LEVEL
 from iscat_analysis.inference.split_frames import LENGTHS
 from iscat_analysis.optics.forward import PixelGrid

@@ -26,8 +26,8 @@ from numba.core.dispatcher import Dispatcher
 import iscat_analysis
 from iscat_analysis import _kernels
 from iscat_analysis._kernels.kept import Kept
-from iscat_analysis.fitting import compilation as module
-from iscat_analysis.fitting.compilation import compiling
+from iscat_analysis.fitting import run as module
+from iscat_analysis.fitting.run import compiling
 
 ROOM = "iscat_analysis._kernels"
 PACKAGE = Path(iscat_analysis.__file__).parent

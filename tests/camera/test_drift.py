@@ -18,9 +18,9 @@ from iscat_analysis.camera.drift import (
     trusted,
 )
 from iscat_analysis.config import Config, load_config
+from iscat_analysis.fitting.events import Region
 from iscat_analysis.fitting.pattern import MovingPattern, follow
-from iscat_analysis.fitting.regions import Region
-from iscat_analysis.search.sliding import Chunk, make_chunk, measure_frames
+from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames
 from iscat_analysis.study import Movie
 
 SIGMAS = 4.0

@@ -16,7 +16,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.fitting.regions import search_likelihood
+from iscat_analysis.fitting.events import search_likelihood
 from iscat_analysis.records import Windows
 from iscat_analysis.search.templates import find_particles, signal_to_noise
 

@@ -24,9 +24,9 @@ from iscat_analysis.config import (
     read_optics_file,
 )
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.fitting.background_mode import background_mode
 from iscat_analysis.fitting.context import make_context
-from iscat_analysis.fitting.regions import photons_scale
+from iscat_analysis.fitting.events import photons_scale
+from iscat_analysis.fitting.ranges import background_mode
 
 SETTINGS: list[tuple[str, Any]] = [
     ("optics.na", 1.3),

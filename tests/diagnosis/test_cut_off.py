@@ -11,7 +11,7 @@ from wanderers import SETTINGS, wander
 import iscat_analysis as ia
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.search.sliding import cut_off
+from iscat_analysis.search.frames import cut_off
 from iscat_analysis.study import Movie
 
 Counts = NDArray[np.uint16]

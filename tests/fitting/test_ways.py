@@ -15,14 +15,10 @@ from iscat_analysis import Preview
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.fitting.background_mode import (
-    BackgroundMode,
-    background_mode,
-    describe_background_mode,
-)
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import Event, fit_flags, standing_out
 from iscat_analysis.fitting.field import fit_field
+from iscat_analysis.fitting.ranges import BackgroundMode, background_mode, describe_background_mode
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.pipeline import analyse, finder

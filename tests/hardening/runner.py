@@ -30,7 +30,7 @@ from sketches import sketch_figures
 
 from iscat_analysis import pipeline  # what a run imports, before the clock runs
 from iscat_analysis.report import page
-from iscat_analysis.search.sliding import chunks
+from iscat_analysis.search import chunks
 from iscat_cli import main
 
 LOADED = (pipeline, page)

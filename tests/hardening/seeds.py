@@ -235,7 +235,7 @@ def _zarr_folder(path: Path) -> None:
 
 
 def _kept_part(path: Path) -> None:
-    from iscat_analysis.fitting.checkpoint import Checkpoint
+    from iscat_analysis.fitting.run import Checkpoint
 
     part = object.__new__(Checkpoint)  # of any key
     part._folder, part.kept = path.parent, 0

@@ -25,9 +25,9 @@ from small_movies import SETUP
 import iscat_analysis as ia
 from iscat_analysis import executors as places
 from iscat_analysis.errors import SchedulerError
-from iscat_analysis.fitting.checkpoint import partial_folder
+from iscat_analysis.fitting.run import partial_folder
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.search.sliding import planning
+from iscat_analysis.search import chunks as planning
 from iscat_cli import main_fit
 
 pytestmark = [

@@ -34,7 +34,7 @@ from iscat_analysis.errors import DataError
 from iscat_analysis.records import EVENT_COLUMNS, REPEAT_COLUMNS
 from iscat_analysis.report import write_report
 from iscat_analysis.report.output import OUTPUT_NAMES, atomic_folder, check_output
-from iscat_analysis.search.sliding import chunks
+from iscat_analysis.search import chunks
 from iscat_analysis.study import write_stack
 from iscat_cli import main
 

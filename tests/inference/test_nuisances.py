@@ -21,7 +21,8 @@ from iscat_analysis.inference.nuisances import Evidence, evidence_of
 from iscat_analysis.inference.split_frames import BLOCK_ROWS, Series, repeats_of
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model
 from iscat_analysis.records import Candidate, FloatArray
-from iscat_analysis.search.sliding import Patch, StepFrame, common_rise, go_on_rising, locate_step
+from iscat_analysis.search.dating import StepFrame, common_rise, go_on_rising, locate_step
+from iscat_analysis.search.frames import Patch
 from iscat_analysis.trust.changing_light import at_a_shared_place, in_parts, may_rise
 from iscat_analysis.trust.extension import Extension
 from iscat_analysis.trust.fluctuation import Fluctuation

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from microscopes import setting
 
-from iscat_analysis.fitting.regions import Region
+from iscat_analysis.fitting.events import Region
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.records import PARAMETERS, Candidate, FitResult, FloatArray, Status

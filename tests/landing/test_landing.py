@@ -21,12 +21,12 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting import events as events_module
-from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.checkpoint import partial_folder
-from iscat_analysis.landing import chunk_work, merging
-from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.fitting.ranges import background_mode
+from iscat_analysis.fitting.run import partial_folder
+from iscat_analysis.landing import chunks as chunk_work
+from iscat_analysis.landing import merging
+from iscat_analysis.landing.find import analyse_landings, frame_warnings
 from iscat_analysis.landing.merging import FinishedChunk, MergedChunks
-from iscat_analysis.landing.odd_frames import frame_warnings
 from iscat_analysis.landing.steps import ChunkFitter
 from iscat_analysis.landing.tasks import TaskBuilder
 from iscat_analysis.movie import open_stack
@@ -34,8 +34,8 @@ from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.pipeline.injection import inject_and_recover
 from iscat_analysis.pipeline.summary import summary_of
 from iscat_analysis.records import EVENT_COLUMNS, FRAME_COLUMN, EventView
-from iscat_analysis.search.sliding import chunks as chunks_module
-from iscat_analysis.search.sliding import planning
+from iscat_analysis.search import chunks as chunks_module
+from iscat_analysis.search import chunks as planning
 from iscat_analysis.study import Movie
 
 PIXEL_NM = 84.0
@@ -627,7 +627,7 @@ def test_an_interrupted_run_resumes_to_the_same_result(
 
 
 def test_chunks_of_another_configuration_are_not_used(tmp_path: Path) -> None:
-    from iscat_analysis.landing.chunk_store import Store
+    from iscat_analysis.landing.chunks import Store
 
     one, two = _config(), _config("optics.focus_nm=-250")
     keys = {Store(tmp_path, c, "movie", (8, 8), (0, 9), Camera()).key for c in (one, two)}

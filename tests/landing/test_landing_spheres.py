@@ -14,7 +14,7 @@ from iscat_analysis.camera.calibration.transfer import measure_transfer
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline import fit_stack
-from iscat_analysis.search.sliding import measure_motion
+from iscat_analysis.search.noise import measure_motion
 from iscat_analysis.study import write_stack
 
 DIAMETER_NM, INDEX = 150.0, 1.461

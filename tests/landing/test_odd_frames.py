@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from iscat_analysis.landing.odd_frames import frame_warnings
+from iscat_analysis.landing.find import frame_warnings
 
 
 @pytest.mark.parametrize(("missing", "lost"), [(3, ""), (400, "67% of the movie")])

@@ -17,8 +17,8 @@ from iscat_analysis.config import Config, load_config
 from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module
 from iscat_analysis.landing.find import analyse_landings
+from iscat_analysis.landing.maps import LEVELS, Searched, searched_warning
 from iscat_analysis.landing.measured_images import ring_average
-from iscat_analysis.landing.searched import LEVELS, Searched, searched_warning
 from iscat_analysis.species import Efficiency
 from iscat_analysis.study import Movie
 

@@ -11,8 +11,8 @@ import pytest
 
 from iscat_analysis.config import load_config
 from iscat_analysis.landing import steps as steps_module
+from iscat_analysis.landing.maps import StepMaps
 from iscat_analysis.landing.neighbours import Step
-from iscat_analysis.landing.step_maps import StepMaps
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.study import write_stack
 

@@ -18,15 +18,16 @@ from iscat_analysis.camera.counts import Camera
 from iscat_analysis.camera.spectrum import measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
-from iscat_analysis.landing import chunk_work, joining, merging, neighbours, steps
+from iscat_analysis.landing import chunks as chunk_work
+from iscat_analysis.landing import merging, neighbours, steps
+from iscat_analysis.landing import merging as joining
 from iscat_analysis.landing.find import analyse_landings
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import FRAME_COLUMN
-from iscat_analysis.search.sliding import chunks as chunks_module
-from iscat_analysis.search.sliding import planning
-from iscat_analysis.search.sliding.chunks import Reader
-from iscat_analysis.search.sliding.stored import frames_in_place
-from iscat_analysis.search.sliding.tiles import Tile, cut_field
+from iscat_analysis.search import chunks as chunks_module
+from iscat_analysis.search import chunks as planning
+from iscat_analysis.search.chunks import Reader
+from iscat_analysis.search.frames import Tile, cut_field, frames_in_place
 from iscat_analysis.study import Movie
 from iscat_analysis.threads import threads
 

@@ -16,8 +16,8 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.movie import slabs as slabs_module
 from iscat_analysis.movie.hdf5 import StoredArray
 from iscat_analysis.movie.zarr_folder import CheckedStore
-from iscat_analysis.search.sliding import chunks as chunks_module
-from iscat_analysis.search.sliding.chunks import Reader
+from iscat_analysis.search import chunks as chunks_module
+from iscat_analysis.search.chunks import Reader
 
 SHAPE = (210, 40, 48)
 SPANS = [(0, 90), (50, 140), (100, 190), (150, 210)]

@@ -145,7 +145,7 @@ def test_a_movie_that_drifts_or_breaks_is_prepared_as_for_an_analysis(make) -> N
         curve = list(ready.opening.curve.variance_over_shot)
         assert curve == landing["noise_variance_over_shot"]
         assert {key: analysed.summary[key] for key in ready.summary} == ready.summary
-        assert set(preview.notes) <= set(analysed.warnings)
+        assert set(preview.notes) <= {one["text"] for one in analysed.summary["findings"]}
         assert preview.frames == (0, 320)
         for event in analysed.table.itertuples():  # each is found where and when it lands
             found = preview.look(event.frame).found()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.pipeline import ratio_film
-from iscat_analysis.pipeline.ratio_film import RatioFilm
+from iscat_analysis.pipeline import preview as ratio_film
+from iscat_analysis.pipeline.preview import RatioFilm
 
 FLICKER = 0.1
 

@@ -20,7 +20,7 @@ from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
 from iscat_analysis.executors import LocalExecutor, open_executor
 from iscat_analysis.movie import open_stack
-from iscat_analysis.search.sliding.chunks import Reader
+from iscat_analysis.search.chunks import Reader
 from iscat_analysis.threads import allotted, threads
 from iscat_cli import main, main_fit
 

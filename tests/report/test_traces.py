@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 from report_factory import make_analysis, with_traces
 
-from iscat_analysis.fitting.checkpoint import packed_views, unpacked_views
+from iscat_analysis.fitting.run import packed_views, unpacked_views
 from iscat_analysis.records import Clip, EventView, Trace
 from iscat_analysis.report.event_figures import event_details
 from iscat_analysis.report.films import CLIP_MS, clip_shown

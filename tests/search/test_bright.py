@@ -10,7 +10,8 @@ from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
-from iscat_analysis.search.sliding import STRIDES, Chunk, make_chunk, measure_frames
+from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames
+from iscat_analysis.search.sliding import STRIDES
 
 LEVEL = 4000.0
 WINDOW = 24

@@ -14,8 +14,8 @@ from scenes import Light, blank, make_config
 from iscat_analysis.config import Config
 from iscat_analysis.errors import FloodError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
+from iscat_analysis.fitting.events import field_likelihood, noise_cumulants, search_likelihood
 from iscat_analysis.fitting.field import fit_field
-from iscat_analysis.fitting.regions import field_likelihood, noise_cumulants, search_likelihood
 from iscat_analysis.optics.forward import PixelGrid
 from iscat_analysis.records import Candidate, Windows
 from iscat_analysis.search.templates import (

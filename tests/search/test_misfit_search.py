@@ -17,7 +17,7 @@ from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.landing.find import analyse_landings
-from iscat_analysis.search.residue import EXCEEDS, Described, chi2_excess, size_on_ring
+from iscat_analysis.search.peaks import EXCEEDS, Described, chi2_excess, size_on_ring
 
 pytestmark = pytest.mark.large
 

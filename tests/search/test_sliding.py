@@ -12,22 +12,17 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.sliding import strongest_maps
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.search.sliding import (
+from iscat_analysis.search.dating import crosstalk, locate_step
+from iscat_analysis.search.frames import (
     Chunk,
-    NoiseCurve,
+    HeldRegions,
     Patch,
-    choose_window,
-    crosstalk,
-    find_steps,
-    locate_step,
-    longest_window,
+    StoredFrames,
     make_chunk,
-    make_filter,
     measure_frames,
-    measure_noise,
-    sliding_maps,
 )
-from iscat_analysis.search.sliding.stored import HeldRegions, StoredFrames
+from iscat_analysis.search.noise import NoiseCurve, choose_window, longest_window, measure_noise
+from iscat_analysis.search.sliding import find_steps, make_filter, sliding_maps
 from iscat_analysis.threads import threads
 
 SHAPE = (40, 44)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.search.smoothing import smoothed, spot_response
+from iscat_analysis.search.bright import smoothed, spot_response
 
 
 @pytest.mark.parametrize("shape", [(40, 40), (31, 57), (9, 16)])

@@ -24,7 +24,7 @@ from iscat_analysis.calibration import with_standards
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.checkpoint import RESUMPTION_HINT, partial_folder
+from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.threads import threads

@@ -13,8 +13,7 @@ import iscat_analysis as ia
 from iscat_analysis.camera.counts import camera_from_config
 from iscat_analysis.config import configure
 from iscat_analysis.errors import DataError
-from iscat_analysis.fitting.background_mode import background_mode
-from iscat_analysis.fitting.ranges import measured_windows
+from iscat_analysis.fitting.ranges import background_mode, measured_windows
 from iscat_analysis.movie import open_stack
 from iscat_analysis.study import write_stack
 

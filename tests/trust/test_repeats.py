@@ -26,7 +26,7 @@ from iscat_analysis.inference.split_frames import (
     response_of,
     series_of,
 )
-from iscat_analysis.landing.split_frame_estimates import most_windows
+from iscat_analysis.landing.split_frames import most_windows
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.pipeline.summary import species_of
 from iscat_analysis.records import FREE_PARAMETERS, Candidate

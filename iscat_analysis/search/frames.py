@@ -1,9 +1,17 @@
-"""Consecutive frames in memory: their light, their sums in blocks, regions of them."""
+"""Consecutive frames in memory: their light, their sums in blocks, tiles and regions of them.
+
+Frames may lie in several arrays, as in the files of one recording, and are copied region by region.
+A tile of a large field has a core, whose particles are its own, and a halo around it as wide as the
+picture of a strong particle reaches, so that every particle of the core is analysed with all its
+neighbours.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -12,9 +20,255 @@ from numpy.typing import NDArray
 from iscat_analysis._kernels.sliding import block_sums, frame_totals, region_sum
 from iscat_analysis._kernels.stepping import part_sums
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.records import BoolArray, FloatArray, Mapper
-from iscat_analysis.search.sliding.stored import HeldRegions, StoredFrames
-from iscat_analysis.search.sliding.tiles import Box, FieldSums
+from iscat_analysis.last_used import LastUsed
+from iscat_analysis.records import BoolArray, CountSource, FloatArray, InPlace, Mapper, PlacedSource
+
+Box = tuple[slice, slice]
+"""Rows and columns."""
+
+EVERYWHERE: Box = (slice(None), slice(None))
+"""All pixels."""
+
+
+def middle_of_box(box: Box, shape: tuple[int, int], side_px: int) -> Box:
+    """Give the middle of a box in an image, of at most a given side."""
+    low, high = zip(*(part.indices(n)[:2] for part, n in zip(box, shape, strict=True)), strict=True)
+    begins = [max(a, (a + b - side_px) // 2) for a, b in zip(low, high, strict=True)]
+    rows, columns = (
+        slice(begin, min(begin + side_px, b)) for begin, b in zip(begins, high, strict=True)
+    )
+    return rows, columns
+
+
+def is_within(box: Box, y_px: float, x_px: float, margin_px: float) -> bool:
+    """Whether a place is in a box of pixels, or nearer to it than a margin."""
+    return all(
+        (part.start is None or place >= part.start - 0.5 - margin_px)
+        and (part.stop is None or place < part.stop - 0.5 + margin_px)
+        for place, part in zip((y_px, x_px), box, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Half-open ranges of full-frame pixels: the core of a tile, and the core with its halo."""
+
+    core_rows: tuple[int, int]
+    core_columns: tuple[int, int]
+    rows: tuple[int, int]
+    columns: tuple[int, int]
+    field: tuple[int, int]
+
+    @property
+    def here(self) -> Box:
+        """Index of the tile in a full frame."""
+        return slice(*self.rows), slice(*self.columns)
+
+    @property
+    def core(self) -> Box:
+        """Index of the core in a full frame."""
+        return slice(*self.core_rows), slice(*self.core_columns)
+
+    @property
+    def inner(self) -> Box:
+        """Index of the core in the tile; without an end where the field ends."""
+        rows, columns = (
+            slice(low - first if low > first else None, high - first if high < last else None)
+            for (low, high), (first, last) in (
+                (self.core_rows, self.rows),
+                (self.core_columns, self.columns),
+            )
+        )
+        return rows, columns
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        """First row and first column."""
+        return self.rows[0], self.columns[0]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns that the tile has, with its halo."""
+        return self.rows[1] - self.rows[0], self.columns[1] - self.columns[0]
+
+    @property
+    def share(self) -> float:
+        """Share of the field that the core has."""
+        (top, bottom), (left, right) = self.core_rows, self.core_columns
+        return (bottom - top) * (right - left) / math.prod(self.field)
+
+    @property
+    def is_central(self) -> bool:
+        """Whether its core holds the middle of the field."""
+        y, x = (np.array((n - 1) / 2) for n in self.field)
+        return bool(self.holds(y, x))
+
+    def holds(self, y_px: FloatArray, x_px: FloatArray, margin_px: float = 0.0) -> BoolArray:
+        """Tell which places of the field are in the core; beyond the edge of the field it goes on.
+
+        Shapes: `y_px, x_px` (n,), result (n,).
+        """
+        kept = np.ones(np.shape(y_px), dtype=np.bool_)
+        for place, (low, high), size in zip(
+            (y_px, x_px), (self.core_rows, self.core_columns), self.field, strict=True
+        ):
+            if low > 0:
+                kept &= place >= low - 0.5 - margin_px
+            if high < size:
+                kept &= place < high - 0.5 + margin_px
+        return kept
+
+
+def cut_field(shape: tuple[int, int], parts: tuple[int, int], halo_px: int) -> list[Tile]:
+    """Cut a field into so many rows and columns of tiles."""
+    edges = [
+        np.linspace(0, size, number + 1).round().astype(int).tolist()
+        for size, number in zip(shape, parts, strict=True)
+    ]
+    tiles = []
+    for core_rows in pairwise(edges[0]):
+        for core_columns in pairwise(edges[1]):
+            rows, columns = (
+                (max(low - halo_px, 0), min(high + halo_px, size))
+                for (low, high), size in zip((core_rows, core_columns), shape, strict=True)
+            )
+            tiles.append(Tile(core_rows, core_columns, rows, columns, shape))
+    return tiles
+
+
+@dataclass(frozen=True)
+class FieldSums:
+    """What some frames say of the whole field, or of a tile: made once for all of its tiles.
+
+    Shapes: `good, power` (t,), the others (y, x).
+    """
+
+    span: tuple[int, int]
+    good: BoolArray
+    power: FloatArray
+    level_e: float
+    mean_e: FloatArray
+    usable: BoolArray
+    saturated: BoolArray
+
+    def part(self, here: Box) -> FieldSums:
+        """Copy what belongs to some pixels."""
+        return replace(
+            self,
+            mean_e=self.mean_e[here].copy(),
+            usable=self.usable[here].copy(),
+            saturated=self.saturated[here].copy(),
+        )
+
+
+REGION_BYTES = 40_000_000
+"""Of the regions that a chunk or a tile holds."""
+
+_SPREAD = 2  # times the frames that are asked for, that lie between the first and the last
+_NO_COUNTS: NDArray[Any] = np.empty((0, 0, 0))
+
+
+class StoredFrames:
+    """Arrays of frames, one after the other, indexed as one array (t, y, x); or a box of them."""
+
+    def __init__(self, parts: Sequence[NDArray[Any]], box: Box = EVERYWHERE) -> None:
+        self._parts = parts
+        ends = (part.indices(n)[:2] for part, n in zip(box, parts[0].shape[1:], strict=True))
+        self._rows, self._columns = ends
+        self._edges = np.cumsum([0, *map(len, parts)]).tolist()
+        self.shape = (
+            int(self._edges[-1]),
+            self._rows[1] - self._rows[0],
+            self._columns[1] - self._columns[0],
+        )
+        self.dtype = parts[0].dtype
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def views(self, start: int, stop: int, box: Box = EVERYWHERE) -> StoredFrames:
+        """View a box of pixels in frames ``[start, stop)``."""
+        held = list(zip(pairwise(self._edges), self._parts, strict=True))
+        near = [one for one in held if one[0][0] < stop and start < one[0][1]] or held[:1]
+        parts = [part[max(start - low, 0) : stop - low] for (low, _), part in near]
+        ends = (part.indices(n)[:2] for part, n in zip(box, self.shape[1:], strict=True))
+        rows, columns = (
+            slice(first + low, first + high)
+            for (first, _), (low, high) in zip((self._rows, self._columns), ends, strict=True)
+        )
+        return StoredFrames(parts, (rows, columns))
+
+    def array(self, start: int, stop: int, box: Box = EVERYWHERE) -> NDArray[Any]:
+        """Give a box of pixels in frames ``[start, stop)``: a view where one array has them all.
+
+        Shapes: result (stop − start, y, x).
+        """
+        seen = self.views(start, stop, box)
+        here = slice(None), slice(*seen._rows), slice(*seen._columns)
+        parts = [part[here] for part in seen._parts]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def whole(self, start: int, stop: int) -> tuple[NDArray[Any], tuple[int, int]]:
+        """Give contiguous frames ``[start, stop)``, and where in them these pixels begin.
+
+        Shapes: result (stop − start, all y, all x).
+        """
+        seen = self.views(start, stop)
+        if len(seen._parts) == 1 and seen._parts[0].flags.c_contiguous:
+            return seen._parts[0], (self._rows[0], self._columns[0])
+        return np.ascontiguousarray(seen.array(0, stop - start)), (0, 0)
+
+
+class HeldRegions:
+    """The regions that were copied last: steps at one place ask for them in each of their fits."""
+
+    def __init__(self) -> None:
+        self._held: LastUsed[tuple[int, NDArray[Any]]] = LastUsed(REGION_BYTES)
+
+    def frames(
+        self,
+        wanted: slice,
+        rows: tuple[int, int],
+        columns: tuple[int, int],
+        copied: Callable[[slice, tuple[int, int], tuple[int, int]], NDArray[Any]],
+    ) -> NDArray[Any]:
+        """Give frames of a region, of which those that are not held yet are copied.
+
+        Shapes: result (t, y, x).
+        """
+        low, held = self._held.get((rows, columns)) or (wanted.start, _NO_COUNTS)
+        high = low + len(held)
+        first, last = min(low, wanted.start), max(high, wanted.stop)
+        if last - first > _SPREAD * (len(held) + wanted.stop - wanted.start):
+            return copied(wanted, rows, columns)
+        parts = [copied(slice(first, low), rows, columns)] if first < low else []
+        parts += [held] if len(held) else []
+        parts += [copied(slice(high, last), rows, columns)] if high < last or not parts else []
+        counts = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        self._held.hold((rows, columns), (first, counts), counts.nbytes)
+        return counts[wanted.start - first : wanted.stop - first]
+
+
+def frames_in_place(movie: CountSource, start: int, stop: int) -> list[InPlace]:
+    """Map frames where they lie, in as few runs as there are; nothing if some have to be read."""
+    if not isinstance(movie, PlacedSource):
+        return []
+    found: list[InPlace] = []
+    while start < stop:
+        run = movie.in_place(start, stop)
+        few, many = 1, stop - start  # frames of a run that is one, and that is none
+        if run is None:
+            run = movie.in_place(start, start + few)
+            while run is not None and many - few > 1:
+                middle = (few + many) // 2
+                longer = movie.in_place(start, start + middle)
+                few, many, run = (few, middle, run) if longer is None else (middle, many, longer)
+        if run is None:
+            return []
+        found.append(run)
+        start += len(run.counts)
+    return found
+
 
 HALF = 0.5
 """Share of the usual light, below which a shutter is not open."""

@@ -22,8 +22,8 @@ from scipy import fft
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.records import FloatArray, Mapper
+from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import SAMPLED, summits
-from iscat_analysis.search.sliding.frames import Chunk
 
 MapArray = NDArray[np.float32]
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 
 from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera.drift import Trajectory
 from iscat_analysis.camera.lines import Lines
 from iscat_analysis.camera.spectrum import NoiseSpectrum
 from iscat_analysis.config import Config
@@ -20,8 +21,11 @@ from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.results import evidence_beside, lines_of, view_of
+from iscat_analysis.fitting.run import Checkpoint, packed_views, unpacked_views
+from iscat_analysis.landing.maps import Searched
 from iscat_analysis.landing.merging import CLIPS, SEAM_PX, VIEWS, FinishedChunk
-from iscat_analysis.landing.steps import ChunkFitter, StepEvent
+from iscat_analysis.landing.steps import ChunkFitter
+from iscat_analysis.landing.tasks import StepEvent
 from iscat_analysis.records import (
     CountSource,
     EventView,
@@ -31,12 +35,85 @@ from iscat_analysis.records import (
     make_rows,
     silent,
 )
-from iscat_analysis.search.sliding import STRIDES, Chunk, FieldSums, Tile, stride_of
-from iscat_analysis.search.sliding.chunks import Reader, reader_of
-from iscat_analysis.search.sliding.planning import Part
-from iscat_analysis.search.sliding.tiles import EVERYWHERE
+from iscat_analysis.search.chunks import Part, Reader, reader_of
+from iscat_analysis.search.empty import EmptySpread
+from iscat_analysis.search.frames import EVERYWHERE, Chunk, FieldSums, Tile
+from iscat_analysis.search.sliding import STRIDES, stride_of
 from iscat_analysis.search.templates import ExcessNoise
 from iscat_analysis.threads import threads
+
+
+class Store(Checkpoint):
+    """Finished chunks of a landing movie on disk."""
+
+    def load(self, number: int) -> FinishedChunk | None:
+        """Give a finished chunk, or None."""
+        found = self.read(number)
+        if found is None:
+            return None
+        lines, data = found
+        try:
+            low, high = (int(n) for n in data["core"])
+            return FinishedChunk(
+                core=(low, high),
+                lines=lines,
+                repeats=data["repeats"],
+                evidence=data["evidence"],
+                views=unpacked_views(data),
+                good=data["good"],
+                light=data["light"],
+                masked=data["masked"],
+                saturated=data["saturated"],
+                strongest=data["strongest"],
+                ends_e=data["ends_e"],
+                trajectory=_trajectory(data["trajectory"]),
+                cause=str(data["cause"]),
+                untold=data["untold"],
+                searched=Searched(data["searched_frames"], data["searched_shares"]),
+                empty=_empty(data["squares"], data["number"], data["shared"]),
+            )
+        except (ValueError, KeyError):
+            return None
+
+    def save(self, number: int, done: FinishedChunk) -> None:
+        """Keep a finished chunk."""
+        searched = done.searched or Searched.joined(())
+        arrays = {
+            "searched_frames": searched.frames,
+            "searched_shares": searched.shares,
+            "core": np.array(done.core),
+            "repeats": done.repeats,
+            "evidence": done.evidence,
+            **packed_views(done.views),
+            "good": done.good,
+            "light": done.light,
+            "masked": done.masked,
+            "saturated": done.saturated,
+            "strongest": done.strongest,
+            "ends_e": done.ends_e,
+            "trajectory": _columns(done.trajectory),
+            "cause": np.array(done.cause),
+            "untold": done.untold,
+            "squares": np.empty(0) if done.empty is None else done.empty.squares,
+            "number": np.empty(0) if done.empty is None else done.empty.counts,
+            "shared": np.empty(0) if done.empty is None else done.empty.shared,
+        }
+        self.write(number, done.lines, arrays)
+
+
+def _columns(motion: Trajectory | None) -> FloatArray:
+    if motion is None:
+        return np.empty((0, 5))
+    return np.column_stack([motion.frames, motion.shift_px, motion.error_px])
+
+
+def _empty(squares: FloatArray, counts: FloatArray, shared: FloatArray) -> EmptySpread | None:
+    return EmptySpread(squares, counts, shared) if counts.size else None
+
+
+def _trajectory(columns: FloatArray) -> Trajectory | None:
+    return Trajectory(columns[:, 0], columns[:, 1:3], columns[:, 3:]) if len(columns) else None
+
 
 _LARGEST_SHARE = 1.5  # times its share of the field, that a tile may have of the events shown
 

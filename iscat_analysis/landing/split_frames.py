@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.counts import Camera
 from iscat_analysis.fitting.context import AnalysisContext
-from iscat_analysis.fitting.events import Event
+from iscat_analysis.fitting.events import Event, Region, photons_scale
 from iscat_analysis.fitting.field import total_signal
 from iscat_analysis.fitting.pattern import LocalPattern, MovingPattern
-from iscat_analysis.fitting.regions import Region, photons_scale
 from iscat_analysis.inference.split_frames import (
     PARTS,
     Response,
@@ -29,8 +28,7 @@ from iscat_analysis.landing.neighbours import Neighbours, Step
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray, Windows
 from iscat_analysis.search.empty import EmptySpread
-from iscat_analysis.search.sliding import Chunk
-from iscat_analysis.search.sliding.tiles import EVERYWHERE, Box, middle_of_box
+from iscat_analysis.search.frames import EVERYWHERE, Box, Chunk, middle_of_box
 from iscat_analysis.trust.null_field import background_field, empty_field, taken_by, taken_places
 
 PLACES, MOVIE_PLACES = 20_000, 100_000
