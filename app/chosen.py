@@ -14,7 +14,7 @@ import panel as pn
 import param
 
 from iscat_analysis.errors import DataError, IscatError
-from iscat_analysis.movie.addresses import path_beside, setup_beside
+from iscat_analysis.movie import path_beside, setup_beside
 
 T = TypeVar("T")
 

@@ -11,7 +11,7 @@ import panel as pn
 
 import iscat_analysis as ia
 from iscat_analysis.config import config_to_toml
-from iscat_analysis.movie.addresses import path_beside
+from iscat_analysis.movie import path_beside
 from iscat_analysis.report.gates import FONTS, PALETTES, Format, figure_bytes, histogram_figure
 from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.compare import Compare

@@ -10,9 +10,7 @@ from typing import Any, Literal
 import panel as pn
 
 import iscat_analysis as ia
-from iscat_analysis.movie.addresses import path_beside
-from iscat_analysis.movie.folders import SUFFIXES
-from iscat_analysis.movie.frame_files import holds_single_frames
+from iscat_analysis.movie import SUFFIXES, holds_single_frames, path_beside
 from iscat_analysis.reading import read_json
 from iscat_analysis.report.answer import answer_in
 from iscat_app.chosen import Chosen, Notice, in_line, table_of

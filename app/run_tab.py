@@ -8,7 +8,7 @@ from typing import Any
 
 import panel as pn
 
-from iscat_analysis.movie.addresses import path_beside
+from iscat_analysis.movie import path_beside
 from iscat_app.chosen import Chosen, Notice, in_line
 from iscat_app.files import listed
 from iscat_app.runs import Job, Queue, Run

@@ -34,8 +34,7 @@ from _memory import Memory
 from _peer import peer_python
 
 from iscat_analysis._kernels.sliding import contrast_map
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.search.frames import make_chunk, measure_frames

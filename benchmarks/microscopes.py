@@ -40,7 +40,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.instrument.learning import learn_optics

@@ -20,10 +20,9 @@ from microscopes import MICROSCOPES, SEEDS, compare, nominal, tally
 
 from instruments import Instrument, InstrumentMovie, draw_landings  # isort: skip
 
-from iscat_analysis.camera.background import measure_windows
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.causes import misfit_warning
+from iscat_analysis.diagnosis import misfit_warning
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.field import fit_field
 from iscat_analysis.fitting.results import table_of

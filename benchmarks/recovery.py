@@ -25,7 +25,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import poisson
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.results import DetectionResult
 from iscat_analysis.landing.find import analyse_landings

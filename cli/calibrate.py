@@ -13,7 +13,7 @@ from iscat_cli.options import ConfigOption, JsonOption, OverwriteOption, SetOpti
 
 if TYPE_CHECKING:
     from iscat_analysis.calibration import MassCalibration
-    from iscat_analysis.camera.calibration import CameraCalibration, Estimate
+    from iscat_analysis.camera import CameraCalibration, Estimate
     from iscat_analysis.instrument.result import OpticsCalibration
 
 SUMMARY = "Calibrate the camera, the optics, or contrast against mass."
@@ -80,7 +80,7 @@ def camera(
     with failures(messages):
         from iscat_analysis.answers.calibrations import camera_calibration
         from iscat_analysis.errors import ConfigError
-        from iscat_analysis.movie.addresses import path_beside
+        from iscat_analysis.movie import path_beside
 
         given = [*(stacks or ()), *([dark] if dark is not None else [])]
         if not given:
@@ -166,7 +166,7 @@ def mass(
         places = None if peaks is None else _contrasts(peaks)
 
         from iscat_analysis.answers.calibrations import mass_calibration
-        from iscat_analysis.movie.addresses import path_beside
+        from iscat_analysis.movie import path_beside
 
         folder = out if out is not None else path_beside(events, ".calibration")
         found = mass_calibration(
@@ -251,7 +251,7 @@ def optics(
         from iscat_analysis.answers.calibrations import optics_calibration
         from iscat_analysis.config import load_config
         from iscat_analysis.errors import DataError
-        from iscat_analysis.movie.addresses import path_beside
+        from iscat_analysis.movie import path_beside
 
         folder = out if out is not None else path_beside(movie, ".optics")
         with messages.progress() as progress:
@@ -295,7 +295,7 @@ def _measure(
     from iscat_analysis.answers.calibrations import template_calibration
     from iscat_analysis.config import load_config
     from iscat_analysis.errors import ConfigError, DataError
-    from iscat_analysis.movie.addresses import path_beside
+    from iscat_analysis.movie import path_beside
 
     if free is not None or focus_step is not None:
         raise ConfigError(

@@ -149,7 +149,7 @@ def fit(
         changes = _changes(settings, mode, frames, background, channels, posterior, workers)
 
         from iscat_analysis.calibration.line import with_line
-        from iscat_analysis.movie.addresses import MARK, path_beside
+        from iscat_analysis.movie import MARK, path_beside
 
         sources = with_line(setup_of(stack, config, messages), calibration)
         resolved = load_config(sources, changes)

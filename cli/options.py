@@ -180,7 +180,7 @@ def setup_of(
     movie: Path, config: list[Path] | None, messages: Messages
 ) -> Path | list[Path] | None:
     """Give the configuration of a movie: those that are named, else ``iscat.toml`` beside it."""
-    from iscat_analysis.movie.addresses import setup_beside
+    from iscat_analysis.movie import setup_beside
     from iscat_analysis.reading import is_file
 
     beside = setup_beside(movie)

@@ -88,7 +88,7 @@ def watch(
     it changes. Results are those of iscat batch, which may go on with them.
     """
     with failures(messages):
-        from iscat_analysis.movie.folders import is_movie
+        from iscat_analysis.movie import is_movie
 
         if is_movie(folder):
             given = {
@@ -171,7 +171,7 @@ def _watch_one(
     """Watch one movie that is being recorded."""
     from iscat_analysis.config import configure
     from iscat_analysis.day.watch import watch_movie
-    from iscat_analysis.movie.addresses import path_beside
+    from iscat_analysis.movie import path_beside
 
     folder = path_beside(movie, ".iscat") if out is None else out
     with messages.progress() as progress:

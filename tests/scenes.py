@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import start_power
+from iscat_analysis.camera import start_power
 from iscat_analysis.config import Config, config_to_toml, parse_config
 from iscat_analysis.records import Windows
 from iscat_analysis.study import Movie, write_stack

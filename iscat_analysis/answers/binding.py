@@ -19,7 +19,7 @@ from scipy.signal import find_peaks, peak_prominences
 from iscat_analysis.calibration.line import Line
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import LARGEST, choice_in, number_in, path_in, truth_in
-from iscat_analysis.movie.addresses import path_beside, split_address
+from iscat_analysis.movie import path_beside, split_address
 from iscat_analysis.movie.text_tables import read_frame, refuse_twice
 from iscat_analysis.reading import is_file, is_folder, read_json
 from iscat_analysis.records import BoolArray, FloatArray

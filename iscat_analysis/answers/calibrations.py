@@ -22,7 +22,7 @@ from iscat_analysis.calibration import (
     standards_of,
 )
 from iscat_analysis.calibration.line import made_with, measured_contrasts
-from iscat_analysis.camera.calibration import CameraCalibration, measure_camera
+from iscat_analysis.camera import CameraCalibration, measure_camera
 from iscat_analysis.config import Config
 from iscat_analysis.instrument.learning import calibrate_movie
 from iscat_analysis.instrument.result import OpticsCalibration

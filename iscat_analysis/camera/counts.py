@@ -19,13 +19,12 @@ from numpy.typing import DTypeLike, NDArray
 
 from iscat_analysis.config import CameraConfig
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.disorder import bytes_are_swapped
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie import WHAT_LIBRARIES_RAISE, bytes_are_swapped
 from iscat_analysis.reading import is_file
 from iscat_analysis.records import BoolArray, FloatArray
 
 if TYPE_CHECKING:
-    from iscat_analysis.camera.calibration.laws import Law
+    from iscat_analysis.camera.laws import Law
 
 CEILING_REPEATS = 4
 """Counts that must share the largest one before it is taken for a converter's full scale."""

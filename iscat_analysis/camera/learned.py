@@ -1,4 +1,8 @@
-"""The numbers of the camera, as far as the movie tells them: learned once, before anything else.
+"""The numbers of the camera, as far as configuration, metadata and movie tell them.
+
+The frames of a movie from which its camera is learned: with light, and in the dark.
+
+The numbers of the camera, as far as the movie tells them: learned once, before anything else.
 
 What the configuration leaves at "auto" is measured from the first frames: offset and read noise
 from frames in the dark where there are some, the offset otherwise from where the light of the
@@ -9,7 +13,7 @@ on the configuration has numbers, whatever they come from.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -17,26 +21,102 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.burnt_in import find_text, patched, without_text
-from iscat_analysis.camera.calibration.laws import Law, find_law
-from iscat_analysis.camera.calibration.transfer import Transfer, measure_transfer
-from iscat_analysis.camera.calibration.true_zero import TOLD, judge_zero
 from iscat_analysis.camera.counts import (
     Camera,
     camera_from_config,
     padded_bits,
     rounding_variance_adu2,
 )
-from iscat_analysis.camera.first_frames import noise_adu2, sample
-from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain
-from iscat_analysis.camera.pattern_jitter import without_pattern_jitter
-from iscat_analysis.camera.response import Response, full_scale, linear, response_of
+from iscat_analysis.camera.gain import (
+    GainDiagnosis,
+    averaged_noise,
+    diagnose_gain,
+    without_pattern_jitter,
+)
+from iscat_analysis.camera.laws import Law, Response, find_law, full_scale, linear, response_of
+from iscat_analysis.camera.pixels import find_text, patched, without_text
 from iscat_analysis.camera.spectrum import measure_spectrum
-from iscat_analysis.camera.successive import averaged_noise
-from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config
-from iscat_analysis.errors import DataError
+from iscat_analysis.camera.transfer import TOLD, Transfer, judge_zero, measure_transfer
+from iscat_analysis.config import ASSUMED, AUTO, CameraConfig, Config, Optics, plausible_pixel
+from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import BoolArray, CountSource, StackMetadata
+from iscat_analysis.units import count
+
+_MOST_FRAMES, _MOST_COUNTS = 1024, 2**23  # that are looked at: it takes a second
+_LEAST_FRAMES = 8
+_LEVEL_FRAMES = 24  # frames all over a movie, that tell how much light there is
+_FIRST_FRAMES = 64  # frames among which some may be dark
+_DARK_LIGHT_SHARE = 0.5  # of the usual counts, below which a frame may be without light
+_DARK_SPREAD_SHARE = 0.01  # of the usual counts, by which dark frames may differ
+# of what the counts of dark frames would show, if they were light: its error, and itself
+_LIT_SHARE_ERROR, _LIT_SHARE = 0.1, 0.1
+_DARK_NOISE_SHARE = 0.5  # of the noise that its counts would have if they were light
+
+
+def sample(
+    movie: CountSource, span: tuple[int, int], pixels: int
+) -> tuple[NDArray[Any], NDArray[Any] | None]:
+    """Read the first frames with light, without repeats, and those in the dark.
+
+    Shapes: `lit` (t, y, x), `dark` (k, y, x).
+    """
+    total = movie.shape[0]
+    looks = np.unique(np.linspace(span[0], span[1] - 1, _LEVEL_FRAMES).astype(int)).tolist()
+    levels = [float(frame.mean()) for k in looks for frame in _finite(movie.read(k, k + 1))]
+    first = min(_FIRST_FRAMES, total)
+    looked = [(k, float(one.mean())) for k in range(first) for one in _finite(movie.read(k, k + 1))]
+    if not levels or not looked:
+        return movie.read(0, 0), None
+    usual = float(np.quantile(levels, 0.75))
+    means = np.array([mean for _, mean in looked])
+    dim = (means < _DARK_LIGHT_SHARE * usual) & (means > 0)
+    dim &= means - means.min() < _DARK_SPREAD_SHARE * usual  # and no shutter that is opening
+    most = max(_LEAST_FRAMES, min(_MOST_FRAMES, _MOST_COUNTS // pixels))
+    counts = _finite(movie.read(span[0], min(span[1], span[0] + most)))
+    lit = counts.mean(axis=(1, 2)) > _DARK_LIGHT_SHARE * usual
+    repeats = np.array([False, *(np.array_equal(a, b) for a, b in pairwise(counts))][: len(counts)])
+    counts = counts[lit & ~repeats]
+    if not dim.any() or dim.all() or len(counts) < _LEAST_FRAMES:
+        return counts, None
+    dark = np.concatenate(
+        [movie.read(k, k + 1) for (k, _), d in zip(looked, dim, strict=True) if d]
+    )
+    return counts, dark if _is_dark(dark, counts) else None
+
+
+def _finite(frames: NDArray[Any]) -> NDArray[Any]:
+    """Drop frames with pixels that are not numbers; these are handled later.
+
+    Shapes: `frames` and result (t, y, x).
+    """
+    whole: NDArray[Any] = frames[np.isfinite(frames).all(axis=(1, 2))]
+    return whole
+
+
+def _is_dark(dark: NDArray[Any], lit: NDArray[Any]) -> bool:
+    """Tell whether frames have neither the pattern of light nor its noise.
+
+    Shapes: `dark` (k, y, x), `lit` (t, y, x).
+    """
+    as_light = float(dark.mean()) / float(lit.mean())  # if all of it were light
+    apart, pattern = (part.mean(axis=0) - part.mean() for part in (dark, lit))
+    power = float(np.sum(pattern**2))
+    share = float(np.sum(apart * pattern)) / power if power > 0 else 0.0
+    rest = float(np.mean((apart - share * pattern) ** 2))
+    error = math.sqrt(rest / power) if power > 0 else math.inf
+    if error < _LIT_SHARE_ERROR * as_light:
+        return abs(share) < _LIT_SHARE * as_light + 3 * error
+    noise = noise_adu2(dark) if len(dark) > 1 else noise_adu2(np.moveaxis(dark, 2, 0))
+    return noise < _DARK_NOISE_SHARE * as_light * noise_adu2(lit)
+
+
+def noise_adu2(counts: NDArray[Any]) -> float:
+    """Half the mean square of what successive frames differ by, without the laser's flicker."""
+    steps = np.diff(counts[:_FIRST_FRAMES].astype(np.float64), axis=0)
+    steps -= steps.mean(axis=(1, 2), keepdims=True)
+    return float(np.mean(steps**2)) / 2
+
 
 MEASURED, DARK, CONFIGURED, METADATA = "measured", "dark frames", "configured", "metadata"
 EFFECTIVE, ASSUMPTION, ROUNDING = "effective", "assumed", "rounding"
@@ -465,3 +545,116 @@ def _short(counts: NDArray[Any], camera: Camera) -> GainDiagnosis | None:
         return diagnose_gain(counts, camera)
     except DataError:
         return None
+
+
+_DISAGREEMENT = 0.01  # relative, between configuration and metadata
+
+
+_OPTICS_DISAGREEMENT = 0.05  # the aperture that was measured is some percent below the engraved one
+
+
+def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
+    """Set what the configuration leaves open from the metadata of the movie."""
+    notes = []
+    found: dict[str, float] = {}
+    for key, unit, words in (
+        ("pixel_size_nm", "nm", "pixel size"),
+        ("exposure_ms", "ms", "exposure"),
+        ("frame_rate_hz", "Hz", "frame rate"),
+    ):
+        given: float | None = getattr(config.camera, key)
+        read: float | None = getattr(metadata, key)
+        if read is None:
+            continue
+        if given is None:
+            if key == "pixel_size_nm":
+                _refuse_unlikely(read, metadata.source)
+            found[key] = read
+        elif abs(read / given - 1) > _DISAGREEMENT:
+            notes.append(
+                f"the {words} is {given:g} {unit} in the configuration (camera.{key}) but "
+                f"{read:g} {unit} in the movie's {metadata.source} metadata; "
+                "the configuration is used"
+            )
+    shown_hz = metadata.displayed_hz
+    if config.fit.mode == "track" and shown_hz is not None and metadata.frame_rate_hz is None:
+        notes.append(
+            f"the {shown_hz:g} frames per second in the file are the speed at which ImageJ shows "
+            "the movie, which tells nothing of the camera, and are not used"
+        )
+    if metadata.ticks is not None:
+        missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
+        notes.append(
+            f"the camera dropped {count(missing, 'frame')}, by the times in the movie's "
+            f"{metadata.source} metadata; diffusion coefficients and rates count the time that "
+            "passed"
+        )
+    if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
+        raise DataError(
+            "the pixel size is neither in the configuration nor in the movie's metadata; "
+            "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
+        )
+    camera = config.camera.model_copy(update=found)
+    optics, taken_from_file = _with_optics(config.optics, metadata)
+    notes += taken_from_file
+    config = config.model_copy(update={"camera": camera, "optics": optics})
+    source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
+    return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
+
+
+def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
+    """Replace defaults of the optics by the metadata of the movie."""
+    found: dict[str, float] = {}
+    notes = []
+    for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
+        given: float = getattr(optics, key)
+        read: float | None = getattr(metadata, key)
+        if read is None:
+            continue
+        where = f"in the movie's {metadata.source} metadata"
+        if given == read:
+            continue
+        if given == type(optics).model_fields[key].default:
+            found[key] = read
+            notes.append(
+                f"the {words} is {read:g}{unit}, as {where}, and not {given:g}{unit}, which is "
+                f"the default of optics.{key}"
+            )
+        elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
+            notes.append(
+                f"the {words} is {given:g}{unit} in the configuration (optics.{key}) but "
+                f"{read:g}{unit} {where}; the configuration is used"
+            )
+    if not found:
+        return optics, notes
+    try:
+        return Optics(**{**optics.model_dump(), **found}), notes
+    except ConfigError as error:
+        raise DataError(
+            f"the movie's {metadata.source} metadata do not suit the configuration: {error}"
+        ) from None
+
+
+def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
+    """Warn that pixels are larger than the spot of a particle; refuse twice that size."""
+    optics, pixel_nm = config.optics, config.camera.pixel_size_nm
+    spot_nm = optics.wavelength_nm / (2 * optics.na)
+    if pixel_nm is None or pixel_nm <= spot_nm:
+        return
+    problem = (
+        f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
+        f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
+    )
+    advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
+    if pixel_nm > 2 * spot_nm:
+        raise DataError(f"{problem}; {advice}")
+    yield f"{problem}, so that pictures are not resolved; unless it was binned so far, {advice}"
+
+
+def _refuse_unlikely(pixel_nm: float, source: str) -> None:
+    try:
+        plausible_pixel(pixel_nm)
+    except ValueError as error:
+        raise DataError(
+            f"the movie's {source} metadata: {error}, as in camera.pixel_size_nm = 84.4"
+        ) from None

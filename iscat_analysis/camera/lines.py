@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from iscat_analysis.camera.background import find_defects
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.lighting import Surface
+from iscat_analysis.camera.light import Surface
 from iscat_analysis.camera.spectrum import measure_spectrum
-from iscat_analysis.movie.stack import Stack
+from iscat_analysis.movie import Stack
 from iscat_analysis.records import CountSource, FloatArray, StackMetadata
 
 _LEAST_LIT = 0.25  # of a line's pixels that must be usable

@@ -36,7 +36,7 @@ from iscat_analysis.day.table import (
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import THREADS, open_executor
 from iscat_analysis.inference.checks import path_in, shown
-from iscat_analysis.movie.folders import files_of
+from iscat_analysis.movie import files_of
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.species.equilibrium import Model
 from iscat_analysis.text import from_table

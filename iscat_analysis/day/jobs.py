@@ -28,10 +28,7 @@ from iscat_analysis.errors import DataError, IscatError, SchedulerError
 from iscat_analysis.executors import Executor
 from iscat_analysis.files import take, whole_file
 from iscat_analysis.hashing import fingerprint, sha256_of_files
-from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.addresses import split_address
-from iscat_analysis.movie.folders import files_of
-from iscat_analysis.movie.stack import not_shared
+from iscat_analysis.movie import files_of, not_shared, open_stack, split_address
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.records import Progress, silent
 from iscat_analysis.threads import one_thread_algebra

@@ -21,9 +21,16 @@ from typing import Any
 from iscat_analysis.calibration import STANDARD_ERROR
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError
-from iscat_analysis.movie.addresses import MARK, path_beside, split_address
-from iscat_analysis.movie.folders import SUFFIXES, find_movies, is_movie_folder, members_of
-from iscat_analysis.movie.frame_files import holds_single_frames
+from iscat_analysis.movie import (
+    MARK,
+    SUFFIXES,
+    find_movies,
+    holds_single_frames,
+    is_movie_folder,
+    members_of,
+    path_beside,
+    split_address,
+)
 from iscat_analysis.movie.text_tables import read_table_text, table_lines
 from iscat_analysis.reading import is_file, is_folder, read_text, toml_of
 from iscat_analysis.text import printable

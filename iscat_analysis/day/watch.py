@@ -37,8 +37,7 @@ from iscat_analysis.errors import ConfigError, DataError, IscatError, SchedulerE
 from iscat_analysis.executors import THREADS
 from iscat_analysis.fitting.run import is_resumable
 from iscat_analysis.inference.checks import number_in, path_in
-from iscat_analysis.movie import Stack, open_stack
-from iscat_analysis.movie.folders import files_of, find_movies, is_open_to_write
+from iscat_analysis.movie import Stack, files_of, find_movies, is_open_to_write, open_stack
 from iscat_analysis.pipeline import analyse, fit_stack
 from iscat_analysis.reading import is_folder
 from iscat_analysis.records import Analysis, Progress, Status, silent

@@ -1,1 +1,52 @@
 """What is special about this movie?  Its light, noise, kind, and what went wrong."""
+
+from __future__ import annotations
+
+from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, SCAN_STEPS, Prepared, Step, calibrated
+from iscat_analysis.diagnosis.causes import (
+    axes_warning,
+    fixed_height_warning,
+    landing_rate_warning,
+    large_warning,
+    line_warning,
+    misfit_warning,
+    nonlinearity_warning,
+    pattern_jitter_warning,
+    pixel_warnings,
+    repeats_warning,
+    residue_warning,
+    scale_warning,
+    sign_warning,
+    smear_warning,
+    uneven_warning,
+)
+from iscat_analysis.diagnosis.frames import channels_of, without_cut_off
+from iscat_analysis.diagnosis.light import judge_lines
+from iscat_analysis.diagnosis.motion import DRIFT_PX, drift_warning, examine_background
+from iscat_analysis.diagnosis.noise import (
+    SPECTRUM_FRAMES,
+    Noise,
+    NoiseSurvey,
+    judge_background,
+    judge_beside,
+    judge_counts,
+    judge_window,
+    law_messages,
+    survey_over,
+)
+from iscat_analysis.diagnosis.recognise import (
+    BLOCK,
+    LARGEST_CHANCE,
+    LEAST_MOVING,
+    MOST_MOVING,
+    MOST_STAYING,
+    Changes,
+    as_landing,
+    as_moving,
+    changes_summary,
+    find_changes,
+    least_beside,
+    look_at_changes,
+    spot_of,
+)
+from iscat_analysis.diagnosis.stretches import Stretches, find_stretches

@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.metadata import diagnose_gain
+from iscat_analysis.camera import Camera, diagnose_gain
 from iscat_analysis.config import Config
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
 from iscat_analysis.errors import DataError

@@ -10,14 +10,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.field_sample import LARGEST_PX, whole_frames
-from iscat_analysis.camera.lighting import find_surface
-from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
-from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
+from iscat_analysis.camera import (
+    LARGEST_PX,
+    Camera,
+    Lines,
+    SteadyFrames,
+    find_lines,
+    find_surface,
+    find_unsteady,
+    unsteady_message,
+    whole_frames,
+)
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.changes import least_beside, spot_of
 from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES
+from iscat_analysis.diagnosis.recognise import least_beside, spot_of
 from iscat_analysis.fitting.ranges import background_mode
 from iscat_analysis.movie import Stack
 from iscat_analysis.search.frames import good_frames, measure_frames, well_lit

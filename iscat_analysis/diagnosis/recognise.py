@@ -1,20 +1,157 @@
-"""Movies that were given to the wrong mode."""
+"""Whether particles land and stay, or move; and movies that were given to the wrong mode.
+
+What becomes of changes in a movie: whether particles land and stay, or move.
+
+Averages A_j of successive blocks of frames change where something happens.  A change is seen as
+S_j = A_{j+1} − A_{j−1}, with the block in which it happens between.  Where a particle lands or
+leaves, the blocks before agree with each other, and so do those after: A_{j+2} − A_{j+1} and
+A_{j−1} − A_{j−2} are noise.  Where one moves they seldom are.
+
+A particle that stays where it is, even one that lands for a moment or blinks, has one picture:
+around it five blocks, less their mean, are multiples of that picture, whatever it does in time.
+One that moves has another picture in every block.  How many pictures there are is the number of
+singular values of the matrix of blocks × pixels that exceed those of noise.  A second picture may
+be another particle that lands or leaves beside the first, or a pattern that drifts steadily; a
+third needs two such coincidences, or motion.
+
+Movies that were given to the wrong mode.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import bdtrc
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.field_sample import sampled
+from iscat_analysis.camera import Camera, sampled
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.changes import NO_CHANGES, Changes, find_changes, spot_of
+from iscat_analysis.medians import middle
 from iscat_analysis.records import CountSource, FloatArray
+from iscat_analysis.search.bright import smoothed, spot_response
 from iscat_analysis.search.frames import summed
+from iscat_analysis.search.peaks import maxima
+
+LEAST_CHANGE_SIGMAS = 12.0
+"""Standard deviations of noise that a change must exceed: the ratios below then have errors of a
+tenth."""
+
+LEAST_STEP_SHARE = 0.15
+"""What the neighbouring differences may come to, as a part of a change that stays, or noise: rings
+of others make less."""
+
+_LEAST_PICTURE_SHARE = 0.1  # singular value of a picture over the norm of the change
+# The same over noise's; of noise the second is 1.2, the third 0.9, 1.3 in a fiftieth
+_LEAST_NOISE_RATIO = 1.5
+# Of the picture's share beside its centre, which the pixels there have at least
+_LEAST_NEIGHBOUR_SHARE = 0.5
+_NOISE_SIGMAS = 4.0  # standard deviations of noise
+_SPOT_SIGMA = 0.21  # standard deviation of a spot, in wavelengths over NA
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
+_REACH_SIGMAS = 4.5  # standard deviations of a spot, within which a picture is looked at
+_AROUND = 2  # blocks on either side that are looked at
+_LEAST_BLOCKS = 5
+_MOST_VALUES = 500_000  # values, whose median has an error of a few thousandths
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Statistics of clear changes in a movie."""
+
+    number: int
+    staying: float
+    moving: float
+
+
+NO_CHANGES = Changes(0, float("nan"), float("nan"))
+"""Of a movie that shows none, or is too short."""
+
+
+def find_changes(blocks: NDArray[np.floating], spot_px: float) -> Changes:
+    """Find changes from block to block, and test whether they stay.
+
+    Shapes: `blocks` (k, y, x).
+    """
+    if len(blocks) < _LEAST_BLOCKS:
+        return NO_CHANGES
+    smooth = np.empty(blocks.shape, dtype=np.float32)
+    narrow, wide = (spot_response(blocks.shape[1:], width * spot_px) for width in (1, 4))
+    between = narrow - wide
+    for image, out in zip(blocks, smooth, strict=True):
+        out[:] = smoothed(image - 1, between)  # whose noise single precision holds
+    noise = _SIGMA_PER_MAD * _median_deviation(smooth[:-1], smooth[1:])
+    size = smooth[3:-1] - smooth[1:-3]
+    np.abs(size, out=size)
+    apart = round(2 * _REACH_SIGMAS * spot_px)
+    peaks = maxima(size, max(LEAST_CHANGE_SIGMAS * noise, 0.0), (_AROUND, apart, apart))
+    peaks = peaks[_of_spots(blocks, peaks, spot_px)]
+    if not len(peaks):
+        return NO_CHANGES
+    block, *position = peaks.T
+    one, two, _, four, five = (smooth[block + n, *position] for n in range(_LEAST_BLOCKS))
+    change = size[block, *position]
+    neighbouring = np.maximum(np.abs(two - one), np.abs(five - four)) / change
+    quiet = np.maximum(_NOISE_SIGMAS * noise / change, LEAST_STEP_SHARE)
+    pictures = _pictures(smooth, peaks, _REACH_SIGMAS * spot_px, noise)
+    staying = (neighbouring < quiet) & (pictures == 1)
+    return Changes(len(peaks), float(staying.mean()), float((pictures > 2).mean()))
+
+
+def _pictures(
+    smooth: NDArray[np.float32], peaks: NDArray[np.int64], reach_px: float, noise: float
+) -> NDArray[np.int64]:
+    """Count the pictures around each change; `noise` is that of a difference of two blocks."""
+    row, column = np.ogrid[: smooth.shape[1], : smooth.shape[2]]
+    count = np.empty(len(peaks), dtype=np.int64)
+    for number, (t, y, x) in enumerate(peaks.tolist()):
+        part = tuple(slice(max(c - int(reach_px), 0), c + int(reach_px) + 1) for c in (y, x))
+        near = (row[part[0]] - y) ** 2 + (column[:, part[1]] - x) ** 2 <= reach_px**2
+        seen = smooth[(slice(t, t + _LEAST_BLOCKS), *part)][:, near].astype(np.float64)
+        strength = np.linalg.svd(seen - seen.mean(axis=0), compute_uv=False)
+        change = np.linalg.norm(seen[_AROUND + 1] - seen[_AROUND - 1])
+        least = max(
+            _LEAST_PICTURE_SHARE * change, _LEAST_NOISE_RATIO * noise * math.sqrt(seen.shape[1] / 2)
+        )
+        count[number] = max(int((strength > least).sum()), 1)
+    return count
+
+
+def _of_spots(
+    blocks: NDArray[np.floating], peaks: NDArray[np.int64], spot_px: float
+) -> NDArray[np.bool_]:
+    """Tell changes in which neighbouring pixels take part from single pixels that blink."""
+    least = least_beside(spot_px)
+    real = np.ones(len(peaks), dtype=np.bool_)
+    _, rows, columns = blocks.shape
+    for number, (t, y, x) in enumerate(peaks.tolist()):
+        if 0 < y < rows - 1 and 0 < x < columns - 1:
+            part = slice(y - 1, y + 2), slice(x - 1, x + 2)
+            change = blocks[t + 3][part] - blocks[t + 1][part]
+            neighbouring = (change[0, 1] + change[2, 1] + change[1, 0] + change[1, 2]) / 4
+            real[number] = neighbouring * np.sign(change[1, 1]) > least * abs(change[1, 1])
+    return real
+
+
+def _median_deviation(one: NDArray[np.floating], other: NDArray[np.floating]) -> float:
+    """Median deviation from the median of what other has more than one, of some values all over."""
+    every = 1 + one.size // _MOST_VALUES
+    some = other.ravel()[::every] - one.ravel()[::every]
+    deviation = some - middle(some.copy())
+    return float(middle(np.abs(deviation, out=deviation)))
+
+
+def least_beside(spot_px: float) -> float:
+    """Give the smallest share of a change that the pixels next to its centre have."""
+    return _LEAST_NEIGHBOUR_SHARE * math.exp(-0.5 / spot_px**2)
+
+
+def spot_of(wavelength_nm: float, na: float, pixel_nm: float) -> float:
+    """Give the standard deviation of a particle's picture."""
+    return max(_SPOT_SIGMA * wavelength_nm / na / pixel_nm, 0.5)
+
 
 MOST_FRAMES = 2000
 """Of a movie that are looked at, from its first."""

@@ -6,8 +6,7 @@ import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-from iscat_analysis.camera.lines import Lines, PartOfLines
-from iscat_analysis.camera.spectrum import NoiseSpectrum
+from iscat_analysis.camera import Lines, NoiseSpectrum, PartOfLines
 from iscat_analysis.config import Config, Detection
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import KNOWN, MEAN, MEDIAN

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.camera.background import smooth_background
+from iscat_analysis.camera import smooth_background
 from iscat_analysis.fitting.context import AnalysisContext, is_counted
 from iscat_analysis.inference.counts import MEAN, choose_noise, counts_likelihood
 from iscat_analysis.inference.free_index import fit_index

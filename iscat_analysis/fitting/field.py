@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from iscat_analysis.camera.background import refine_power
+from iscat_analysis.camera import refine_power
 from iscat_analysis.fitting.context import SPREAD_NM, AnalysisContext, search_both
 from iscat_analysis.fitting.events import (
     IN_VAIN,

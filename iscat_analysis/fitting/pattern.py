@@ -24,7 +24,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.drift import (
+from iscat_analysis.camera import (
     ComplexArray,
     Mover,
     Trajectory,

@@ -20,8 +20,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import Check, measure_windows
-from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.camera import Camera, Check, check_counts, measure_windows
 from iscat_analysis.config import ALL, Config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import Stack

@@ -11,7 +11,7 @@ import pandas as pd
 
 from iscat_analysis.bounds.classical import ComplexArray
 from iscat_analysis.bounds.quantum import quantum_information
-from iscat_analysis.camera.drift import Trajectory
+from iscat_analysis.camera import Trajectory
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Fitted, photons_scale
 from iscat_analysis.inference.nuisances import NOTHING, Evidence, evidence_of

@@ -20,7 +20,7 @@ import pandas as pd
 from numba.core import event
 
 from iscat_analysis import _kernels
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, config_to_toml
 from iscat_analysis.executors import Executor
 from iscat_analysis.files import whole_file

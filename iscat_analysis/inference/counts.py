@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from iscat_analysis.camera.background import smooth_background
+from iscat_analysis.camera import smooth_background
 from iscat_analysis.inference.checks import BoolArray, FloatArray, mask_of, pixels_of
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson

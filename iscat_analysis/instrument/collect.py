@@ -12,9 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.camera import Camera, check_counts
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import NoiseSurvey, judge_window
+from iscat_analysis.diagnosis import NoiseSurvey, judge_window
 from iscat_analysis.fitting.context import is_counted, variance_of_background
 from iscat_analysis.fitting.pattern import corrected
 from iscat_analysis.fitting.ranges import (
@@ -28,7 +28,7 @@ from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import conditional, poisson
 from iscat_analysis.instrument.microscope import RINGS_NM, TESTED, build_microscope
 from iscat_analysis.instrument.particle_image import PRIVATE, ParticleImage
-from iscat_analysis.movie.stack import Stack
+from iscat_analysis.movie import Stack
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.optics.model import ForwardModel
 from iscat_analysis.optics.parameters import (

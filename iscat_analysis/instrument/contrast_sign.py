@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import NoiseSurvey
+from iscat_analysis.diagnosis import NoiseSurvey
 from iscat_analysis.errors import ConfigError, ContrastError, DataError
 from iscat_analysis.fitting.ranges import frame_ranges, measured_windows
 from iscat_analysis.fitting.run import notify_nobody

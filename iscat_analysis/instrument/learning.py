@@ -12,11 +12,18 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from typing import Any
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, SCAN_STEPS, calibrated
-from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
-from iscat_analysis.diagnosis.noise import SPECTRUM_FRAMES, NoiseSurvey, judge_counts
+from iscat_analysis.diagnosis import (
+    LIGHT_STEPS,
+    SCAN_STEPS,
+    SPECTRUM_FRAMES,
+    NoiseSurvey,
+    calibrated,
+    drift_warning,
+    examine_background,
+    judge_counts,
+)
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import printing
 from iscat_analysis.fitting.ranges import background_mode, frame_ranges, measured_windows

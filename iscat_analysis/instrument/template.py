@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.calibrated import calibrated
+from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.findings import printing
 from iscat_analysis.fitting.ranges import background_mode
@@ -32,7 +32,7 @@ from iscat_analysis.instrument.collect import bright_particle_images, kind_of
 from iscat_analysis.instrument.measure import HELD_OUT_P, Judgement, judge
 from iscat_analysis.instrument.microscope import reach_nm, refuse_uncalibratable
 from iscat_analysis.instrument.particle_image import ParticleImage, place_particle_images, signal_of
-from iscat_analysis.movie.stack import Stack
+from iscat_analysis.movie import Stack
 from iscat_analysis.optics.forward import (
     ForwardModel,
     forward_model,

@@ -11,12 +11,9 @@ from itertools import compress
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Trajectory
-from iscat_analysis.camera.lines import Lines
-from iscat_analysis.camera.spectrum import NoiseSpectrum
+from iscat_analysis.camera import Camera, Lines, NoiseSpectrum, Trajectory
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.causes import misfit_warning
+from iscat_analysis.diagnosis import misfit_warning
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import posterior_of
 from iscat_analysis.fitting.pattern import corrected

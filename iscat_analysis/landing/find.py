@@ -22,14 +22,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Trajectory
-from iscat_analysis.camera.lines import Lines, SteadyFrames
+from iscat_analysis.camera import Camera, Lines, SteadyFrames, Trajectory
 from iscat_analysis.config import LARGEST_SD_NM, Config, with_absolute_paths
-from iscat_analysis.diagnosis.causes import pixel_warnings
-from iscat_analysis.diagnosis.fixed_pattern import DRIFT_PX
-from iscat_analysis.diagnosis.noise import NoiseSurvey, survey_over
-from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.diagnosis import DRIFT_PX, NoiseSurvey, Prepared, pixel_warnings, survey_over
 from iscat_analysis.errors import FloodError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.context import AnalysisContext, make_context

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.drift import Trajectory, measure_drift, middle_of
+from iscat_analysis.camera import Trajectory, measure_drift, middle_of
 from iscat_analysis.fitting.events import Told
 from iscat_analysis.inference.nuisances import NOTHING
 from iscat_analysis.landing.maps import Searched

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.stepping import add_image, times_change
-from iscat_analysis.camera.drift import derivatives
+from iscat_analysis.camera import derivatives
 from iscat_analysis.fitting.context import AnalysisContext, farthest_px
 from iscat_analysis.fitting.events import Region
 from iscat_analysis.fitting.pattern import SPAN, MovingPattern

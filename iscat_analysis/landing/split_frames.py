@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, Region, photons_scale
 from iscat_analysis.fitting.field import total_signal

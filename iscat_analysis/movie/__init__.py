@@ -1,6 +1,6 @@
 """Movie files and arrays become a `Stack`: frames (t, y, x), read lazily, whole or not at all.
 
-Each format is one module that offers `Frames`; `FORMATS` of `folders` names its signature.  What a
+Each format is one module that offers `Frames`, and an entry of `FORMATS` in `formats`.  What a
 file says of itself is checked against what it holds before any pixel is read: a movie that is cut
 short, or whose description announces more than it holds, is refused and never analysed in part.
 """
@@ -8,43 +8,39 @@ short, or whose description announces more than it holds, is refused and never a
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from numbers import Real
 from pathlib import Path
 
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.hashing import refuse_changed, states_of
-from iscat_analysis.movie.addresses import MARK, path_beside, split_address
-from iscat_analysis.movie.file_set import FileSet
-from iscat_analysis.movie.folders import FORMATS, Format, files_of
-from iscat_analysis.movie.frame_files import FrameFiles, holds_single_frames
-from iscat_analysis.movie.mapped_frames import open_raw
-from iscat_analysis.movie.ome_zarr import is_zarr, open_zarr
-from iscat_analysis.movie.recorded import description_of, open_recorded
-from iscat_analysis.movie.side_files import with_side_files
-from iscat_analysis.movie.stack import ArrayFrames, ArrayLike, Frames, Stack
-from iscat_analysis.reading import open_regular
+from iscat_analysis.movie.addresses import MARK, path_beside, setup_beside, split_address
+from iscat_analysis.movie.descriptions import measure_clock
+from iscat_analysis.movie.formats import (
+    FORMATS,
+    SUFFIXES,
+    files_of,
+    find_movies,
+    is_movie,
+    is_movie_folder,
+    is_named_as_movie,
+    is_open_to_write,
+    members_of,
+    open_file,
+)
+from iscat_analysis.movie.frame_files import holds_single_frames
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
+from iscat_analysis.movie.plain import MappedFrames, bytes_are_swapped
+from iscat_analysis.movie.stack import (
+    ArrayFrames,
+    ArrayLike,
+    ChangedFrames,
+    Frames,
+    SelectedFrames,
+    Stack,
+    StackFrames,
+    not_shared,
+)
+from iscat_analysis.movie.tiff import open_tiff
 from iscat_analysis.records import StackMetadata
-
-__all__ = ["ArrayLike", "Frames", "Stack", "open_stack", "path_beside"]
-
-READERS: Mapping[bytes, Format] = {
-    signature: kind for kind in FORMATS for signature in kind.signatures
-}
-"""The first four bytes of a file, and what it is."""
-
-_LOSSY = "which keeps no counts: its compression leaves out what the eye does not see"
-_EXPORT = "export the movie as TIFF"
-_FOREIGN: Mapping[bytes, str] = {
-    b"\x89PNG": f"a PNG picture; {_EXPORT}",
-    b"\xff\xd8\xff": f"a JPEG picture; {_EXPORT}",
-    b"\x1f\x8b": "a gzip archive; unpack it",
-    b"RIFF": f"an AVI film, {_LOSSY}; {_EXPORT}",
-    b"\x1aE\xdf\xa3": f"a Matroska film, {_LOSSY}; {_EXPORT}",
-    b"SIMPLE": f"a FITS file; {_EXPORT}",
-}
-_FILM = b"ftyp"  # of MP4 and QuickTime, behind four bytes
-_SIGNATURE_BYTES = 8
 
 
 def open_stack(
@@ -107,7 +103,7 @@ def open_stack(
                 "metadata of its own; leave it out, and correct the file in the configuration, "
                 "as in camera.pixel_size_nm"
             )
-        return _open_file(Path(movie))
+        return open_file(Path(movie))
     if name is not None and not isinstance(name, str):
         raise ConfigError(f"name: is {type(name).__name__}; give a text")
     if not (isinstance(movie, ArrayLike) and isinstance(movie.shape, tuple)):
@@ -121,79 +117,3 @@ def open_stack(
     metadata = StackMetadata(pixel_size_nm, exposure_ms, frame_rate_hz, source=source)
     name = name or "array"
     return Stack(Path(name), ArrayFrames(movie, name, metadata), files=())
-
-
-def _open_file(address: Path) -> Stack:
-    try:
-        path, part = split_address(address)
-        is_folder = path.is_dir()
-        is_pipe = path.exists() and not (is_folder or path.is_file())  # or a device
-    except OSError as error:  # nobody may look into the folder that it is in
-        raise DataError(f"{address}: cannot be read ({error.strerror})") from None
-    before = states_of([path])
-    stack = _opened(path, part, is_folder=is_folder, is_pipe=is_pipe)
-    try:
-        refuse_changed([path], before)
-    except DataError:
-        stack.close()
-        raise
-    return stack
-
-
-def _opened(path: Path, part: str, *, is_folder: bool, is_pipe: bool) -> Stack:
-    """Open a file or folder by what is in it."""
-    if is_folder:
-        if is_zarr(path):
-            return _stack(path, open_zarr(path, part), part, files_of(path))
-        if holds_single_frames(path, named=True):
-            frames = FrameFiles(path)
-            return _stack(path, frames, files=frames.files)
-        raise DataError(
-            f"{path}: is a folder, but not one of TIFF files with a frame each, nor of Zarr; give "
-            "the path of one movie file; all movies of a folder are analysed by `iscat batch`"
-        )
-    if is_pipe:  # which would keep whoever opens it waiting
-        raise DataError(
-            f"{path}: is a pipe or a device, and a movie is read more than once: save it as a "
-            "file, and give its path"
-        )
-    try:
-        with open_regular(path) as file:
-            signature = file.read(_SIGNATURE_BYTES)
-    except FileNotFoundError:
-        raise DataError(f"{path}: there is no such file; check the path") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read ({error.strerror})") from None
-    if not signature:
-        raise DataError(f"{path}: is empty (0 bytes); copy it again or export it again")
-    kind = READERS.get(signature[:4])
-    if part and (kind is None or kind.holds_one is None):
-        return _stack(path, open_raw(path, part), part)
-    if description_of(path) is not None:
-        recorded = open_recorded(path)
-        return _stack(path, recorded, files=recorded.files)
-    if kind is None:
-        raise DataError(f"{path}: {_refusal(path, signature)}")
-    found = kind.open(path, part)
-    return _stack(path, found, part, found.files if isinstance(found, FileSet) else None)
-
-
-def _stack(
-    path: Path, frames: Frames, part: str = "", files: Sequence[Path] | None = None
-) -> Stack:
-    """Make the movie of a file, with what is known of its recording."""
-    known = with_side_files(frames.metadata, path)
-    return Stack(path, frames, part=part, files=files, metadata=known)
-
-
-def _refusal(path: Path, signature: bytes) -> str:
-    """Say what kind of file is not read, and what to do."""
-    known = (what for mark, what in _FOREIGN.items() if signature.startswith(mark))
-    found = f"a film, {_LOSSY}; {_EXPORT}" if signature[4:] == _FILM else next(known, "")
-    needed = "needs to be a TIFF file, a Refeyn .mp movie, HDF5, Zarr, NumPy, MATLAB, ND2 or CZI"
-    if found:
-        return f"{needed} but is {found}"
-    return (
-        f"{needed} but is not one; {_EXPORT} or, if it is plain numbers, say so, "
-        f'as in "{path}{MARK}1500x128x128,uint16"'
-    )

@@ -1,9 +1,21 @@
-"""Movies in HDF5 files: Refeyn's, and any dataset of frames that is named or alone there."""
+"""Movies in HDF5 files: Refeyn's, and any dataset of frames that is named or alone there.
+
+Refeyn ``.mp`` movies: HDF5, plain or as differences from frame to frame.
+
+The layouts are not published; they are read as other open software found them.  OneMP: dataset
+``frame`` with ``configuration/Devices/AcqCam``; TwoMP, format 3: ``movie/frame`` with
+``movie/configuration/acq_camera``; between the two lies a format 3 with OneMP's names.
+In a compressed movie frame 0 is plain and every later one is what must be added, modulo the range
+of the type, to the one before; ``movie/keyframe`` repeats some frames in full: those that its
+attribute ``indices`` names, or else the last one at its end.
+"""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +25,272 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.containers import SHOWN_NAMES, name_one
+from iscat_analysis.movie.descriptions import Hints, merge, positive
 from iscat_analysis.movie.hdf5 import Hdf5Reader, StoredArray
-from iscat_analysis.movie.mapped import Writer
-from iscat_analysis.movie.refeyn import is_refeyn, open_refeyn
+from iscat_analysis.movie.mapped import Writer, refuse_changed
 from iscat_analysis.movie.stack import Frames
 from iscat_analysis.records import StackMetadata
+
+PIXEL_NM = {"Refeyn OneMP": 19.3, "Refeyn TwoMP": 11.8}
+"""Side of an unbinned pixel by instrument [nm]; the files do not store it."""
+
+_BLOCK_BYTES = 64_000_000
+ANCHOR_BYTES = 64_000_000  # of decoded frames kept, from which later ones are reached
+_MOST_FRAME_DECODED_RATIO = 100  # of one decoded frame over the file
+
+
+@dataclass(frozen=True)
+class _Dialect:
+    """Names of datasets in one generation of files."""
+
+    frames: str
+    keyframes: str | None
+    rate: str
+    frame_binning: str
+    pixel_binning: str
+    exposure: str
+    names: tuple[str, ...]
+    instrument: str | None
+
+
+_DIALECTS = (
+    _Dialect(
+        frames="frame",
+        keyframes=None,
+        rate="configuration/Devices/AcqCam/FrameRate",
+        frame_binning="configuration/Engines/AcqMovieEngine/FrameBinning",
+        pixel_binning="configuration/Engines/AcqMovieEngine/PixelBinning",
+        exposure="configuration/Devices/AcqCam/ExposureTime",
+        names=("device_info/InstrumentName",),
+        instrument="Refeyn OneMP",
+    ),
+    _Dialect(
+        frames="movie/frame",
+        keyframes="movie/keyframe",
+        rate="movie/configuration/acq_camera/frame_rate",
+        frame_binning="movie/configuration/acq_camera/frame_binning",
+        pixel_binning="movie/configuration/acq_camera/pixel_binning",
+        exposure="movie/configuration/acq_camera/exposure_time",
+        names=("movie/device_serials/InstrumentName", "movie/device_info/InstrumentName"),
+        instrument="Refeyn TwoMP",
+    ),
+    _Dialect(
+        frames="movie/frame",
+        keyframes="movie/keyframe",
+        rate="movie/configuration/Devices/AcqCam/FrameRate",
+        frame_binning="movie/configuration/Devices/AcqCam/SoftwareFrameBinning",
+        pixel_binning="movie/configuration/Devices/AcqCam/SoftwarePixelBinning",
+        exposure="movie/configuration/Devices/AcqCam/ExposureTime",
+        names=("movie/device_info/InstrumentName", "movie/device_serials/InstrumentName"),
+        instrument=None,
+    ),
+)
+
+
+class RefeynFrames:
+    """The frames of an ``.mp`` file; `open_refeyn` makes it."""
+
+    def __init__(self, stored: StoredArray, reader: Hdf5Reader, path: Path) -> None:
+        t, y, x = stored.shape
+        self._stored = stored
+        self._data = reader.data
+        self._path = path
+        self.shape = (t, y, x)
+        self.dtype = stored.dtype
+        self.metadata = StackMetadata()
+        self.notes: tuple[str, ...] = ()
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
+        return self._stored.read(start, stop)
+
+    def close(self) -> None:
+        """Release the file."""
+        self._data.close()
+
+
+class DifferenceFrames(RefeynFrames):
+    """A movie stored as differences, which are summed as it is read.
+
+    Some decoded frames are kept, so that a read need not start at the first frame.  A movie that is
+    read in order is summed once.
+    """
+
+    def __init__(
+        self,
+        stored: StoredArray,
+        reader: Hdf5Reader,
+        path: Path,
+        *,
+        known: tuple[int, NDArray[Any]] | None,
+    ) -> None:
+        super().__init__(stored, reader, path)
+        self._known = known
+        frame_bytes = self.shape[1] * self.shape[2] * stored.dtype.itemsize
+        kept = max(1, min(self.shape[0], ANCHOR_BYTES // frame_bytes))
+        self._spacing = -(-self.shape[0] // kept)
+        self._step = max(1, _BLOCK_BYTES // frame_bytes)
+        self._anchors: dict[int, NDArray[Any]] = {}
+        self._newest: tuple[int, NDArray[Any]] | None = None
+        self._lock = threading.Lock()
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)``; a file that does not add up is refused."""
+        refuse_changed(self._path, self._data)
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
+        if start == stop:
+            return block
+        with self._lock:
+            known, frame = self._nearest(start)
+            first = known + 1
+            while first < stop:
+                end = min(first + self._step, stop)
+                if first < start:
+                    end = min(end, start)
+                part = self._stored.read(first, end)
+                if frame is not None:
+                    part[0] += frame
+                np.cumsum(part, axis=0, dtype=part.dtype, out=part)
+                self._remember(first, part)
+                frame = part[-1]
+                if first >= start:
+                    block[first - start : end - start] = part
+                first = end
+        return block
+
+    def _nearest(self, start: int) -> tuple[int, NDArray[Any] | None]:
+        """Find the last remembered frame before `start`; −1 and None where there is none."""
+        found = max((number for number in self._anchors if number < start), default=-1)
+        if self._newest is not None and found < self._newest[0] < start:
+            return self._newest
+        return found, self._anchors.get(found)
+
+    def _remember(self, first: int, part: NDArray[Any]) -> None:
+        end = first + len(part)
+        for number in range(-(-first // self._spacing) * self._spacing, end, self._spacing):
+            self._anchors.setdefault(number, part[number - first].copy())
+        self._newest = (end - 1, part[-1].copy())
+        if self._known is None or not first <= self._known[0] < end:
+            return
+        if not np.array_equal(part[self._known[0] - first], self._known[1]):
+            raise DataError(
+                f"{self._path}: its frames do not add up to its last keyframe; "
+                "copy the file again or export it again"
+            )
+
+
+def open_refeyn(path: Path) -> RefeynFrames:
+    """Open a Refeyn ``.mp`` movie, or ``.mpr``, which holds one."""
+    with closing(Hdf5Reader(path)) as reader:
+        try:
+            return _open(reader, path)
+        except BaseException:
+            reader.data.close()
+            raise
+
+
+def is_refeyn(reader: Hdf5Reader) -> bool:
+    """Tell whether a file has frames where one of Refeyn's has them."""
+    return any(reader.array(dialect.frames) is not None for dialect in _DIALECTS)
+
+
+def _open(reader: Hdf5Reader, path: Path) -> RefeynFrames:
+    found = [dialect for dialect in _DIALECTS if reader.array(dialect.frames) is not None]
+    if not found:
+        raise DataError(
+            f"{path}: is an HDF5 file but not a Refeyn movie (it has neither frame nor "
+            "movie/frame); export the movie as TIFF"
+        )
+    dialect = next((d for d in found if reader.number(d.rate) is not None), found[0])
+    stored = reader.array(dialect.frames)
+    if stored is None or len(stored.shape) != 3 or 0 in stored.shape:
+        shape = stored.shape if stored is not None else ()
+        raise DataError(
+            f"{path}: {dialect.frames} has the shape {shape}, not frames of rows and columns; "
+            "export it again"
+        )
+    _, rows, columns = stored.shape
+    if stored.shape[0] < 2:
+        raise DataError(
+            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
+        )
+    frame_bytes = rows * columns * stored.dtype.itemsize
+    if frame_bytes > max(_BLOCK_BYTES, _MOST_FRAME_DECODED_RATIO * len(reader.data)):
+        raise DataError(
+            f"{path}: a frame of {rows} x {columns} pixels would be {frame_bytes} bytes, from a "
+            f"file of {len(reader.data)}; the file is damaged, export it again"
+        )
+    frames = RefeynFrames(stored, reader, path)
+    if stored.dtype.kind == "u" and dialect.keyframes is not None:
+        frames = _differences(reader, dialect, stored, path) or frames
+    hints, frames.notes = _hints(reader, dialect)
+    frames.metadata = merge([hints], path)
+    return frames
+
+
+def _differences(
+    reader: Hdf5Reader, dialect: _Dialect, stored: StoredArray, path: Path
+) -> DifferenceFrames | None:
+    """Decide how the frames are encoded; None for plain ones.
+
+    The last keyframe decides: it is among plain frames as it is, and differences must add up to
+    it.  Without keyframes, an attribute ``encoding`` marks differences.
+    """
+    known = _last_keyframe(reader, dialect.keyframes or "", stored, path)
+    if known is not None and np.array_equal(stored.read(known[0], known[0] + 1)[0], known[1]):
+        return None
+    if known is None and not reader.has_attribute(dialect.frames, "encoding"):
+        return None
+    frames = DifferenceFrames(stored, reader, path, known=known)
+    if known is not None:
+        frames.read(known[0], known[0] + 1)
+    return frames
+
+
+def _last_keyframe(
+    reader: Hdf5Reader, name: str, stored: StoredArray, path: Path
+) -> tuple[int, NDArray[Any]] | None:
+    """Which frame the last keyframe repeats, and its pixels; None where that tells nothing."""
+    keyframes = reader.array(name)
+    if keyframes is None or not keyframes.shape[0]:
+        return None
+    if keyframes.shape[1:] != stored.shape[1:]:
+        raise DataError(
+            f"{path}: its keyframes have the shape {keyframes.shape[1:]} but its frames "
+            f"{stored.shape[1:]}; export it again"
+        )
+    indices = reader.numbers(name, "indices")
+    number = indices[-1] if indices else stored.shape[0] - 1
+    if not 0 <= number < stored.shape[0]:
+        raise DataError(
+            f"{path}: its last keyframe should be frame {number} of {stored.shape[0]}; "
+            "the recording or the copy was interrupted: export it again"
+        )
+    if number == 0:  # stored in full either way
+        return None
+    last = len(indices) - 1 if indices else keyframes.shape[0] - 1
+    if last >= keyframes.shape[0]:
+        raise DataError(f"{path}: lacks some of its keyframes; export it again")
+    return number, keyframes.read(last, last + 1)[0]
+
+
+def _hints(reader: Hdf5Reader, dialect: _Dialect) -> tuple[Hints, tuple[str, ...]]:
+    named = (reader.text(name) for name in dialect.names)
+    instrument = next((name for name in named if name), dialect.instrument)
+    frame_binning = positive(reader.number(dialect.frame_binning)) or 1.0
+    pixel_binning = positive(reader.number(dialect.pixel_binning))
+    rate = positive(reader.number(dialect.rate), 1 / frame_binning)
+    exposure = positive(reader.number(dialect.exposure), frame_binning)
+    unbinned = PIXEL_NM.get(instrument or "")
+    if unbinned is None or pixel_binning is None:
+        return Hints("refeyn", exposure_ms=exposure, frame_rate_hz=rate), ()
+    pixel = unbinned * pixel_binning
+    note = (
+        f"the file does not store its pixel size; that of every {instrument} is {unbinned:g} nm "
+        f"times the pixel binning of {pixel_binning:g}: {pixel:g} nm"
+    )
+    return Hints("refeyn", pixel, pixel, exposure, rate), (note,)
+
 
 _MOST_NAMES = 1000  # that are looked at
 _MOST_GROUPS = 8  # one inside the other, in which movies are looked for; named, they may be deeper

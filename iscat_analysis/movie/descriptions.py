@@ -1,5 +1,7 @@
 """What TIFF files say of themselves: which axis is time, the pixel size, and the timing.
 
+The clock of the camera: its rate and dropped frames, from the times of all frames.
+
 ImageJ, tifffile's own descriptions ('shaped'), Micro-Manager and plain TIFF; OME-XML is in `ome`.
 """
 
@@ -16,10 +18,59 @@ from typing import Any
 import numpy as np
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.clock import measure_clock
-from iscat_analysis.movie.driver_names import told_by
-from iscat_analysis.movie.tiff_checks import Image
-from iscat_analysis.records import StackMetadata
+from iscat_analysis.movie.side_files import told_by
+from iscat_analysis.records import FloatArray, StackMetadata
+
+# |mean exp(2πi f t)| of times that tell the clock; a jitter of 0.19 intervals
+_LEAST_REGULARITY = 0.5
+_BLOCK = 64  # frames that tell the rate at first
+_REACH = 0.2  # of the rate by the median interval, where the true one is looked for
+_STEP = 0.1  # of the width of the maximum, 1/(time that passed)
+
+
+def measure_clock(times_s: Mapping[int, float]) -> tuple[float | None, tuple[int, ...] | None]:
+    """Tell the rate [Hz], and the intervals from the first frame to each where some are missing.
+
+    Times t of a camera of rate f lie on a grid: |Σ exp(2πi f t)| is largest at its rate, whether
+    frames are missing or not, and the phase there says where the grid lies.  A computer may
+    receive a frame late, but that does not delay those that follow; a missing frame does.  So as
+    many are missing before frame i as the least number by which frames from i on are behind.  Where
+    the times are not on a grid, or not all known, the rate is the mean, and nothing is missing.
+    """
+    if len(times_s) < 2:
+        return None, None
+    number, times = (np.array(values) for values in zip(*sorted(times_s.items()), strict=True))
+    times = times - times[0]
+    if not (math.isfinite(times[-1]) and times[-1] > 0):
+        return None, None
+    mean = float((number[-1] - number[0]) / times[-1])
+    if not np.array_equal(number, np.arange(times.size)) or np.diff(times).min() < 0:
+        return mean, None
+    middle = float(np.median(np.diff(times)))
+    rate = _rate(times, 1 / middle) if middle > 0 else mean
+    grid = np.mean(np.exp(2j * np.pi * rate * times))
+    if abs(grid) < _LEAST_REGULARITY:
+        return mean, None
+    behind = np.rint(rate * times - np.angle(grid) / (2 * np.pi)).astype(np.int64) - number
+    ticks = number + np.minimum.accumulate(behind[::-1])[::-1]
+    ticks -= ticks[0]
+    missing = bool(np.diff(ticks).min() > 0 and ticks[-1] > number[-1])
+    return rate, tuple(ticks.tolist()) if missing else None
+
+
+def _rate(times: FloatArray, rate: float) -> float:
+    """Find the rate whose grid the times lie on, from a few of them to all."""
+    size, reach = min(_BLOCK, times.size), _REACH * rate
+    while True:
+        block = times[:size]
+        step = _STEP / block[-1] if block[-1] > 0 else reach
+        rates = rate + np.arange(-reach, reach + step / 2, step)
+        on_grid = [abs(np.exp(2j * np.pi * each * block).mean()) for each in rates]
+        rate, reach = float(rates[int(np.argmax(on_grid))]), 2 * step
+        if size == times.size:
+            return rate
+        size = min(4 * size, times.size)
+
 
 TIME_FROM_HEIGHTS = (
     "the images lie along Z (height) in the file, which names no axis of time; "
@@ -219,27 +270,6 @@ def frame_index(frame: object) -> int | None:
     """Read the number that Micro-Manager gave a frame; None where its metadata are silent."""
     value = _mm_value(frame.get("FrameIndex")) if isinstance(frame, dict) else None
     return value if type(value) is int and 0 <= value < _LARGEST_INDEX else None
-
-
-def order_by_time(images: Sequence[Image]) -> list[int] | None:
-    """Sort images by their times, and by their numbers where those are the same or not all known.
-
-    Returns None where they are in order, or nothing tells it.
-    """
-    known = [(image.elapsed_ms, image.index) for image in images]
-    keys = [values for values in zip(*known, strict=True) if None not in values]
-    order = np.lexsort(keys[::-1]) if keys else np.arange(len(images))
-    found: list[int] = order.tolist()
-    return None if found == [*range(len(images))] else found
-
-
-def out_of_order(order: Sequence[int]) -> str:
-    """Say that frames were sorted."""
-    moved = sum(page != frame for frame, page in enumerate(order))
-    return (
-        f"{moved} of the file's {len(order)} images are not where their times (ElapsedTime-ms, or "
-        "else FrameIndex) say; the frames are read in the order of these times"
-    )
 
 
 def chosen_rate(

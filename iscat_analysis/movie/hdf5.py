@@ -32,7 +32,7 @@ from iscat_analysis.movie.mapped import (
     refuse_growth,
     writer_of,
 )
-from iscat_analysis.movie.slabs import Slabs
+from iscat_analysis.movie.stack import Slabs
 
 _LARGEST_CHUNK_BYTES = 2**28
 _LARGEST_TEXT_BYTES = 4096

@@ -18,11 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.movie.descriptions import (
     TIME_FROM_HEIGHTS,
     Hints,
     inverse,
+    measure_clock,
     merge,
     positive,
     time_axis,

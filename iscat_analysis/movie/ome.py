@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 
 from iscat_analysis.config.values import WAVELENGTH_NM
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie.clock import measure_clock
 from iscat_analysis.movie.descriptions import (
     LENGTH_NM,
     TIME_S,
     Hints,
     chosen_rate,
     inverse,
+    measure_clock,
     positive,
     time_axis,
 )
-from iscat_analysis.movie.driver_names import LARGEST_NA, told_by
+from iscat_analysis.movie.side_files import LARGEST_NA, told_by
 from iscat_analysis.reading import is_file
 
 _OME_ROOT = re.compile(r"<(?:\w+:)?OME[\s>]")

@@ -1,37 +1,194 @@
-"""Movies in Zarr folders: OME-Zarr, and single arrays of frames.
+"""Movies in Zarr folders, whose files are looked at before any of them is believed.
+
+A folder of Zarr's whose files are looked at before any of them is believed.
+
+zarr gives zeros for a chunk that is not there, waits for pipes and reads devices without end.
+Here every file is a regular one, and every chunk that an array declares is there, before and while
+it is read.
+
+Movies in Zarr folders: OME-Zarr, and single arrays of frames.
 
 Format: OME-NGFF 0.4 and 0.5 (doi:10.1038/s41592-021-01326-w); zarr reads the arrays.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
+import os
+import stat
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+from zarr.abc.store import ByteRequest
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import LocalStore
+
 from iscat_analysis.errors import DataError
 from iscat_analysis.movie.addresses import MARK
 from iscat_analysis.movie.descriptions import LENGTH_NM, TIME_S, Hints, inverse, merge, positive
-from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE
-from iscat_analysis.movie.microscopes import needed_package
+from iscat_analysis.movie.mapped import WHAT_LIBRARIES_RAISE, refuse_growth
 from iscat_analysis.movie.stack import ArrayFrames
-from iscat_analysis.reading import first_line, is_file
+from iscat_analysis.reading import LARGEST_TEXT_BYTES, first_line
 from iscat_analysis.records import StackMetadata
 
-_MARKS = ("zarr.json", ".zgroup", ".zarray")
+_TEXTS = ("zarr.json", ".zgroup", ".zarray", ".zattrs", ".zmetadata")
+_LARGEST_CHUNK_BYTES = 2**28
+_GROWTH = 2  # of a chunk that a codec cannot compress, at most; and room for its header
+_HEADER_BYTES = 65_536
+_NOTHING = 2**64 - 1  # in the index of a shard, of a chunk that was not written
 
 
-def is_zarr(folder: Path) -> bool:
-    """Tell whether a folder is one of Zarr's."""
-    return any(is_file(folder / mark) for mark in _MARKS)
+class CheckedStore(LocalStore):
+    """The files of a Zarr folder; reading a chunk that is not there is an error."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, read_only=True)
+        self.sizes = _sizes(folder)
+        self.most = LARGEST_TEXT_BYTES
+        self.complete = False
+        """Whether whatever is asked for must be there."""
+
+    async def get(
+        self,
+        key: str,
+        prototype: BufferPrototype | None = None,
+        byte_range: ByteRequest | None = None,
+    ) -> Buffer | None:
+        """Read a file, or a part of it."""
+        path = Path(self.root) / key
+        try:
+            state = path.stat()
+        except OSError:
+            state = None
+        if state is not None and not stat.S_ISREG(state.st_mode):
+            raise DataError(f"{path}: is a pipe, a device or a folder where a file should be")
+        if state is not None and byte_range is None and state.st_size > self.most:
+            raise DataError(
+                f"{path}: has {state.st_size} bytes where {self.most} are the most; it is damaged, "
+                "copy it again or export it again"
+            )
+        found = None if state is None else await super().get(key, prototype, byte_range)
+        if found is None and self.complete:
+            raise DataError(f"{path}: is missing; copy the movie again or export it again")
+        return found
+
+
+class CheckedArray:
+    """An array in frames (t, y, x) all of whose chunks are there."""
+
+    def __init__(self, array: Any, store: CheckedStore, name: str) -> None:
+        self._array, self._name = array, name
+        self.dtype = np.dtype(array.dtype)
+        shape = tuple(int(n) for n in array.shape)
+        _refuse_incomplete(array, shape, store, name)
+        if len(shape) > 3 and set(shape[1:-2]) == {1}:
+            shape = (shape[0], *shape[-2:])
+        self.shape = shape
+        self.depth = int((array.shards or array.chunks)[0])
+        """Frames that are stored together."""
+        store.most = _GROWTH * math.prod(array.shards or array.chunks) * self.dtype.itemsize
+        store.most += _HEADER_BYTES
+        store.complete = True
+
+    def __getitem__(self, key: slice, /) -> NDArray[Any]:
+        try:
+            return np.asarray(self._array[key]).reshape(-1, *self.shape[1:])
+        except DataError:
+            raise
+        except WHAT_LIBRARIES_RAISE as error:
+            raise DataError(
+                f"{self._name}: frames {key.start} to {key.stop - 1} cannot be decompressed "
+                f"({first_line(error)}); copy the movie again or export it again"
+            ) from None
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    """List the files of a folder, by their paths in it, with their sizes."""
+    found = {}
+    for where, _, names in os.walk(folder):
+        for name in names:
+            path = Path(where) / name
+            try:
+                state = path.stat()
+            except OSError as error:
+                raise DataError(f"{path}: cannot be read ({error.strerror})") from None
+            if not stat.S_ISREG(state.st_mode):
+                raise DataError(f"{path}: is a pipe or a device where a file should be")
+            if name in _TEXTS and state.st_size > LARGEST_TEXT_BYTES:
+                raise DataError(f"{path}: has {state.st_size} bytes, too many for a description")
+            found[path.relative_to(folder).as_posix()] = state.st_size
+    return found
+
+
+def _refuse_incomplete(array: Any, shape: tuple[int, ...], store: CheckedStore, name: str) -> None:
+    """Refuse an array that declares more than its folder holds, or lacks a chunk."""
+    itemsize, chunk = np.dtype(array.dtype).itemsize, array.chunks
+    size, held = math.prod(shape) * itemsize, sum(store.sizes.values())
+    if math.prod(chunk) * itemsize > _LARGEST_CHUNK_BYTES:
+        raise DataError(
+            f"{name}: is stored in chunks of {chunk}, too large to be decoded one at a time; save "
+            "it with smaller chunks"
+        )
+    refuse_growth(size, held, f"{name}: it")
+    stored = array.shards or chunk
+    grid = [-(-n // c) for n, c in zip(shape, stored, strict=True)]
+    prefix = f"{array.path}/" if array.path else ""
+    if math.prod(grid) > len(store.sizes):
+        raise _missing(name, f"it holds {len(store.sizes)} files and needs {math.prod(grid)}")
+    for place in itertools.product(*map(range, grid)):
+        key = prefix + array.metadata.encode_chunk_key(place)
+        first = place[0] * stored[0]
+        frames = f"frames {first} to {min(first + stored[0], shape[0]) - 1}"
+        if key not in store.sizes:
+            raise _missing(name, f"{key} with {frames} is missing")
+        if array.shards and _lacks_chunks(array, Path(store.root) / key, place, shape):
+            raise _missing(name, f"{key} lacks some of {frames}")
+
+
+def _lacks_chunks(array: Any, path: Path, place: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Tell whether a shard lacks some of its chunks, which zarr would read as zeros.
+
+    Its index has place and length of each chunk as two integers of 64 bits, before a checksum of 4
+    bytes.
+    """
+    codec = array.metadata.codecs[0]
+    names = [type(each).__name__ for each in codec.index_codecs]
+    if names not in (["BytesCodec"], ["BytesCodec", "Crc32cCodec"]):
+        raise DataError(f"{path}: its index is stored as {names}, which is not supported")
+    inside = [s // c for s, c in zip(array.shards, array.chunks, strict=True)]
+    count = math.prod(inside)
+    length = 16 * count + 4 * (len(names) - 1)
+    with path.open("rb") as file:
+        if codec.index_location.value == "end":
+            file.seek(max(path.stat().st_size - length, 0))
+        index = file.read(16 * count)
+    if len(index) < 16 * count:
+        return True
+    order = ">" if getattr(codec.index_codecs[0].endian, "value", "little") == "big" else "<"
+    written = np.frombuffer(index, f"{order}u8").reshape(*inside, 2)[..., 0] != _NOTHING
+    starts = [p * s for p, s in zip(place, array.shards, strict=True)]
+    needed = tuple(
+        slice(0, -(-(min(start + s, n) - start) // c))
+        for start, s, n, c in zip(starts, array.shards, shape, array.chunks, strict=True)
+    )
+    return not bool(written[needed].all())
+
+
+def _missing(name: str, how: str) -> DataError:
+    return DataError(
+        f"{name}: is incomplete ({how}); the recording or the copy was interrupted, or frames of "
+        "zeros alone were left out: export it again"
+    )
 
 
 def open_zarr(folder: Path, part: str) -> ArrayFrames:
     """Open a movie in a Zarr folder."""
-    zarr = needed_package("zarr", "zarr", "Zarr", folder)
-    from iscat_analysis.movie.zarr_folder import CheckedArray, CheckedStore
-
     name = f"{folder}{MARK}{part}" if part else str(folder)
     store = CheckedStore(folder)
     try:

@@ -1,14 +1,30 @@
-"""`Stack`, the movie that every later stage reads, and `Frames`, what each format provides."""
+"""`Stack`, the movie that every later stage reads, and `Frames`, what each format provides.
+
+Frames that a file stores several together, in chunks or shards: none is decoded twice.
+
+Whoever reads a few frames decodes all that are stored with them; the next ones are then at hand.
+Several threads may read: one decodes a slab, the others wait for it.
+
+One of several channels whose frames take turns in a movie.
+
+Frames of a movie that another one is made of: some of them, or all with other counts.
+
+A movie in several files: TIFF, as Micro-Manager writes it beyond 4 GB and OME describes it.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import platform
+import threading
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +32,64 @@ from numpy.typing import NDArray
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import fingerprint, refuse_changed, sha256_of_files, states_of
 from iscat_analysis.movie.addresses import MARK, split_address
-from iscat_analysis.movie.slabs import Slabs
-from iscat_analysis.records import BoolArray, InPlace, PlacedSource, StackMetadata
+from iscat_analysis.records import BoolArray, FrameSource, InPlace, PlacedSource, StackMetadata
 from iscat_analysis.text import printable
 from iscat_analysis.threads import start_in_thread
+
+_KEPT_BYTES = 2**28  # of decoded frames that are kept
+_FEWEST = 2  # slabs: one thread ends in one while another begins in the next
+
+
+class Slabs:
+    """Reads frames through slabs of `depth` frames, of which some are kept."""
+
+    def __init__(
+        self,
+        read: Callable[[int, int], NDArray[Any]],
+        shape: tuple[int, ...],
+        dtype: np.dtype[Any],
+        depth: int,
+    ) -> None:
+        self._read, self._shape, self._dtype = read, shape, dtype
+        self._depth = min(depth, shape[0])
+        slab_bytes = self._depth * math.prod(shape[1:]) * dtype.itemsize
+        kept = _KEPT_BYTES // max(slab_bytes, 1) if self._depth > 1 else 0
+        self._most = kept if kept >= _FEWEST else 0
+        self._kept: OrderedDict[int, Future[NDArray[Any]]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array."""
+        if not self._most:
+            return self._read(start, stop)
+        out = np.empty((stop - start, *self._shape[1:]), dtype=self._dtype)
+        for number in range(start // self._depth, -(-stop // self._depth)):
+            begin = number * self._depth
+            end = min(begin + self._depth, self._shape[0])
+            low, high = max(begin, start), min(end, stop)
+            slab = self._slab(number, begin, end)
+            out[low - start : high - start] = slab[low - begin : high - begin]
+        return out
+
+    def _slab(self, number: int, begin: int, end: int) -> NDArray[Any]:
+        with self._lock:
+            found = self._kept.get(number)
+            mine = found is None
+            if found is None:
+                found = self._kept[number] = Future()
+            self._kept.move_to_end(number)
+            while len(self._kept) > self._most:
+                self._kept.popitem(last=False)
+        if mine:
+            try:
+                found.set_result(self._read(begin, end))
+            except BaseException as error:
+                with self._lock:
+                    self._kept.pop(number, None)
+                found.set_exception(error)
+                raise
+        return found.result()
+
 
 LeftOut = tuple[BoolArray, NDArray[Any]]
 """Pixels that are left out (y, x), and the counts of each in the dark."""
@@ -280,7 +350,6 @@ class Stack:
         """
         if chosen is None:
             return self
-        from iscat_analysis.movie.channels import ChannelFrames
 
         frames = ChannelFrames(self._frames, self.name, *chosen)
         seen = self._again(frames, metadata=frames.with_times(self._metadata))
@@ -461,3 +530,149 @@ class Stack:
                 f"{self._path}: frames [{start}, {stop}) were asked for, but it holds "
                 f"[0, {total}); choose frames inside that range"
             )
+
+
+class ChannelFrames:
+    """Every n-th frame of a movie; `Stack.channel` makes it."""
+
+    def __init__(self, source: Frames, name: str, channels: int, which: int) -> None:
+        self._source, self._channels, self._which = source, channels, which
+        frames = len(range(which, source.shape[0], channels))
+        if frames < 2:
+            raise DataError(
+                f"{name}: has {source.shape[0]} frames, which are too few for channel {which} of "
+                f"{channels}; give another camera.channels"
+            )
+        self.shape = (frames, *source.shape[1:])
+        self.dtype: np.dtype[Any] = source.dtype
+        self.notes = source.notes
+
+    @property
+    def metadata(self) -> StackMetadata:
+        """What the file says, with the times of these frames."""
+        return self.with_times(self._source.metadata)
+
+    def with_times(self, said: StackMetadata) -> StackMetadata:
+        """Give metadata of the whole movie the times of these frames."""
+        if said.ticks is not None:  # which count the intervals of the camera
+            own = said.ticks[self._which :: self._channels]
+            return replace(said, ticks=tuple(tick - own[0] for tick in own))
+        rate = said.frame_rate_hz
+        return replace(said, frame_rate_hz=None if rate is None else rate / self._channels)
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Shapes: result (stop − start, y, x).
+        """
+        if start >= stop:
+            return self._source.read(0, 0)
+        first, last = (self._which + self._channels * n for n in (start, stop - 1))
+        return np.ascontiguousarray(self._source.read(first, last + 1)[:: self._channels])
+
+    def close(self) -> None:
+        """Release the file."""
+        self._source.close()
+
+
+S = TypeVar("S", bound=FrameSource)
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedFrames:
+    """Frames of a movie that another one can be made of; how they are read is added to it."""
+
+    source: Stack
+
+    notes: ClassVar[tuple[str, ...]] = ()
+    metadata: ClassVar[StackMetadata] = StackMetadata()
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self.source.shape
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the stored counts."""
+        return self.source.dtype
+
+    def close(self) -> None:
+        """Do nothing: the movie has an owner."""
+
+
+@dataclass(frozen=True, eq=False)
+class SelectedFrames(Generic[S]):
+    """Some frames of a stack."""
+
+    source: S
+    frames: NDArray[np.int64]
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return self.source.name
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Frames, rows, columns."""
+        return self.frames.size, *self.source.shape[1:]
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames by their index in the selection.
+
+        Shapes: result (stop − start, y, x).
+        """
+        wanted = self.frames[start:stop]
+        runs = np.split(wanted, np.flatnonzero(np.diff(wanted) > 1) + 1)
+        parts = [self.source.read(int(run[0]), int(run[-1]) + 1) for run in runs if run.size]
+        return np.concatenate(parts) if parts else self.source.read(0, 0)
+
+
+class StackFrames(SelectedFrames[Stack], ChangedFrames):
+    """Some frames of a movie, which another one can be made of."""
+
+
+class FileSet:
+    """The frames of a set of files."""
+
+    def __init__(
+        self,
+        members: Sequence[Frames],
+        files: Sequence[Path],
+        where: NDArray[np.int64],
+        metadata: StackMetadata,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self._members, self._where = members, where
+        self.files = tuple(files)
+        self.shape = (len(where), *members[0].shape[1:])
+        self.dtype = members[0].dtype
+        self.metadata, self.notes = metadata, notes
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
+        block = np.empty((stop - start, *self.shape[1:]), dtype=self.dtype)
+        where = self._where[start:stop]
+        goes_on = (np.diff(where, axis=0) == [0, 1]).all(axis=1)
+        runs = np.flatnonzero(~goes_on) + 1
+        for first, last in zip([0, *runs], [*runs, len(where)], strict=True):
+            if last > first:
+                member, image = where[first]
+                block[first:last] = self._members[member].read(image, image + last - first)
+        return block
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """Give frames where they lie, if one file holds all of them in a row."""
+        where = self._where[start:stop]
+        if not len(where) or not (np.diff(where, axis=0) == [0, 1]).all():
+            return None
+        member, image = self._members[int(where[0, 0])], int(where[0, 1])
+        if not isinstance(member, PlacedSource):
+            return None
+        return member.in_place(image, image + stop - start)
+
+    def close(self) -> None:
+        """Release the files."""
+        for member in self._members:
+            member.close()

@@ -1,5 +1,12 @@
 """TIFF movies: which images are the frames, and their pixels.
 
+What a TIFF file must hold to be read as a movie, and what it must not do to its reader.
+
+Headers of TIFF images that repeat another's but for the place of the pixels.
+
+Cameras write thousands of them, one before each frame, and to read each tag of each takes a tenth
+of a millisecond.  What repeats, byte for byte, was read and judged before.
+
 tifffile reads the images.  It repairs what it can, by leaving out what it cannot read; whatever it
 left out is a reason here to refuse the file.  The images are counted against every description: a
 movie that was written frame by frame describes one frame in each image, and a reader that believes
@@ -14,8 +21,8 @@ import math
 import mmap
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -36,12 +43,9 @@ from iscat_analysis.movie.descriptions import (
     metamorph_hints,
     micro_manager_axes,
     micro_manager_hints,
-    order_by_time,
-    out_of_order,
     plain_hints,
     time_axis,
 )
-from iscat_analysis.movie.file_set import FileSet, open_set
 from iscat_analysis.movie.mapped import (
     WHAT_LIBRARIES_RAISE,
     frames_in_place,
@@ -51,23 +55,189 @@ from iscat_analysis.movie.mapped import (
     release,
     unmap,
 )
-from iscat_analysis.movie.ome import is_ome, read_ome, read_ome_set
-from iscat_analysis.movie.tiff_checks import (
-    MOST_FRAME_DECODED_RATIO,
-    STRIP_OFFSETS,
-    STRIP_SIZES,
-    TILE_OFFSETS,
-    TILE_SIZES,
-    Image,
-    damaged,
-    pixel_type,
-    refuse_differences,
-    refuse_overlap,
-    refuse_unread_pixels,
-    refuse_volumes,
-)
-from iscat_analysis.movie.tiff_headers import Repetition, repetition_of
+from iscat_analysis.movie.ome import OmeSet, is_ome, read_ome, read_ome_set
+from iscat_analysis.movie.stack import FileSet, Frames
 from iscat_analysis.records import InPlace, StackMetadata
+
+STRIP_OFFSETS, TILE_OFFSETS, STRIP_SIZES, TILE_SIZES = 273, 324, 279, 325
+"""Codes of the tags that say where the pixels lie, and how many bytes they have."""
+
+_LOSSLESS = {1, 5, 8, 32773, 32946, 34925, 50000}
+"""No compression, LZW, Deflate, PackBits, old Deflate, LZMA, Zstandard."""
+
+_LARGEST_FRAME_BYTES = 2**31  # 32 768 × 32 768 pixels of 16 bits, beyond any camera
+MOST_FRAME_DECODED_RATIO = 100
+"""Of one frame, which is held in memory whole, decoded over stored."""
+
+_OVERLAP = 2  # values of tags over the size of the file; each lies in it once
+_OVERLAP_BYTES = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """One image of the file: how it is stored, and where its strips or tiles lie."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any] | None
+    encoding: int
+    reduced: bool
+    texts: tuple[str, ...]
+    offsets: tuple[int, ...]
+    sizes: tuple[int, ...]
+    start: int | None
+    planes: int
+    """Frames whose pixels follow one another from here, as MetaMorph counts them."""
+    elapsed_ms: float | None
+    index: int | None
+    """Time and number of the frame, as Micro-Manager wrote them beside its pixels."""
+
+    def __str__(self) -> str:
+        return f"{' x '.join(map(str, self.shape))} pixels of {self.dtype}"
+
+
+def refuse_overlap(values: int, data: mmap.mmap, path: Path) -> None:
+    """Refuse images that share one long value, which would cost its length each time."""
+    if values > _OVERLAP * len(data) + _OVERLAP_BYTES:
+        raise damaged(path, "the headers of its images overlap")
+
+
+def refuse_unread_pixels(page: tifffile.TiffPage, file_size: int, path: Path) -> None:
+    """Refuse an image whose strips or tiles are not all listed, and whole, in the file."""
+    number, rows, columns = page.index, page.imagelength, page.imagewidth
+    frame_bytes = rows * columns * (page.dtype.itemsize if page.dtype else 8) * page.samplesperpixel
+    if not 0 < frame_bytes <= _LARGEST_FRAME_BYTES:
+        raise damaged(path, f"image {number} declares {rows} x {columns} pixels")
+    needed = math.prod(page.chunked)
+    tag = page.tags.get(TILE_OFFSETS) or page.tags.get(STRIP_OFFSETS)
+    listed = tag.count if tag is not None else 0
+    if page.compression != 1 and not {STRIP_SIZES, TILE_SIZES} & set(page.tags.keys()):
+        raise damaged(path, f"image {number} does not say how long its pixel data are")
+    if not listed == len(page.dataoffsets) == len(page.databytecounts) == needed:
+        raise damaged(path, f"image {number} lists {listed} strips or tiles but needs {needed}")
+    if min(page.dataoffsets) <= 0 or min(page.databytecounts) <= 0:
+        raise DataError(
+            f"{path}: image {number} has no pixel data for part of its area; "
+            "the recording or the copy was interrupted, export it again"
+        )
+    end = max(map(sum, zip(page.dataoffsets, page.databytecounts, strict=True)))
+    if end > file_size:
+        raise DataError(
+            f"{path}: is truncated (the pixels of image {number} should reach byte {end} of "
+            f"{file_size}); copy it again or export it again"
+        )
+    if page.compression == 1:
+        stored = sum(page.databytecounts)
+        tile_rows, tile_columns = page.chunks[-2:] if page.samplesperpixel == 1 else (1, 1)
+        if page.is_tiled and page.samplesperpixel == 1:
+            rows, columns = needed * tile_rows, tile_columns
+        if stored < rows * -(-columns * page.bitspersample // 8):
+            raise damaged(path, f"image {number} needs more than the {stored} bytes it stores")
+
+
+def refuse_volumes(page: tifffile.TiffPage, path: Path) -> None:
+    """Refuse images of several planes, which descriptions may count one by one."""
+    if page.imagedepth > 1:
+        raise DataError(
+            f"{path}: holds volumes ({page.imagedepth} planes per image); "
+            "export one plane per frame"
+        )
+
+
+def pixel_type(page: tifffile.TiffPage, path: Path) -> np.dtype[Any]:
+    """Give the type of the pixels, if the movie is of a kind that can be analysed."""
+    if page.samplesperpixel > 1:
+        raise DataError(
+            f"{path}: holds colour images ({page.samplesperpixel} samples per pixel); "
+            "export the camera's grey values"
+        )
+    if page.compression not in _LOSSLESS:
+        name = getattr(page.compression, "name", "unknown")
+        raise DataError(
+            f"{path}: its compression ({name}, number {int(page.compression)}) is not supported; "
+            "save it uncompressed or with Deflate"
+        )
+    if page.dtype is None or page.dtype.kind not in "uif":
+        raise DataError(
+            f"{path}: its pixels are {page.bitspersample}-bit numbers of sample format "
+            f"{int(page.sampleformat)}; export it as 8-, 16- or 32-bit integers or as floats"
+        )
+    dtype: np.dtype[Any] = page.dtype
+    return dtype
+
+
+def refuse_differences(frames: Sequence[Image], path: Path) -> None:
+    """Refuse frames that are not all stored alike."""
+    first = frames[0]
+    for number, image in enumerate(frames):
+        if image.encoding != first.encoding:
+            differs = str(image) != str(first)
+            what = f"{image} but the first is {first}" if differs else "stored in another way"
+            raise DataError(
+                f"{path}: its frames differ: image {number} is {what}; "
+                "export the frames of one movie to a file of their own"
+            )
+
+
+def damaged(path: Path, how: str) -> DataError:
+    """Make the error of a damaged file."""
+    return DataError(f"{path}: is damaged ({how}); export it again")
+
+
+STRIP_OFFSETS = 273
+_ELSEWHERE = {282: 5, 283: 5, 305: 2, 306: 2}
+"""Resolutions, program and time, with their types: they lie outside the list of tags, and those of
+the first image count."""
+
+_PLACES = {3: "H", 4: "I", 16: "Q"}  # types of number that may say where pixels are
+
+
+@dataclass(frozen=True, slots=True)
+class Repetition:
+    """Header of an image, against which others are compared; `repetition_of` makes it."""
+
+    tiff: tifffile.TiffFormat
+    tags: bytes
+    free: tuple[tuple[int, int], ...]
+    place: tuple[str, int]
+    size: int
+
+    def find(self, data: mmap.mmap, offset: int) -> tuple[int, int] | None:
+        """Compare an image."""
+        end = offset + len(self.tags)
+        here = bytearray(data[offset : end + self.tiff.offsetsize])
+        if offset <= 0 or len(here) < len(self.tags) + self.tiff.offsetsize:
+            return None
+        (start,) = struct.unpack_from(self.place[0], here, self.place[1])
+        (following,) = struct.unpack_from(self.tiff.offsetformat, here, len(self.tags))
+        for first, last in self.free:
+            here[first:last] = bytes(last - first)
+        if here[: len(self.tags)] != self.tags or not 0 < start <= len(data) - self.size:
+            return None
+        return int(start), int(following)
+
+
+def repetition_of(
+    tiff: tifffile.TiffFormat, data: mmap.mmap, offset: int, size: int
+) -> Repetition | None:
+    """Make a pattern of the header of an image."""
+    (count,) = struct.unpack_from(tiff.tagnoformat, data, offset)
+    length = tiff.tagnosize + count * tiff.tagsize
+    tags = bytearray(data[offset : offset + length])
+    place: tuple[str, int] | None = None
+    free = []
+    for first in range(tiff.tagnosize, length, tiff.tagsize):
+        code, kind = struct.unpack_from(f"{tiff.byteorder}HH", tags, first)
+        number = struct.unpack_from(tiff.offsetformat, tags, first + 4)[0]
+        last = first + tiff.tagsize
+        value = last - tiff.offsetsize
+        if code == STRIP_OFFSETS and number == 1 and kind in _PLACES and place is None:
+            place = f"{tiff.byteorder}{_PLACES[kind]}", value
+        elif _ELSEWHERE.get(code) != kind:
+            continue
+        free.append((value, last))
+        tags[value:last] = bytes(last - value)
+    return None if place is None else Repetition(tiff, bytes(tags), tuple(free), place, size)
+
 
 TIFF_SUFFIXES = (".tif", ".tiff", ".btf", ".tf8", ".stk")
 """Of files that are taken for TIFF movies where a folder is searched for them."""
@@ -455,3 +625,48 @@ def _unheard() -> Iterator[None]:
 
 def _first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), "") or type(error).__name__
+
+
+def open_set(described: OmeSet, path: Path, open_member: Callable[[Path], Frames]) -> FileSet:
+    """Open the files of a set, which lie beside each other."""
+    files = [path.with_name(name) if name else path for name in described.files]
+    with ExitStack() as opened:
+        members = []
+        for file in files:
+            members.append(open_member(file))
+            opened.callback(members[-1].close)
+        last = np.full(len(files), -1)
+        np.maximum.at(last, described.where[:, 0], described.where[:, 1])
+        for number, (file, member) in enumerate(zip(files, members, strict=True)):
+            if (member.shape[1:], member.dtype) != (members[0].shape[1:], members[0].dtype):
+                raise DataError(f"{file}: has other pixels than {files[0].name}; export it again")
+            needed = int(last[number]) + 1
+            if needed > member.shape[0]:
+                raise DataError(
+                    f"{file}: holds {member.shape[0]} images, but the description of its set says "
+                    f"{needed}; the recording or the copy was interrupted: export it again"
+                )
+        opened.pop_all()
+    hints = described.hints
+    return FileSet(members, files, described.where, merge([hints], path), hints.notes)
+
+
+def order_by_time(images: Sequence[Image]) -> list[int] | None:
+    """Sort images by their times, and by their numbers where those are the same or not all known.
+
+    Returns None where they are in order, or nothing tells it.
+    """
+    known = [(image.elapsed_ms, image.index) for image in images]
+    keys = [values for values in zip(*known, strict=True) if None not in values]
+    order = np.lexsort(keys[::-1]) if keys else np.arange(len(images))
+    found: list[int] = order.tolist()
+    return None if found == [*range(len(images))] else found
+
+
+def out_of_order(order: Sequence[int]) -> str:
+    """Say that frames were sorted."""
+    moved = sum(page != frame for frame, page in enumerate(order))
+    return (
+        f"{moved} of the file's {len(order)} images are not where their times (ElapsedTime-ms, or "
+        "else FrameIndex) say; the frames are read in the order of these times"
+    )

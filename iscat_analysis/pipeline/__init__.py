@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from iscat_analysis.config import Config, refuse_rod
-from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.diagnosis import Prepared
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.fitting.ranges import BackgroundMode, background_mode

@@ -12,16 +12,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.diagnosis.causes import (
+from iscat_analysis.diagnosis import (
+    Noise,
+    Prepared,
+    drift_warning,
+    examine_background,
+    judge_background,
+    judge_beside,
     misfit_warning,
     pixel_warnings,
     repeats_warning,
     uneven_warning,
+    without_cut_off,
 )
-from iscat_analysis.diagnosis.dark_frames import without_cut_off
-from iscat_analysis.diagnosis.fixed_pattern import drift_warning, examine_background
-from iscat_analysis.diagnosis.noise import Noise, judge_background, judge_beside
-from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import (
     Event,

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from iscat_analysis.calibration import as_given
 from iscat_analysis.config import config_to_toml
-from iscat_analysis.diagnosis.causes import (
+from iscat_analysis.diagnosis import (
+    Prepared,
     fixed_height_warning,
     landing_rate_warning,
     large_warning,
@@ -28,7 +29,6 @@ from iscat_analysis.diagnosis.causes import (
     scale_warning,
     sign_warning,
 )
-from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.executors import versions
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.fitting.run import Run

@@ -20,11 +20,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import power_searched
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Mover, Trajectory
-from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera import Camera, Lines, Mover, Trajectory
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.diagnosis import Prepared
 from iscat_analysis.executors import Executor
 from iscat_analysis.fitting.context import AnalysisContext, reported_steps
 from iscat_analysis.fitting.ranges import fitted_frames

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 from iscat_analysis.calibration import with_standards
-from iscat_analysis.camera.burnt_in import text_summary
+from iscat_analysis.camera import text_summary
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.calibrated import LIGHT_STEPS, Step, calibrated
-from iscat_analysis.diagnosis.prepared import Prepared
-from iscat_analysis.diagnosis.recognise import (
+from iscat_analysis.diagnosis import (
+    LIGHT_STEPS,
+    Prepared,
+    Step,
     as_landing,
     as_moving,
+    calibrated,
     changes_summary,
     look_at_changes,
 )

@@ -22,11 +22,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import contrast_map
-from iscat_analysis.camera.background import measure_windows, start_power
+from iscat_analysis.camera import measure_windows, start_power
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.calibrated import calibrated
-from iscat_analysis.diagnosis.noise import judge_background, survey_over
-from iscat_analysis.diagnosis.prepared import Prepared
+from iscat_analysis.diagnosis import Prepared, calibrated, judge_background, survey_over
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.findings import printing
 from iscat_analysis.fitting.context import AnalysisContext, make_context, reported_steps

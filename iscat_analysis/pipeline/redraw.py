@@ -17,12 +17,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import add_frames, refine_power
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.field_sample import LARGEST_PX, CutFrames
-from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera import LARGEST_PX, Camera, CutFrames, Lines, add_frames, refine_power
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.calibrated import calibrated
+from iscat_analysis.diagnosis import calibrated
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context
 from iscat_analysis.fitting.events import (

@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.learned import ASSUMPTION, METADATA, LearnedCamera
-from iscat_analysis.camera.learned import MEASURED as BY_NOISE
+from iscat_analysis.camera import ASSUMPTION, METADATA, LearnedCamera
+from iscat_analysis.camera import MEASURED as BY_NOISE
 from iscat_analysis.config import AUTO, Config, configure, instruments, toml_value
-from iscat_analysis.diagnosis.recognise import as_moving, look_at_changes
+from iscat_analysis.diagnosis import as_moving, look_at_changes
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file
 from iscat_analysis.instrument.learning import why_not
-from iscat_analysis.movie import Stack, open_stack
-from iscat_analysis.movie.addresses import setup_beside
+from iscat_analysis.movie import Stack, open_stack, setup_beside
 from iscat_analysis.pipeline.preview import Preview
 from iscat_analysis.records import StackMetadata
 from iscat_analysis.text import in_toml

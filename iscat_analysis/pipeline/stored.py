@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.checks import path_in
-from iscat_analysis.movie import Stack, open_stack
-from iscat_analysis.movie.addresses import split_address
+from iscat_analysis.movie import Stack, open_stack, split_address
 from iscat_analysis.pipeline.redraw import Redraw, redraw
 from iscat_analysis.reading import read_json, read_parquet
 from iscat_analysis.records import EventView, tally

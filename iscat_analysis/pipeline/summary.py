@@ -13,12 +13,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis.bounds import holevo_over_quantum
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Pattern, middle_of, pattern_of
-from iscat_analysis.camera.field_sample import FieldSample
+from iscat_analysis.camera import Camera, FieldSample, Pattern, middle_of, pattern_of
 from iscat_analysis.config import MOVES, Config
-from iscat_analysis.diagnosis.prepared import Prepared
-from iscat_analysis.diagnosis.stretches import Stretches
+from iscat_analysis.diagnosis import Prepared, Stretches
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.results import Compared, DetectionResult
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread

@@ -14,9 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import block_sums
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera, check_counts
-from iscat_analysis.camera.field_sample import sampled
+from iscat_analysis.camera import Camera, check_counts, find_defects, sampled
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, CountSource, FloatArray, Mapper

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from iscat_analysis._kernels.sliding import contrast_map, step_peaks
-from iscat_analysis.camera.spectrum import NoiseSpectrum
+from iscat_analysis.camera import NoiseSpectrum
 from iscat_analysis.records import FloatArray, Mapper
 from iscat_analysis.search.frames import Chunk
 from iscat_analysis.search.peaks import SAMPLED, summits

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 from scipy.ndimage import maximum_filter
 
-from iscat_analysis.camera.spectrum import NoiseSpectrum
+from iscat_analysis.camera import NoiseSpectrum
 from iscat_analysis.config import Detection
 from iscat_analysis.errors import FloodError
 from iscat_analysis.inference.likelihood import Likelihood

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.camera.counts import camera_from_config, read_map
+from iscat_analysis.camera import camera_from_config, read_map
 from iscat_analysis.config import AUTO, Config, Particle
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.files import whole_file

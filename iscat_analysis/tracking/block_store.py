@@ -12,9 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.canvas import box_of
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.diagnosis.causes import smear_warning
-from iscat_analysis.diagnosis.noise import Noise, judge_beside
+from iscat_analysis.camera import Camera
+from iscat_analysis.diagnosis import Noise, judge_beside, smear_warning
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.run import Checkpoint, packed_views, unpacked_views
 from iscat_analysis.records import BoolArray, CountSource, EventView, FloatArray, Progress, Windows

@@ -27,9 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import Trajectory, follow_pattern, trusted
+from iscat_analysis.camera import Camera, Trajectory, find_defects, follow_pattern, trusted
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.ranges import fitted_frames

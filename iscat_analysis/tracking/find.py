@@ -17,16 +17,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.camera.background import Check, add_frames, start_power
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, Check, add_frames, start_power
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.causes import (
+from iscat_analysis.diagnosis import (
+    Prepared,
     fixed_height_warning,
     misfit_warning,
     pattern_jitter_warning,
     pixel_warnings,
 )
-from iscat_analysis.diagnosis.prepared import Prepared
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, contrast_image

@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.fitting.results import Compared, DetectionResult
-from iscat_analysis.movie import Stack
-from iscat_analysis.movie.selected_frames import StackFrames
+from iscat_analysis.movie import Stack, StackFrames
 from iscat_analysis.records import BoolArray, FloatArray, Windows
 from iscat_analysis.search.frames import DARK, measure_frames, well_lit
 from iscat_analysis.units import listed

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import BoolArray, CountSource, Status, silent

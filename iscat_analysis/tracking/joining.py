@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.fitting.results import Followed
 from iscat_analysis.records import EventView, FloatArray, Windows

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import chdtri
 
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera import Camera, Lines, find_defects
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context

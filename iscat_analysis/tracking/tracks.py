@@ -12,8 +12,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from iscat_analysis.camera.background import add_frames, start_power
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, add_frames, start_power
 from iscat_analysis.config import Config
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import AnalysisContext

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from iscat_analysis.camera.background import smooth_background
+from iscat_analysis.camera import smooth_background
 from iscat_analysis.fitting.context import AnalysisContext
 from iscat_analysis.fitting.events import Event, photons_scale
 from iscat_analysis.fitting.field import total_signal

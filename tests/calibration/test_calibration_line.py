@@ -11,7 +11,7 @@ import tifffile
 from scenes import make_config
 
 from iscat_analysis.config import Calibration, Config
-from iscat_analysis.diagnosis.causes import sign_warning
+from iscat_analysis.diagnosis import sign_warning
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model
 from iscat_analysis.optics.scale import MassScale

@@ -7,16 +7,16 @@ import pytest
 from scenes import Stack
 from scipy.ndimage import median_filter
 
-from iscat_analysis.camera.background import (
+from iscat_analysis.camera import (
     DEAD,
     DEFECT_SIGMAS,
     HOT,
+    Camera,
     find_defects,
     measure_windows,
     refine_power,
     smooth_background,
 )
-from iscat_analysis.camera.counts import Camera
 from iscat_analysis.errors import DataError
 
 SHAPE = (48, 56)

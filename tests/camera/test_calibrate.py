@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 import tifffile
 
-from iscat_analysis.camera.counts import Camera, camera_from_config, check_counts, refuse_ratio
-from iscat_analysis.camera.metadata import GainDiagnosis, diagnose_gain, resolve_metadata
+from iscat_analysis.camera import (
+    Camera,
+    GainDiagnosis,
+    camera_from_config,
+    check_counts,
+    diagnose_gain,
+    refuse_ratio,
+    resolve_metadata,
+)
 from iscat_analysis.config import CameraConfig, parse_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.records import StackMetadata

@@ -13,13 +13,17 @@ import pytest
 from recorded_light import LEVEL_E, SHAPE, gamma, linear, record, saturation
 
 import iscat_analysis as ia
-from iscat_analysis.camera.calibration.laws import Law, find_law
-from iscat_analysis.camera.calibration.transfer import measure_transfer
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.learned import LearnedCamera, learn_camera
-from iscat_analysis.camera.response import read_response
+from iscat_analysis.camera import (
+    Camera,
+    Law,
+    LearnedCamera,
+    find_law,
+    learn_camera,
+    measure_transfer,
+    read_response,
+)
 from iscat_analysis.config import CameraConfig
-from iscat_analysis.diagnosis.camera_numbers import law_messages
+from iscat_analysis.diagnosis import law_messages
 from iscat_analysis.movie import open_stack
 from iscat_analysis.records import StackMetadata
 

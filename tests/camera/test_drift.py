@@ -7,12 +7,12 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.ndimage import shift as image_shift
 
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import (
+from iscat_analysis.camera import (
+    Camera,
     Mover,
     Trajectory,
     derivatives,
+    find_defects,
     follow_pattern,
     measure_drift,
     trusted,

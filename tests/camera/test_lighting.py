@@ -10,9 +10,7 @@ from scipy.ndimage import fourier_shift, gaussian_filter
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.lighting import Surface, find_surface
-from iscat_analysis.camera.lines import Lines
+from iscat_analysis.camera import Camera, Lines, Surface, find_surface
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 from iscat_analysis.study import Movie

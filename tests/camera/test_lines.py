@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scenes import PIXEL_NM, Stack, make_config
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.lines import Lines, SteadyFrames, find_lines
+from iscat_analysis.camera import Camera, Lines, SteadyFrames, find_lines
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.optics.grid import PixelGrid
 

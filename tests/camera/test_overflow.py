@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import refuse_overflow
+from iscat_analysis.camera import refuse_overflow
 from iscat_analysis.errors import DataError
 
 LANDING = {"fit.mode": "mass", "background.method": "sliding"}

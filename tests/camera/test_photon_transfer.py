@@ -11,12 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import convolve1d, gaussian_filter
 
-from iscat_analysis.camera.calibration import (
-    CameraCalibration,
-    Estimate,
-    measure_camera,
-    regression,
-)
+from iscat_analysis.camera import CameraCalibration, Estimate, measure_camera, regression
 from iscat_analysis.errors import DataError
 
 GAIN, OFFSET, READ_E = 4.0, 100.0, 20.0
@@ -200,9 +195,7 @@ def test_noise_that_pixels_share_does_not_spoil_the_gain(kind: str) -> None:
 def test_control_taking_pixels_for_independent_spoils_it(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "iscat_analysis.camera.calibration.measure.measure_spectrum", lambda *_, **__: None
-    )
+    monkeypatch.setattr("iscat_analysis.camera.calibration.measure_spectrum", lambda *_, **__: None)
     found = measure_camera([with_noise(np.random.default_rng(1), kind)], offset_adu=OFFSET)
     assert abs(pull(found.gain_e_per_adu, GAIN)) > 20
 
@@ -225,7 +218,7 @@ def test_pixels_that_reach_zero_are_left_out(monkeypatch: pytest.MonkeyPatch) ->
 
     check_pulls(pulls())
     nothing = np.zeros(SHAPE, dtype=bool)
-    monkeypatch.setattr("iscat_analysis.camera.calibration.measure.clipped", lambda _: nothing)
+    monkeypatch.setattr("iscat_analysis.camera.calibration.clipped", lambda _: nothing)
     with pytest.raises(AssertionError):
         check_pulls(pulls())
 

@@ -16,9 +16,9 @@ import pytest
 from scenes import Stack, make_config
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.causes import fixed_height_warning
+from iscat_analysis.diagnosis import fixed_height_warning
 from iscat_analysis.fitting.ranges import checked
 from iscat_analysis.study import Movie
 from iscat_analysis.tracking.held_height import held_height_warning

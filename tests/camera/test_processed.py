@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, median_filter, shift
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.processed import find_processing
+from iscat_analysis.camera import Camera, find_processing
 
 FRAMES, SIDE, GAIN = 300, 96, 4.0
 

@@ -13,8 +13,7 @@ from scenes import make_config
 from scipy.ndimage import convolve1d
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.spectrum import NoiseSpectrum, measure_spectrum
+from iscat_analysis.camera import Camera, NoiseSpectrum, measure_spectrum
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.events import search_likelihood
 from iscat_analysis.records import Windows

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from noisy import GAIN, SIDE, speckled_counts
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.successive import shared_light
-from iscat_analysis.diagnosis.noise import judge_counts
+from iscat_analysis.camera import Camera, shared_light
+from iscat_analysis.diagnosis import judge_counts
 
 CAMERA = Camera(gain_e_per_adu=GAIN)
 

@@ -14,9 +14,8 @@ from scenes import make_config
 from small_movies import SETUP, simulate
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.unsteady import find_unsteady, unsteady_message
-from iscat_analysis.diagnosis.changes import least_beside
+from iscat_analysis.camera import Camera, find_unsteady, unsteady_message
+from iscat_analysis.diagnosis import least_beside
 from iscat_analysis.study import Movie
 
 Counts = NDArray[np.float64]

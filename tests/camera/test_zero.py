@@ -10,9 +10,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from iscat_analysis.camera.calibration import LightZero, find_zero
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.diagnosis.noise import judge_counts
+from iscat_analysis.camera import Camera, LightZero, find_zero
+from iscat_analysis.diagnosis import judge_counts
 
 SHAPE, FRAMES, LEVEL_E, GAIN = (64, 64), 128, 1e5, 4.0
 SEEDS = 20

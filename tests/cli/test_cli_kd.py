@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 from event_tables import draw_series
 
-from iscat_analysis.movie.addresses import path_beside
+from iscat_analysis.movie import path_beside
 from iscat_analysis.schemas import schema
 from iscat_cli import main
 

@@ -12,11 +12,9 @@ from scenes import make_config
 from scipy.ndimage import fourier_shift
 
 import iscat_analysis as ia
-from iscat_analysis.camera.burnt_in import boxes_of, find_text
-from iscat_analysis.camera.counts import Camera, check_counts
+from iscat_analysis.camera import Camera, boxes_of, check_counts, find_text
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.stretches import find_stretches
-from iscat_analysis.diagnosis.turns import channels_of
+from iscat_analysis.diagnosis import channels_of, find_stretches
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.summary import look_at

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from iscat_analysis.diagnosis.causes import landing_rate_warning, residue_warning
+from iscat_analysis.diagnosis import landing_rate_warning, residue_warning
 
 
 def _table(ok: int, changing: int, undescribed: int) -> pd.DataFrame:

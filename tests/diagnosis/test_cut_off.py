@@ -9,7 +9,7 @@ from scenes import make_config
 from wanderers import SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.search.frames import cut_off
 from iscat_analysis.study import Movie

@@ -13,9 +13,9 @@ import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
 from shared_errors import systematic
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, load_config
-from iscat_analysis.diagnosis.stretches import Stretches
+from iscat_analysis.diagnosis import Stretches
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.fitting.results import DetectionResult

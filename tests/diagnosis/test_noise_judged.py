@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scenes import PIXEL_NM, make_config
 from wanderers import wander
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config
-from iscat_analysis.diagnosis.noise import Noise, judge_beside
+from iscat_analysis.diagnosis import Noise, judge_beside
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.movie import open_stack
 from iscat_analysis.optics.forward import PixelGrid, forward_model

@@ -11,17 +11,19 @@ from scipy.ndimage import shift
 from wanderers import wander
 
 from iscat_analysis import fit_movie
-from iscat_analysis.camera.counts import Camera, camera_from_config
-from iscat_analysis.diagnosis.changes import Changes, find_changes, spot_of
-from iscat_analysis.diagnosis.recognise import (
+from iscat_analysis.camera import Camera, camera_from_config
+from iscat_analysis.diagnosis import (
     BLOCK,
     LARGEST_CHANCE,
     LEAST_MOVING,
     MOST_MOVING,
     MOST_STAYING,
+    Changes,
     as_landing,
     as_moving,
+    find_changes,
     look_at_changes,
+    spot_of,
 )
 from iscat_analysis.errors import DataError, FloodError
 from iscat_analysis.optics.forward import PixelGrid, forward_model

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import fourier_shift, gaussian_filter
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.search.noise import measure_motion, measure_noise
 from iscat_analysis.study import Movie
 

@@ -10,8 +10,7 @@ import pytest
 from instruments import PEAK_PER_KDA, Instrument, InstrumentMovie, Landings, draw_landings
 
 import iscat_analysis as ia
-from iscat_analysis.camera.background import measure_windows
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.config import load_config
 from iscat_analysis.fitting import field
 from iscat_analysis.fitting.context import make_context

@@ -12,7 +12,7 @@ import pytest
 from scenes import PIXEL_NM, Stack
 
 from iscat_analysis import Preview
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Config, configure
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting.context import AnalysisContext, make_context

@@ -22,7 +22,7 @@ from tiff_files import movie, write_stk
 
 from iscat_analysis import find_species, fit_kd, open_result
 from iscat_analysis.answers.calibrations import read_contrasts
-from iscat_analysis.camera.counts import read_map
+from iscat_analysis.camera import read_map
 from iscat_analysis.config import Config, config_to_toml, load_config
 from iscat_analysis.day.table import read_table
 from iscat_analysis.executors import open_executor

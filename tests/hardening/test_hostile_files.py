@@ -409,7 +409,7 @@ def test_a_pickle_is_not_a_movie_nor_a_table(tmp_path: Path) -> None:
 
 
 def test_a_map_that_is_a_movie_of_colours_is_refused(tmp_path: Path) -> None:
-    from iscat_analysis.camera.counts import read_map
+    from iscat_analysis.camera import read_map
 
     tifffile.imwrite(tmp_path / "map.tif", np.zeros((10, 14, 3), "u1"), photometric="rgb")
     refuse(

@@ -11,7 +11,7 @@ from scipy.stats import skew
 
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.posterior import sample_posterior
-from iscat_analysis.inference.prior import Prior
+from iscat_analysis.inference.prior import Prior, van_trees
 from iscat_analysis.records import PARAMETERS, FloatArray, PosteriorResult, Status
 from iscat_analysis.study import (
     PosteriorRanks,
@@ -19,7 +19,6 @@ from iscat_analysis.study import (
     calibrate_posterior,
     run_trials,
     trial_generator,
-    van_trees,
 )
 
 pytestmark = pytest.mark.large

@@ -15,7 +15,7 @@ from scenes import PIXEL_NM, Stack, make_config
 from scipy.ndimage import gaussian_filter, shift
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import Calibration, Config
 from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL

@@ -24,7 +24,7 @@ from uneven_movies import (
     tilted,
 )
 
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import FIELD_TERMS, Config, load_config
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings

@@ -17,7 +17,7 @@ import tifffile
 from scenes import Stack
 
 from iscat_analysis import pipeline as pipeline_module
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.fitting import events as events_module

@@ -9,9 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import iscat_analysis as ia
-from iscat_analysis.camera.calibration.laws import find_law
-from iscat_analysis.camera.calibration.transfer import measure_transfer
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, find_law, measure_transfer
 from iscat_analysis.config import Config
 from iscat_analysis.pipeline import fit_stack
 from iscat_analysis.search.noise import measure_motion

@@ -12,7 +12,7 @@ from scenes import Stack
 from scipy.ndimage import convolve1d
 from scipy.stats import poisson
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.fitting.context import make_context
 from iscat_analysis.inference.fit import fit_particle

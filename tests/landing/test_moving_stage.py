@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, Landings, draw_landings
 
-from iscat_analysis.camera.counts import camera_from_config
-from iscat_analysis.camera.drift import follow_pattern
+from iscat_analysis.camera import camera_from_config, follow_pattern
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.instrument.learning import learn_optics
 from iscat_analysis.landing.find import analyse_landings

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.instrument.uneven import is_plausible
 from iscat_analysis.landing import steps as steps_module

@@ -14,8 +14,7 @@ import pandas as pd
 import pytest
 from scenes import Stack
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.spectrum import measure_spectrum
+from iscat_analysis.camera import Camera, measure_spectrum
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.landing import chunks as chunk_work

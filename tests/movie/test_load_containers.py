@@ -18,8 +18,7 @@ from small_files import COUNTS, SHAPE, assert_whole, refused
 
 from iscat_analysis.day.table import read_table
 from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.movie import open_stack, path_beside
-from iscat_analysis.movie.folders import SUFFIXES, files_of, find_movies, is_movie
+from iscat_analysis.movie import SUFFIXES, files_of, find_movies, is_movie, open_stack, path_beside
 
 MATLAB = COUNTS.transpose(1, 2, 0)
 """As MATLAB has it: (y, x, t)."""

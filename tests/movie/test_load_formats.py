@@ -13,11 +13,9 @@ import zarr
 from small_files import COUNTS, assert_whole, refused
 from tiff_files import write_ome_set
 
-from iscat_analysis.camera.counts import refuse_overflow
+from iscat_analysis.camera import refuse_overflow
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import open_stack, path_beside
-from iscat_analysis.movie.addresses import split_address
-from iscat_analysis.movie.mapped_frames import MappedFrames
+from iscat_analysis.movie import MappedFrames, open_stack, path_beside, split_address
 
 # ---- NumPy and plain numbers -----------------------------------------------------------------
 

@@ -10,12 +10,10 @@ import tifffile
 from numpy.typing import NDArray
 from tiff_files import ASCII, RATIONAL, SHORT, movie, pages_of, write_micro_manager, write_tiff
 
-from iscat_analysis.camera.learned import learn_camera
-from iscat_analysis.camera.metadata import resolve_metadata
+from iscat_analysis.camera import learn_camera, resolve_metadata
 from iscat_analysis.config import CameraConfig, configure
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.clock import measure_clock
+from iscat_analysis.movie import measure_clock, open_stack
 from iscat_analysis.records import StackMetadata
 
 FRAMES = 5

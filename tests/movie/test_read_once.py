@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import zarr
 
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.movie import open_stack
-from iscat_analysis.movie import slabs as slabs_module
+from iscat_analysis.movie import stack as slabs_module
 from iscat_analysis.movie.hdf5 import StoredArray
-from iscat_analysis.movie.zarr_folder import CheckedStore
+from iscat_analysis.movie.ome_zarr import CheckedStore
 from iscat_analysis.search import chunks as chunks_module
 from iscat_analysis.search.chunks import Reader
 

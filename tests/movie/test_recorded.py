@@ -9,8 +9,7 @@ import pytest
 
 from iscat_analysis.day.table import read_table
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import open_stack
-from iscat_analysis.movie.folders import files_of
+from iscat_analysis.movie import files_of, open_stack
 
 COUNTS = np.random.default_rng(1).integers(0, 60000, (7, 6, 5)).astype("<u2")
 

@@ -9,8 +9,7 @@ import pytest
 import tifffile
 
 from iscat_analysis.errors import DataError
-from iscat_analysis.movie import tiff
-from iscat_analysis.movie.tiff import open_tiff
+from iscat_analysis.movie import open_tiff, tiff
 
 
 def movie(frames, shape=(6, 7)):

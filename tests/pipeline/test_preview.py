@@ -10,8 +10,7 @@ import pytest
 import tifffile
 
 import iscat_analysis as ia
-from iscat_analysis.camera.background import measure_windows
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.study import Movie
 
 WINDOW, LANDS, LEAVES = 24, 60, 120

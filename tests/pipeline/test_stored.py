@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
-from iscat_analysis.camera.field_sample import CutFrames
+from iscat_analysis.camera import CutFrames
 from iscat_analysis.movie import Stack
 from iscat_analysis.pipeline import redraw as redraw_module
 

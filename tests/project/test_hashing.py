@@ -10,9 +10,9 @@ import pytest
 import tifffile
 
 import iscat_analysis as ia
-import iscat_analysis.movie
 from iscat_analysis.errors import DataError
 from iscat_analysis.hashing import sha256_of_files
+from iscat_analysis.movie import formats
 
 
 @pytest.fixture
@@ -68,16 +68,13 @@ def test_a_movie_that_is_replaced_while_it_is_being_opened_is_refused(
 ) -> None:
     other = tmp_path / "other.tif"
     tifffile.imwrite(other, np.ones((5, 16, 32), dtype=np.uint16))
-    readers = dict(iscat_analysis.movie.READERS)
-
-    tiff = readers[b"II\x2a\x00"]
+    tiff, *others = formats.FORMATS
 
     def late(path: Path, part: str) -> object:
         frames = tiff.open(path, part)
         other.replace(path)
         return frames
 
-    slow = {b"II\x2a\x00": tiff._replace(open=late)}
-    monkeypatch.setattr(iscat_analysis.movie, "READERS", {**readers, **slow})
+    monkeypatch.setattr(formats, "FORMATS", (tiff._replace(open=late), *others))
     with pytest.raises(DataError, match="was replaced"):
         ia.open_stack(file)

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import with_absolute_paths
 from iscat_analysis.errors import DataError
 from iscat_analysis.executors import LocalExecutor, open_executor

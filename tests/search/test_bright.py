@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from iscat_analysis._kernels.sliding import step_energy
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.records import FloatArray
 from iscat_analysis.search.bright import BrightStep, find_bright_steps
 from iscat_analysis.search.frames import Chunk, make_chunk, measure_frames

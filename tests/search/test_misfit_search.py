@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from instruments import Instrument, InstrumentMovie, draw_landings
 
-from iscat_analysis.camera.background import measure_windows
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config, measure_windows
 from iscat_analysis.config import Config, load_config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.context import make_context

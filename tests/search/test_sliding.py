@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from iscat_analysis._kernels.sliding import strongest_maps
-from iscat_analysis.camera.background import find_defects
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera, find_defects
 from iscat_analysis.search.dating import crosstalk, locate_step
 from iscat_analysis.search.frames import (
     Chunk,

@@ -12,7 +12,7 @@ from shared_errors import systematic
 
 import iscat_analysis as ia
 from iscat_analysis.config import Uncertainty, configure
-from iscat_analysis.diagnosis.causes import nonlinearity_warning
+from iscat_analysis.diagnosis import nonlinearity_warning
 from iscat_analysis.optics.forward import forward_model
 from iscat_analysis.optics.scale import MassScale
 

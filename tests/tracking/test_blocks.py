@@ -21,7 +21,7 @@ import iscat_analysis.tracking.blocks as blocks_module
 import iscat_analysis.tracking.find as tracking_module
 from iscat_analysis import pipeline
 from iscat_analysis.calibration import with_standards
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.config import Config
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.run import RESUMPTION_HINT, partial_folder

@@ -10,7 +10,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import camera_from_config
+from iscat_analysis.camera import camera_from_config
 from iscat_analysis.config import configure
 from iscat_analysis.errors import DataError
 from iscat_analysis.fitting.ranges import background_mode, measured_windows

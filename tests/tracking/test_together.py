@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from wanderers import FRAME_RATE_HZ, SETTINGS, wander
 
 import iscat_analysis as ia
-from iscat_analysis.camera.counts import Camera
+from iscat_analysis.camera import Camera
 from iscat_analysis.tracking.common_motion import warnings_of
 from iscat_analysis.tracking.frame_subset import keep_frames
 

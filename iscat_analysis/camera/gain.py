@@ -1,9 +1,21 @@
-"""Metadata of a movie, and whether its noise agrees with them."""
+"""Noise between frames beside that of the gain, and what else makes it: motion, filters in time.
+
+Frames that contain light of earlier frames: averaged, interpolated or filtered in time.
+
+Of independent frames any two differ by the same noise, apart from slow changes.  If each was
+averaged with the one before, neighbours differ less than frames farther apart, and those all differ
+equally.  Where light or stage drift, or the laser flickers, differences go on growing.
+
+Noise that is not the light's: a fixed pattern that shakes, or counts that are too coarse.
+
+In variance against mean, both look like a wrong gain.
+
+Metadata of a movie, and whether its noise agrees with them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,129 +23,169 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.pattern_jitter import (
-    MOST_EXPLAINED,
-    PatternJitter,
-    measure_pattern_jitter,
-)
-from iscat_analysis.config import Config, Optics, plausible_pixel
-from iscat_analysis.errors import ConfigError, DataError
-from iscat_analysis.records import BoolArray, FloatArray, StackMetadata
-from iscat_analysis.units import count
+from iscat_analysis.errors import DataError
+from iscat_analysis.records import BoolArray, FloatArray
 
-_DISAGREEMENT = 0.01  # relative, between configuration and metadata
-_OPTICS_DISAGREEMENT = 0.05  # the aperture that was measured is some percent below the engraved one
+_APART, _FAR = 8, 16  # frames: filters are forgotten by then
+_FEWEST, _FRAMES = 40, 256  # frames that tell, and as many as are asked
+_MOST_PIXELS = 4096  # that are asked, all over the field
+_LEAST_DEFICIT = 0.1  # by which the variance between neighbours falls short
+_MOST_GROWTH = 0.15  # of that, by which it may still grow farther on
+
+
+def shared_light(
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
+) -> float | None:
+    """Test whether successive frames have light in common.
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
+    """
+    if len(counts) < _FEWEST:
+        return None
+    counts, shape = counts[:_FRAMES], counts.shape[1:]
+    places = np.arange(math.prod(shape)) if masked is None else np.flatnonzero(~masked)
+    places = places[:: max(1, -(-places.size // _MOST_PIXELS))]
+    offset, gain = (
+        np.broadcast_to(value, shape).flat[places]
+        for value in (camera.offset_adu, camera.gain_e_per_adu)
+    )
+    theirs = Camera(offset_adu=offset, gain_e_per_adu=gain)
+    pixels = theirs.to_electrons(counts.reshape(len(counts), -1)[:, places])
+    pixels = pixels[:, pixels.mean(axis=0) > 0]
+    if not pixels.size:
+        return None
+    power = pixels.mean(axis=1)
+    if power.min() <= 0:
+        return None
+    pixels *= (power.mean() / power)[:, None]
+    light = pixels.mean(axis=0)
+    near, apart, far = (
+        float(np.median(np.einsum("tp,tp->p", change, change) / len(change) / light))
+        for change in (pixels[lag:] - pixels[:-lag] for lag in (1, _APART, _FAR))
+    )
+    if apart <= 0 or far <= 0:
+        return None
+    short = 1 - near / apart
+    return (
+        near / apart
+        if short > _LEAST_DEFICIT and abs(far / apart - 1) < _MOST_GROWTH * short
+        else None
+    )
+
+
+def averaged_noise(counts: NDArray[Any], camera: Camera) -> float | None:
+    """Give the variance of long averages over that of frames next to each other, where they share.
+
+    Frames that were averaged or filtered in time have noise in common: with the correlation ρ_k of
+    frames k apart, an average of n has 1 + 2 Σ ρ_k times the variance over n of one.
+
+    Shapes: `counts` (t, y, x).
+    """
+    if shared_light(counts, camera) is None:
+        return None
+    pixels = camera.to_electrons(counts[:_FRAMES])
+    power = pixels.mean(axis=(1, 2), keepdims=True)
+    pixels *= power.mean() / power
+    squares = [float(np.mean((pixels[k:] - pixels[:-k]) ** 2)) for k in (*range(1, _APART), _FAR)]
+    common = sum(1 - one / squares[-1] for one in squares[:-1])
+    return squares[-1] / squares[0] * (1 + 2 * common)
+
+
+MOST_EXPLAINED = 0.5
+"""Share of the noise beyond the light's that the motion of the pattern must explain to be named."""
+
+
+@dataclass(frozen=True)
+class PatternJitter:
+    """Motion of the fixed pattern from frame to frame."""
+
+    share: float
+    rms_px: float
+
+
+def measure_pattern_jitter(
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
+) -> PatternJitter | None:
+    """Fit the difference of neighbouring frames with the gradient of their mean.
+
+    A pattern B that moves by δ changes by −δ·∇B.  The difference of two frames is fitted with ∂_y B
+    and ∂_x B, weighted by shot noise.  Of noise alone each of them explains 1 of χ².
+
+    Shapes: `counts` (t, y, x), `masked` (y, x).
+    """
+    seen = _Pattern.of(counts, camera, masked)
+    if seen is None:
+        return None
+    light, used, information, variance = seen.light, seen.used, seen.information, seen.variance
+    steps = np.diff(light, axis=0)[:, used]
+    moved = seen.motion(steps)
+    explained = float(np.einsum("ki,ij,kj->", moved, information, moved)) - moved.size
+    beyond = float(np.sum(steps**2 / variance)) - steps.size
+    if beyond <= 0:
+        return None
+    own = float(np.trace(np.linalg.inv(information))) / 2  # of the light's noise alone
+    rms = np.sqrt(max(float(np.mean(moved**2)) - own, 0.0) / 2)
+    return PatternJitter(explained / beyond, float(rms))
+
+
+def without_pattern_jitter(
+    counts: NDArray[Any], camera: Camera, *, masked: BoolArray | None = None
+) -> NDArray[Any]:
+    """Remove the motion of the fixed pattern from frames, to first order.
+
+    Shapes: `counts` (t, y, x), `masked` (y, x), result (t, y, x).
+    """
+    seen = _Pattern.of(counts, camera, masked)
+    if seen is None:
+        return counts
+    moved = seen.motion(seen.light[:, seen.used] - seen.mean[seen.used])
+    change_e = np.einsum("ki,iyx->kyx", moved * seen.power[:, None], seen.slopes)
+    return np.asarray(counts - change_e / camera.gain_e_per_adu)
+
+
+@dataclass(frozen=True)
+class _Pattern:
+    """Frames of equal power, their mean, and the Fisher information on its motion."""
+
+    light: FloatArray  # (t, y, x) [e]
+    power: FloatArray  # (t,), that was divided out
+    mean: FloatArray
+    slopes: FloatArray  # (2, y, x)
+    used: BoolArray
+    variance: FloatArray  # of the difference of two frames, at the pixels used
+    information: FloatArray  # (2, 2)
+
+    @classmethod
+    def of(cls, counts: NDArray[Any], camera: Camera, masked: BoolArray | None) -> _Pattern | None:
+        light = np.stack([camera.to_electrons(frame) for frame in counts])
+        used = light.min(axis=0) > 0
+        if masked is not None:
+            used &= ~masked
+        if len(light) < 3 or not used.any():
+            return None
+        power = light[:, used].mean(axis=1)
+        power /= power.mean()
+        light /= power[:, None, None]
+        mean = light.mean(axis=0)
+        slopes = np.stack(np.gradient(mean))
+        variance = 2 * (mean + camera.read_variance_e2(mean.shape))[used]
+        there = slopes[:, used]
+        information = np.einsum("ip,jp,p->ij", there, there, 1 / variance)
+        if not np.linalg.cond(information) < 1 / np.finfo(float).eps:
+            return None
+        return cls(light, power, mean, slopes, used, variance, information)
+
+    def motion(self, changes: FloatArray) -> FloatArray:
+        """Fit the slopes to changes (k, p) in the used pixels: the motion along −y and −x."""
+        there = self.slopes[:, self.used]
+        seen = np.einsum("kp,ip,p->ki", changes, there, 1 / self.variance)
+        return np.asarray(np.linalg.solve(self.information, seen.T).T)
+
+
 _GAIN_TOLERANCE = 0.10  # of the noise variance, before the user is told
 _GAIN_SIGMAS = 3.0  # and the excess over the tolerance that chance must not explain
 _OUTLIER_SIGMAS = 8.0  # a blinking pixel, in standard deviations of one pixel's variance
 _OUTLIER_FRAMES = 16  # fewer, and the variance of one pixel is too uncertain to call it an outlier
-
-
-def resolve_metadata(config: Config, metadata: StackMetadata) -> tuple[Config, tuple[str, ...]]:
-    """Set what the configuration leaves open from the metadata of the movie."""
-    notes = []
-    found: dict[str, float] = {}
-    for key, unit, words in (
-        ("pixel_size_nm", "nm", "pixel size"),
-        ("exposure_ms", "ms", "exposure"),
-        ("frame_rate_hz", "Hz", "frame rate"),
-    ):
-        given: float | None = getattr(config.camera, key)
-        read: float | None = getattr(metadata, key)
-        if read is None:
-            continue
-        if given is None:
-            if key == "pixel_size_nm":
-                _refuse_unlikely(read, metadata.source)
-            found[key] = read
-        elif abs(read / given - 1) > _DISAGREEMENT:
-            notes.append(
-                f"the {words} is {given:g} {unit} in the configuration (camera.{key}) but "
-                f"{read:g} {unit} in the movie's {metadata.source} metadata; "
-                "the configuration is used"
-            )
-    shown_hz = metadata.displayed_hz
-    if config.fit.mode == "track" and shown_hz is not None and metadata.frame_rate_hz is None:
-        notes.append(
-            f"the {shown_hz:g} frames per second in the file are the speed at which ImageJ shows "
-            "the movie, which tells nothing of the camera, and are not used"
-        )
-    if metadata.ticks is not None:
-        missing = metadata.ticks[-1] + 1 - len(metadata.ticks)
-        notes.append(
-            f"the camera dropped {count(missing, 'frame')}, by the times in the movie's "
-            f"{metadata.source} metadata; diffusion coefficients and rates count the time that "
-            "passed"
-        )
-    if config.camera.pixel_size_nm is None and "pixel_size_nm" not in found:
-        raise DataError(
-            "the pixel size is neither in the configuration nor in the movie's metadata; "
-            "set camera.pixel_size_nm, as in camera.pixel_size_nm = 84.4"
-        )
-    camera = config.camera.model_copy(update=found)
-    optics, taken_from_file = _with_optics(config.optics, metadata)
-    notes += taken_from_file
-    config = config.model_copy(update={"camera": camera, "optics": optics})
-    source = f"in the movie's {metadata.source} metadata" if "pixel_size_nm" in found else ""
-    return config, (*notes, *_coarse_pixels(config, source or "in the configuration"))
-
-
-def _with_optics(optics: Optics, metadata: StackMetadata) -> tuple[Optics, list[str]]:
-    """Replace defaults of the optics by the metadata of the movie."""
-    found: dict[str, float] = {}
-    notes = []
-    for key, unit, words in (("wavelength_nm", " nm", "wavelength"), ("na", "", "NA")):
-        given: float = getattr(optics, key)
-        read: float | None = getattr(metadata, key)
-        if read is None:
-            continue
-        where = f"in the movie's {metadata.source} metadata"
-        if given == read:
-            continue
-        if given == type(optics).model_fields[key].default:
-            found[key] = read
-            notes.append(
-                f"the {words} is {read:g}{unit}, as {where}, and not {given:g}{unit}, which is "
-                f"the default of optics.{key}"
-            )
-        elif abs(read / given - 1) > _OPTICS_DISAGREEMENT:
-            notes.append(
-                f"the {words} is {given:g}{unit} in the configuration (optics.{key}) but "
-                f"{read:g}{unit} {where}; the configuration is used"
-            )
-    if not found:
-        return optics, notes
-    try:
-        return Optics(**{**optics.model_dump(), **found}), notes
-    except ConfigError as error:
-        raise DataError(
-            f"the movie's {metadata.source} metadata do not suit the configuration: {error}"
-        ) from None
-
-
-def _coarse_pixels(config: Config, where: str) -> Iterator[str]:
-    """Warn that pixels are larger than the spot of a particle; refuse twice that size."""
-    optics, pixel_nm = config.optics, config.camera.pixel_size_nm
-    spot_nm = optics.wavelength_nm / (2 * optics.na)
-    if pixel_nm is None or pixel_nm <= spot_nm:
-        return
-    problem = (
-        f"a pixel of {pixel_nm:g} nm, as {where}, is larger than the spot of a particle is wide: "
-        f"about {spot_nm:.3g} nm, optics.wavelength_nm over twice optics.na"
-    )
-    advice = "give its size in the sample plane, as in camera.pixel_size_nm = 84.4"
-    if pixel_nm > 2 * spot_nm:
-        raise DataError(f"{problem}; {advice}")
-    yield f"{problem}, so that pictures are not resolved; unless it was binned so far, {advice}"
-
-
-def _refuse_unlikely(pixel_nm: float, source: str) -> None:
-    try:
-        plausible_pixel(pixel_nm)
-    except ValueError as error:
-        raise DataError(
-            f"the movie's {source} metadata: {error}, as in camera.pixel_size_nm = 84.4"
-        ) from None
 
 
 @dataclass(frozen=True)

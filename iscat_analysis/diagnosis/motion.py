@@ -1,4 +1,9 @@
-"""Noise of the background frames, and how far the fixed pattern of the light moved."""
+"""Motion of the fixed pattern of the light, by the stage or between two sums.
+
+Motion of the stage, as the fixed pattern shows it before anything is searched.
+
+Noise of the background frames, and how far the fixed pattern of the light moved.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +12,43 @@ from typing import Any
 
 import numpy as np
 
-from iscat_analysis.camera.counts import Camera
-from iscat_analysis.camera.drift import follow_pattern
-from iscat_analysis.diagnosis.noise import first_counts, is_lit
+from iscat_analysis.camera import Camera, follow_pattern
+from iscat_analysis.config import Config
+from iscat_analysis.diagnosis.noise import NoiseSurvey, first_counts, is_lit
 from iscat_analysis.movie import Stack
 from iscat_analysis.records import FloatArray, Windows
-from iscat_analysis.search.frames import well_lit
-from iscat_analysis.search.noise import measure_noise
+from iscat_analysis.search.frames import good_frames, well_lit
+from iscat_analysis.search.noise import measure_motion, measure_noise
+
+# Share of the variance of averages that motion must add; noise alone adds 1e-3.
+_LEAST_VARIANCE_SHARE = 0.03
+
+
+def with_drift_correction(config: Config, *, moves: bool) -> Config:
+    """Set in the configuration whether the motion of the fixed pattern is divided out."""
+    background = config.background.model_copy(update={"drift_correction": moves})
+    return config.model_copy(update={"background": background})
+
+
+def motion_message(opening: NoiseSurvey) -> str:
+    """Say that the fixed pattern of a landing movie moves; empty where it does not."""
+    if opening.noise.shakes:
+        return "the fixed pattern shakes"
+    reader, length = opening.reader.sampled, opening.curve.frames[-1]
+    last = reader.read(max(reader.first, reader.last - 2 * length), reader.last)
+    last = last[good_frames(last, reader.camera)]
+    share = max(
+        measure_motion(counts, reader.camera, min(length, len(counts) // 2))
+        for counts in (reader.opening(), last)
+        if len(counts) >= 2
+    )
+    if not share > _LEAST_VARIANCE_SHARE:
+        return ""
+    return (
+        f"the fixed pattern moves: averages of {length} frames differ by {1 + share:.3g} times "
+        "what they would otherwise"
+    )
+
 
 DRIFT_PX = 0.02
 """Shift of the fixed pattern below which it is not worth a line."""

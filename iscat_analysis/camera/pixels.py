@@ -1,0 +1,322 @@
+"""Pixels that are left out: under a text that was burnt in, and with noise that is not light's.
+
+Text that was burnt into the frames, as a time that goes on: found, and left out.
+
+Ink is one count, again and again, far from what the light of its pixel is: light scatters, and what
+a pixel saturates at is the end of its own scatter.  A time changes in frames that were not looked
+at, so that the rectangle around its ink is left out.
+
+Pixels whose noise is not that of light: found by their neighbours, and left out.
+
+A pixel that switches between two levels, a column with a noisy amplifier and a time that is burnt
+into a corner look like particles that come and go.  In frames next to each other a pixel's counts
+scatter as its light has it, and so do averages of frames far apart; a pixel is unsteady where they
+scatter more than those of the pixels around it, and those beside it do not follow: a particle's
+picture covers several.  One that never changes is no light either.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation, find_objects, label, median_filter
+from scipy.special import chdtri
+
+from iscat_analysis._kernels.unsteady import add_image, add_scatter, block_extremes, block_powers
+from iscat_analysis.camera.counts import Camera
+from iscat_analysis.movie import ChangedFrames, Stack
+from iscat_analysis.records import BoolArray, FloatArray
+from iscat_analysis.units import count, listed
+
+_FRAMES, _TOGETHER, _COUNTS = 128, 8, 2**24  # that are looked at, in groups all over the movie
+_FEWEST = 16
+_RANGE = 2.5  # times the range of the counts of most pixels, which ink exceeds
+_AGAIN = 0.02  # of the frames that have the same count, at least and at most
+_TIMES = 3  # and as many frames
+_APART = 5.0  # standard deviations of the light, between which and the ink there is nothing
+_LEAST_PIXELS = 8  # of a text
+_GAP = 4  # pixels between letters, at most
+_MOST = 0.25  # of the field
+_MARGIN = 1  # pixel around a text, for letters that are smooth
+
+
+@dataclass(frozen=True, eq=False)
+class PatchedFrames(ChangedFrames):
+    """Frames whose text is covered with the rows beside it, which have the light of any."""
+
+    rows: NDArray[np.int64]
+    text: BoolArray
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames.
+
+        Shapes: result (stop − start, y, x).
+        """
+        counts = self.source.read(start, stop)
+        y, x = np.nonzero(self.text)
+        counts[:, y, x] = counts[:, self.rows[y, x], x]
+        return counts
+
+
+def text_message(text: BoolArray, name: str) -> str:
+    """Say where text is burnt in.
+
+    Shapes: `text` (y, x).
+    """
+    boxes = " and ".join(
+        f"rows {a.start}:{a.stop}, columns {b.start}:{b.stop}" for a, b in boxes_of(text)
+    )
+    return (
+        f"{name}: a text is burnt into the frames ({boxes}), whose {int(text.sum())} pixels are "
+        "left out; what lies beneath it is lost: switch it off in the program that records"
+    )
+
+
+def text_summary(text: BoolArray) -> list[dict[str, list[int]]]:
+    """Give what ``summary.json`` says of a text.
+
+    Shapes: `text` (y, x).
+    """
+    return [{"rows": [a.start, a.stop], "columns": [b.start, b.stop]} for a, b in boxes_of(text)]
+
+
+def boxes_of(text: BoolArray) -> list[tuple[slice, slice]]:
+    """Give the rectangles of a text.
+
+    Shapes: `text` (y, x).
+    """
+    return [(box[0], box[1]) for box in find_objects(label(text)[0])]
+
+
+def patched(movie: Stack, text: BoolArray) -> Stack:
+    """Cover a text with the light of the nearest rows that have none.
+
+    Shapes: `text` (y, x).
+    """
+    free = np.flatnonzero(~text.any(axis=1))
+    rows = np.tile(np.arange(text.shape[0])[:, None], (1, text.shape[1]))
+    for top, part in ((box[0].start, box) for box in boxes_of(text)):
+        high = part[0].stop - top
+        starts = [
+            s for s in range(text.shape[0] - high + 1) if np.isin(range(s, s + high), free).all()
+        ]
+        if starts:
+            start = min(starts, key=lambda s: abs(s - top))
+            rows[part] += start - top
+    return movie.seen_as(PatchedFrames(movie, rows.astype(np.int64), text))
+
+
+def without_text(movie: Stack, text: BoolArray, camera: Camera) -> Stack:
+    """Leave the pixels of a text out, as dead ones.
+
+    Shapes: `text` (y, x).
+    """
+    dark = np.broadcast_to(np.floor(camera.offset_adu), text.shape)[text].astype(movie.dtype)
+    return movie.without(text, dark)
+
+
+def find_text(movie: Stack, span: tuple[int, int]) -> BoolArray | None:
+    """Find pixels into which a text is burnt that changes from frame to frame.
+
+    Shapes: result (y, x).
+    """
+    counts = _sample(movie, span)
+    if len(counts) < _FEWEST or not np.issubdtype(counts.dtype, np.integer):
+        return None
+    lowest, highest = counts.min(axis=0).astype(np.int64), counts.max(axis=0).astype(np.int64)
+    width = highest - lowest
+    doubtful = width > _RANGE * max(float(np.median(width)), 1.0)
+    if not doubtful.sum() >= _LEAST_PIXELS:
+        return None
+    series = np.sort(counts[:, doubtful].astype(np.int64), axis=0)
+    ink, share = _commonest(series)
+    light = np.where(series == ink, np.nan, series)
+    light[:, share == 1] = 0.0  # nothing but ink, or dead
+    scatter = 1.4826 * np.nanmedian(np.abs(light - np.nanmedian(light, axis=0)), axis=0)
+    apart = np.nanmin(np.abs(light - ink), axis=0) > _APART * np.maximum(scatter, 1.0)
+    inked = apart & (share >= max(_AGAIN, _TIMES / len(counts))) & (share <= 1 - _AGAIN)
+    letters = np.zeros(doubtful.shape, dtype=np.bool_)
+    letters[doubtful] = inked
+    inks = np.unique(ink[inked])
+    if letters.sum() < _LEAST_PIXELS or inks.size > letters.sum() / 2:  # of many, none is one
+        return None
+    # some letters stay, and others change in a few frames
+    letters |= (doubtful | (width == 0)) & np.isin(counts, inks).any(axis=0)
+    text = np.zeros_like(letters)
+    for box in find_objects(label(binary_dilation(letters, iterations=_GAP))[0]):
+        y, x = np.nonzero(letters[box])
+        if y.size >= _LEAST_PIXELS:
+            top, left = box[0].start + int(y.min()), box[1].start + int(x.min())
+            bottom, right = box[0].start + int(y.max()), box[1].start + int(x.max())
+            text[
+                max(top - _MARGIN, 0) : bottom + _MARGIN + 1,
+                max(left - _MARGIN, 0) : right + _MARGIN + 1,
+            ] = True
+    return text if 0 < text.mean() < _MOST else None
+
+
+def _sample(movie: Stack, span: tuple[int, int]) -> NDArray[Any]:
+    """Read groups of frames all over a range.
+
+    Shapes: result (t, y, x).
+    """
+    frames = span[1] - span[0]
+    most = max(_FEWEST, min(_FRAMES, _COUNTS // math.prod(movie.shape[1:])))
+    if frames <= most:
+        return movie.read(*span)
+    groups = max(2, most // _TOGETHER)
+    starts = np.linspace(span[0], span[1] - _TOGETHER, groups).astype(int)
+    return np.concatenate([movie.read(start, start + _TOGETHER) for start in starts.tolist()])
+
+
+def _commonest(series: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Give the commonest count of every pixel, and its share of the frames.
+
+    Shapes: `series` (t, n), sorted; `ink, share` (n,).
+    """
+    frames, pixels = series.shape
+    new = np.vstack([np.ones((1, pixels), dtype=np.bool_), np.diff(series, axis=0) != 0])
+    begins = np.where(new, np.arange(frames)[:, None], 0)
+    length = np.arange(frames)[:, None] - np.maximum.accumulate(begins, axis=0) + 1
+    last = length.argmax(axis=0)
+    columns = np.arange(pixels)
+    return series[last, columns], length[last, columns] / frames
+
+
+_CHANCE = 1e-9  # that noise alone makes a pixel unsteady
+_AROUND = 5  # pixels along each side, whose median tells how counts scatter there
+# Times shot noise, by which most pixels change slowly where it is not the pixels
+_SLOW_CHANGE_RATIO = 3.0
+_LEAST_LINE_EXCESS = 0.15  # of the usual scatter, by which that of a noisy line is larger at least
+_LINE_SIGMAS = 8.0  # robust standard deviations of all lines
+_SIGMA_PER_MAD = 1.4826  # standard deviation of a normal law over its median deviation
+_FEWEST_FRAMES = 20  # frames that tell
+_LEAST_E = 20.0  # of light, below which noise is far from normal
+_LINE_SHARE = 0.5  # of the pixels of a line that is named as such
+_MOST_PIXEL_SHARE = 0.1  # of the pixels: where more are, it is not the pixels that are odd
+
+
+def unsteady_message(pixels: BoolArray) -> str:
+    """Say which pixels are unsteady.
+
+    Shapes: `pixels` (y, x).
+    """
+    number = int(pixels.sum())
+    where = [
+        f"{name} {listed(np.flatnonzero(pixels.mean(axis=axis) > _LINE_SHARE), 4)}"
+        for axis, name in ((1, "row"), (0, "column"))
+        if (pixels.mean(axis=axis) > _LINE_SHARE).any()
+    ]
+    if not where:
+        y, x = np.nonzero(pixels)
+        where = [listed([f"({a}, {b})" for a, b in zip(x, y, strict=True)], 3)]
+    verb = "has" if number == 1 else "have"
+    return (
+        f"{count(number, 'pixel')} ({' and '.join(where)}) {verb} noise that is not the light's, "
+        "as where a pixel switches, an amplifier is noisy or a text is burnt in; not used"
+    )
+
+
+def find_unsteady(
+    blocks: Sequence[NDArray[Any]], camera: Camera, least_beside: float
+) -> BoolArray | None:
+    """Find pixels that flicker, switch, or repeat their values.
+
+    Shapes: `blocks` (t, y, x), result (y, x).
+    """
+    frames = np.array([len(block) for block in blocks])
+    freedom = int((frames - 1).sum()), len(blocks) - 1
+    if freedom[0] < _FEWEST_FRAMES or freedom[1] < 4:
+        return None
+    shape = blocks[0].shape[1:]
+    summed = np.zeros(shape)
+    highest, still = blocks[0][0].copy(), np.ones(shape, dtype=np.bool_)
+    for block in blocks:
+        block_extremes(block, summed, highest, still)
+    light = camera.to_electrons(summed / frames.sum())
+    lit = light > max(_LEAST_E, 0.1 * float(np.median(light)))
+    lit &= ~camera.saturated(highest)
+    level = float(light[lit].mean()) if lit.any() else 0.0
+    if lit.mean() < 0.5:
+        return None
+    variance = np.where(lit, light + camera.read_variance_e2(light.shape), np.inf)
+    gain, offset = (
+        np.ascontiguousarray(np.broadcast_to(np.asarray(value, dtype=np.float64), shape))
+        for value in (camera.gain_e_per_adu, camera.offset_adu)
+    )
+    fast, slow = _Scatter(shape), _Scatter(shape)
+    found = lit & still
+    mean, change = np.empty(shape), np.empty(shape)
+    for block in blocks:
+        power = block_powers(block, gain, offset, lit) / level
+        if power.min() <= 0:
+            return None
+        add_scatter(block, gain, offset, power, mean, change, fast.squares, fast.products)
+        slow.add((mean - light) * np.sqrt(len(block)))
+    for scatter, number in ((fast, freedom[0]), (slow, freedom[1])):
+        ratio = np.where(lit, scatter.squares / variance / number, 0.0)
+        usual = float(np.median(ratio[lit]))
+        if (
+            scatter is slow and usual > _SLOW_CHANGE_RATIO
+        ):  # by the light or the stage, and in what pattern
+            continue
+        limit = chdtri(number, _CHANCE) / number
+        more = ratio > usual * limit
+        more &= scatter.neighbour_products < least_beside * scatter.squares
+        more &= _largest_neighbour(ratio) - usual < least_beside * (ratio - usual)
+        if more.any():  # by those around as well, which takes longest
+            more &= ratio > median_filter(ratio, _AROUND, mode="nearest") * limit
+            found |= more
+        if scatter is fast:
+            found |= _noisy_lines(ratio, lit, usual, least_beside)
+    found &= lit
+    return found if 0 < found.mean() < _MOST_PIXEL_SHARE else None
+
+
+def _largest_neighbour(values: FloatArray) -> FloatArray:
+    """Larger one of the two neighbours, along the axis where it is smaller."""
+    padded = np.pad(values, 1, mode="reflect")
+    along_y = np.maximum(padded[:-2, 1:-1], padded[2:, 1:-1])
+    along_x = np.maximum(padded[1:-1, :-2], padded[1:-1, 2:])
+    return np.minimum(along_y, along_x)
+
+
+class _Scatter:
+    """Mean square deviations of pixels, and their products with neighbouring pixels."""
+
+    def __init__(self, shape: tuple[int, ...]) -> None:
+        self.squares = np.zeros(shape)
+        self.products = np.zeros((2, *shape))
+
+    def add(self, image: FloatArray) -> None:
+        """Add one image."""
+        add_image(image, self.squares, self.products)
+
+    @property
+    def neighbour_products(self) -> FloatArray:
+        """Products with the neighbours along y or x, whichever are larger."""
+        largest: FloatArray = self.products.max(axis=0)
+        return largest
+
+
+def _noisy_lines(ratio: FloatArray, lit: BoolArray, usual: float, least_beside: float) -> BoolArray:
+    """Find rows and columns in which most pixels scatter more than in the neighbouring lines."""
+    noisy = np.zeros(ratio.shape, dtype=np.bool_)
+    for axis in (0, 1):
+        lines = np.flatnonzero(lit.mean(axis=axis) > _LINE_SHARE)
+        if lines.size < _AROUND:
+            continue
+        seen = np.where(lit, ratio, np.nan).take(lines, axis=1 - axis)
+        excess = np.nanmedian(seen, axis=axis) - usual
+        spread = _SIGMA_PER_MAD * float(np.median(np.abs(excess - np.median(excess))))
+        padded = np.pad(excess, 1, mode="reflect")
+        neighbours = np.maximum(padded[:-2], padded[2:])
+        off = excess > max(_LEAST_LINE_EXCESS * usual, _LINE_SIGMAS * spread)
+        odd = lines[off & (neighbours < least_beside * excess)]
+        noisy[(slice(None), odd) if axis == 0 else odd] = True
+    return noisy

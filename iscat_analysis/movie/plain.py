@@ -1,0 +1,419 @@
+"""Movies of contiguous numbers: NumPy files, raw files, and those that something describes.
+
+Plain numbers whose bytes or axes lie in another order than was said, told by their smoothness.
+
+Read in the right order, a pixel changes by its noise from frame to frame, and neighbours have
+similar light.  With its bytes the other way round it changes by a third of the range of its type;
+where rows are taken for columns, neighbours are pixels from all over the frame.
+
+Movies of contiguous numbers: NumPy files and raw files.
+
+Plain numbers that a text beside them describes, or their own name.
+
+PyLabLib cam-control writes ``movie.bin`` with ``movie_settings.dat``, or ``frames.bin`` with
+``settings.dat``; a long movie in parts, ``movie_0000.bin``, ``movie_0001.bin``…  The keys are
+``save/frame/shape``, ``save/frame/dtype``, ``save/saved`` and ``save/append``
+(https://pylablib-cam-control.readthedocs.io, "File formats").  PiSCAT's movies are named by their
+shape and type, as ``control_4999_128_128_uint16_2.33FPS.raw`` (https://piscat.readthedocs.io).
+"""
+
+from __future__ import annotations
+
+import glob
+import math
+import re
+import tokenize
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
+
+from iscat_analysis.errors import DataError
+from iscat_analysis.movie.addresses import MARK, Layout, layout
+from iscat_analysis.movie.mapped import (
+    WHAT_LIBRARIES_RAISE,
+    frames_in_place,
+    map_file,
+    refuse_changed,
+    release,
+    unmap,
+)
+from iscat_analysis.movie.stack import FileSet
+from iscat_analysis.reading import first_line, is_file, open_regular, read_text
+from iscat_analysis.records import InPlace, StackMetadata
+
+_LEAST_BYTE_GAIN = 8.0  # of the smoothness, if bytes are swapped; 3 for the noisiest real movies
+_LEAST_AXES_GAIN = 2.0  # of the smoothness across rows, if columns are stored one after the other
+_LEAST_PIXELS = 1024  # of a frame that tell an order
+_LOOKED_AT = 4  # pairs of frames
+
+
+def looked_at(frames: int) -> Iterator[tuple[int, int]]:
+    """Choose pairs of successive frames, all over a movie."""
+    for start in dict.fromkeys(np.linspace(0, frames - 2, _LOOKED_AT, dtype=int).tolist()):
+        yield start, start + 2
+
+
+def bytes_are_swapped(counts: NDArray[Any]) -> bool:
+    """Tell whether numbers are far smoother in time with their bytes the other way round.
+
+    Shapes: `counts` (t, y, x), in pairs of successive frames.
+    """
+    if counts.dtype.itemsize < 2 or counts.size < _LEAST_PIXELS:
+        return False
+    given, swapped = (_change(numbers) for numbers in (counts, counts.byteswap()))
+    return given > _LEAST_BYTE_GAIN * swapped
+
+
+def _change(counts: NDArray[Any]) -> float:
+    """Mean change of a pixel within pairs of frames, in steps; of the logarithm of a float."""
+    if counts.dtype.kind == "f":
+        limits = np.finfo(counts.dtype)
+        size = np.abs(np.nan_to_num(counts, nan=limits.max, posinf=limits.max, neginf=limits.max))
+        values, step = np.log2(np.maximum(size, limits.smallest_subnormal).astype(np.float64)), 1
+    else:  # few bits may stand in the upper bytes, all counts being multiples of a step
+        bits = int(np.bitwise_or.reduce(counts, axis=None))
+        values, step = counts.astype(np.float64), max(bits & -bits, 1)
+    pairs = values[: len(values) // 2 * 2].reshape(-1, 2, *values.shape[1:])
+    return float(np.abs(pairs[:, 1] - pairs[:, 0]).mean()) / step
+
+
+def lines_are_exchanged(counts: NDArray[Any]) -> bool:
+    """Tell whether frames are far smoother if they have as many lines as a line has pixels.
+
+    A square frame is only turned over its diagonal by that, which nothing tells.
+
+    Shapes: `counts` (t, y, x), or (t, x, y) where columns are stored one after the other.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # of floats that are none
+        mean = counts.mean(axis=0, dtype=np.float64)
+    if mean.size < _LEAST_PIXELS or not np.isfinite(mean).all():
+        return False
+    given, other = (
+        float(np.mean(np.diff(lines, axis=0) ** 2)) for lines in (mean, mean.reshape(mean.T.shape))
+    )
+    return given > _LEAST_AXES_GAIN * other
+
+
+NPY_SIGNATURE = b"\x93NUMPY"
+
+Axes = tuple[int, int, int]
+ROWS_TOGETHER, COLUMNS_TOGETHER, FRAMES_TOGETHER = (0, 1, 2), (0, 2, 1), (2, 1, 0)
+"""Which of the axes (t, y, x) is stored slowest, and which fastest: as C, MATLAB and Fortran do."""
+
+_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+
+
+class MappedFrames:
+    """Frames of a file that holds only numbers, after a header."""
+
+    metadata = StackMetadata()
+
+    def __init__(
+        self,
+        path: Path,
+        shape: tuple[int, ...],
+        stored: np.dtype[Any],
+        *,
+        offset: int,
+        axes: Axes = ROWS_TOGETHER,
+        member: bool = False,
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        if len(shape) != 3 or min(shape) < 1 or stored.kind not in "uif":
+            raise DataError(
+                f"{path}: needs to be frames (t, y, x) of integers or floats but is {stored} of "
+                f"shape {shape}; save the camera's counts, one frame after the other"
+            )
+        if shape[0] < 2 and not member:
+            raise DataError(
+                f"{path}: holds a single frame; a movie needs frames before and after a particle "
+                "binds"
+            )
+        self._path, self._data = path, map_file(path)
+        needed = offset + math.prod(shape) * stored.itemsize
+        if needed > len(self._data):
+            held = len(self._data)
+            self._data.close()
+            raise DataError(
+                f"{path}: is truncated ({shape[0]} frames of {shape[1]} x {shape[2]} {stored} need "
+                f"{needed} bytes, it has {held}); copy it again or export it again"
+            )
+        self.shape = (shape[0], shape[1], shape[2])
+        self.dtype: np.dtype[Any] = stored.newbyteorder("=")
+        self._stored, self._offset, self._axes = stored, offset, axes
+        self.notes = notes
+
+    def read(self, start: int, stop: int) -> NDArray[Any]:
+        """Read frames ``[start, stop)`` as a new array in native byte order [counts]."""
+        refuse_changed(self._path, self._data)
+        frames = as_frames(self._data, self.shape, self._stored, self._axes, self._offset)
+        block = np.array(frames[start:stop], dtype=self.dtype, order="C")
+        del frames
+        if self._axes[0] == 0:
+            release(self._data, self._begin(start), self._begin(stop))
+        return block
+
+    def in_place(self, start: int, stop: int) -> InPlace | None:
+        """View frames ``[start, stop)`` in the file; None if they have to be read."""
+        if self._axes != ROWS_TOGETHER:
+            return None
+        shape = (stop - start, *self.shape[1:])
+        return frames_in_place(self._path, self._data, self._begin(start), shape, self._stored)
+
+    def _begin(self, frame: int) -> int:
+        return self._offset + frame * math.prod(self.shape[1:]) * self._stored.itemsize
+
+    def close(self) -> None:
+        """Release the file."""
+        unmap(self._data)
+
+
+def open_npy(path: Path) -> MappedFrames:
+    """Open an array that NumPy saved."""
+    with open_regular(path) as file:
+        header = read_header(file, path)
+    return MappedFrames(path, *header[:2], offset=header.offset, axes=header.axes)
+
+
+class Header(NamedTuple):
+    """What comes before the numbers of an array that NumPy saved."""
+
+    shape: tuple[int, ...]
+    stored: np.dtype[Any]
+    axes: Axes
+    offset: int
+
+
+def read_header(file: IO[bytes], path: Path) -> Header:
+    """Read what comes before the numbers of an array, and not more."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of headers that Python 2 wrote, which are read
+            version = npy.read_magic(file)
+            shape, last_first, stored = _HEADERS[version](file)
+            offset = file.tell()
+    except (SyntaxError, tokenize.TokenError, *WHAT_LIBRARIES_RAISE) as error:
+        raise DataError(
+            f"{path}: begins like a NumPy array but is damaged ({first_line(error)}); save it again"
+        ) from None
+    return Header(shape, stored, FRAMES_TOGETHER if last_first else ROWS_TOGETHER, offset)
+
+
+def as_frames(
+    data: Any, shape: tuple[int, ...], stored: np.dtype[Any], axes: Axes, offset: int = 0
+) -> NDArray[Any]:
+    """Take bytes for frames (t, y, x)."""
+    lying = tuple(shape[axis] for axis in axes)
+    return np.ndarray(lying, stored, buffer=data, offset=offset).transpose(np.argsort(axes))
+
+
+def open_raw(path: Path, part: str) -> MappedFrames:
+    """Open a file that holds the counts and nothing else, but for a header that is passed over."""
+    example = f"{path}{MARK}1500x128x128,uint16"
+    found = layout(part)
+    if found is None:
+        raise DataError(
+            f"{path}{MARK}{part}: a file of plain numbers needs frames x rows x columns and their "
+            f"type, as in {example}; behind a header, and column by column: {example},header=344,"
+            "order=columns"
+        )
+    try:
+        stored = np.dtype(found.type_name)
+    except (TypeError, ValueError, SyntaxError):
+        raise DataError(
+            f"{path}{MARK}{part}: {found.type_name} is no type of numbers; write uint8, uint16, "
+            f"float32 or, for the larger byte first, >u2, as in {example}"
+        ) from None
+    size, frame = path.stat().st_size, found.rows * found.columns * stored.itemsize
+    held = size - found.header_bytes
+    number = found.frames or (max(held, 0) // frame if frame else 0)
+    if number * frame != held:
+        needs = f"{number * frame}" if found.frames else f"a multiple of {frame}"
+        behind = f" behind a header of {found.header_bytes}" if found.header_bytes else ""
+        remedy = "check the shape and the type"
+        spare = held - number * frame
+        if frame and number and spare > 0:
+            header = found._replace(header_bytes=found.header_bytes + spare)
+            remedy += (
+                f" or, if the file begins with a header of {header.header_bytes} bytes, write "
+                f'"{path}{MARK}{header}"'
+            )
+        raise DataError(f"{path}: has {size} bytes, but {part} needs {needs}{behind}; {remedy}")
+    shape, axes = (number, found.rows, found.columns), ROWS_TOGETHER
+    if found.by_columns:
+        axes = COLUMNS_TOGETHER
+    frames = MappedFrames(path, shape, stored, offset=found.header_bytes, axes=axes)
+    refuse_disorder(frames, found._replace(frames=number), path)
+    return frames
+
+
+def refuse_disorder(frames: MappedFrames, said: Layout, path: Path) -> None:
+    """Refuse numbers that are far smoother in another order than was said, and close them."""
+    counts = np.concatenate([frames.read(*pair) for pair in looked_at(frames.shape[0])])
+    cause = ""
+    if bytes_are_swapped(counts):
+        stored = np.dtype(said.type_name).newbyteorder("S")
+        right = said._replace(type_name=stored.str)
+        cause = (
+            "the bytes of its numbers are the other way round: pixels leap over the range of "
+            f"{frames.dtype} from one frame to the next, and do not as {stored.str}"
+        )
+    elif lines_are_exchanged(counts.transpose(0, 2, 1) if said.by_columns else counts):
+        right = said._replace(by_columns=not said.by_columns)
+        cause = (
+            f"its frames are not stored as {said.rows} rows of {said.columns}: neighbouring pixels "
+            "agree where columns and rows are exchanged"
+        )
+    if cause:
+        frames.close()
+        turned = right._replace(rows=said.columns, columns=said.rows, by_columns=said.by_columns)
+        other = f' or "{path}{MARK}{turned}"' if right.by_columns != said.by_columns else ""
+        raise DataError(f'{path}: {cause}; write "{path}{MARK}{right}"{other}')
+
+
+SUFFIXES = (".bin", ".raw")
+"""Of files that are looked at in this way."""
+
+_PART = re.compile(r"_\d{4,9}$", flags=re.ASCII)
+_SHAPE = re.compile(r"\(\s*(\d{1,9})\s*,\s*(\d{1,9})\s*\)", flags=re.ASCII)
+_NUMBER = re.compile(r"\d{1,12}", flags=re.ASCII)
+_NAME = re.compile(
+    r"_(\d{1,9})_(\d{1,9})_(\d{1,9})_(u?int(?:8|16|32)|float(?:32|64))(?:_|$)", flags=re.ASCII
+)
+
+
+def description_of(path: Path) -> Path | None:
+    """Find what describes a file of plain numbers."""
+    if path.suffix.lower() not in SUFFIXES:
+        return None
+    for stem in dict.fromkeys((path.stem, _PART.sub("", path.stem))):
+        for settings in _settings(stem, path):
+            if is_file(settings):
+                return settings
+    return path if _named(path) is not None else None
+
+
+def recorded_files(path: Path) -> tuple[Path, ...]:
+    """Give the files of a movie, its settings last."""
+    settings = description_of(path)
+    if settings is None or settings == path:
+        return (path,)
+    stem = _PART.sub("", path.stem)
+    if settings in _settings(path.stem, path):
+        return path, settings
+    parts = path.parent.glob(f"{glob.escape(stem)}_*{path.suffix}")
+    mine = (each for each in parts if _PART.fullmatch(each.stem.removeprefix(stem)))
+    return *sorted(mine, key=lambda each: (len(each.stem), each.stem)), settings
+
+
+def _settings(stem: str, path: Path) -> list[Path]:
+    """Name the settings that a recording of this name has."""
+    names = [f"{stem}_settings.dat", *(["settings.dat"] if stem == "frames" else [])]
+    return [path.with_name(name) for name in names]
+
+
+def open_recorded(path: Path) -> FileSet:
+    """Open a movie that `description_of` finds described."""
+    named = _named(path) if description_of(path) == path else None
+    if named is not None:
+        frames, rows, columns, stored = named
+        files: tuple[Path, ...] = (path,)
+        counts = {path: frames}
+    else:
+        files = recorded_files(path)
+        rows, columns, stored, counts = _counted(files[:-1], files[-1])
+    if sum(counts.values()) < 2:
+        raise DataError(
+            f"{path}: holds a single frame; a movie needs frames before and after a particle binds"
+        )
+    members = []
+    with ExitStack() as opened:
+        for each, count in counts.items():
+            if count:
+                shape = (count, rows, columns)
+                members.append(MappedFrames(each, shape, stored, offset=0, member=True))
+                opened.callback(members[-1].close)
+        if named is not None:
+            refuse_disorder(members[0], Layout(*named[:3], stored.str), path)
+        opened.pop_all()
+    where = [(m, image) for m, member in enumerate(members) for image in range(member.shape[0])]
+    return FileSet(members, files, np.array(where, dtype=np.int64), StackMetadata())
+
+
+def _counted(
+    files: tuple[Path, ...], settings: Path
+) -> tuple[int, int, np.dtype[Any], dict[Path, int]]:
+    """Read rows, columns and type, and how many frames each file holds; all of them are needed."""
+    values = _read(settings)
+    shape = _SHAPE.fullmatch(values.get("save/frame/shape", ""))
+    name = values.get("save/frame/dtype", "")
+    if shape is None or not name:
+        raise DataError(
+            f"{settings}: does not say save/frame/shape and save/frame/dtype, which are written "
+            "when a recording ends; wait until it does, or give the shape yourself, as in "
+            f'"{files[0].name}{MARK}1500x128x128,uint16"'
+        )
+    try:
+        stored = np.dtype(name)
+    except (TypeError, ValueError, SyntaxError):
+        raise DataError(f"{settings}: save/frame/dtype = {name} is no type of numbers") from None
+    rows, columns = int(shape[1]), int(shape[2])
+    frame = rows * columns * stored.itemsize
+    counts = {}
+    for file in files:
+        held = file.stat().st_size
+        if not frame or held % frame:
+            raise DataError(
+                f"{file}: has {held} bytes, but {settings.name} says {rows} x {columns} pixels of "
+                f"{stored}, so that it should be a multiple of {frame}; copy both again, or check "
+                "that they belong together"
+            )
+        counts[file] = held // frame
+    _refuse_incomplete(values, counts, settings)
+    return rows, columns, stored, counts
+
+
+def _refuse_incomplete(values: dict[str, str], counts: dict[Path, int], settings: Path) -> None:
+    """Compare the frames that are there with those that were saved."""
+    numbers = [int(match[0][1:]) for file in counts if (match := _PART.search(file.stem))]
+    if len(counts) > 1 and numbers != list(range(len(counts))):
+        lost = next(n for n in range(len(counts)) if n not in numbers)
+        raise DataError(f"{settings}: part {lost:04} of its movie is missing; copy it again")
+    saved, held = values.get("save/saved", ""), sum(counts.values())
+    added = values.get("save/append") == "True"  # to what another recording had left there
+    if _NUMBER.fullmatch(saved) and (held < int(saved) or (held > int(saved) and not added)):
+        raise DataError(
+            f"{settings}: says that {saved} frames were saved, but there are {held}; copy the "
+            "movie again, with all of its files"
+        )
+
+
+def _read(settings: Path) -> dict[str, str]:
+    """Read a text of keys and values."""
+    try:
+        text = read_text(settings, errors="replace")
+    except OSError as error:
+        raise DataError(f"{settings}: cannot be read ({error.strerror})") from None
+    pairs = (line.split("\t", 1) for line in text.splitlines() if "\t" in line)
+    return {key.strip(): value.strip() for key, value in pairs}
+
+
+def _named(path: Path) -> tuple[int, int, int, np.dtype[Any]] | None:
+    """Read shape and type out of a name, if the file is as long as that."""
+    match = _NAME.search(path.stem)
+    if match is None:
+        return None
+    frames, rows, columns = (int(match[k]) for k in (1, 2, 3))
+    stored = np.dtype(match[4]).newbyteorder("<")
+    try:
+        size = path.stat().st_size
+    except OSError:
+        return None
+    fits = frames * rows * columns * stored.itemsize == size > 0
+    return (frames, rows, columns, stored) if fits else None
