@@ -38,9 +38,10 @@ from iscat_analysis.study import (
 )
 from iscat_contest.compare import compare_estimators
 from iscat_contest.estimators import Estimator
+from iscat_contest.process import answer, job_of
 from iscat_contest.publish import bibtex
 from iscat_contest.scoring import ranking
-from iscat_contest.simple import Baselines
+from iscat_contest.simple import gauss_ls, peak
 
 PHOTONS = (100.0, 300.0, 1e3, 3e3, 1e4, 3e4)
 """Collected scattered photons of the first curve."""
@@ -105,8 +106,7 @@ def run_benchmark(
         stream = 100 * number
         found = run_trials(
             setting, trials, seed=seed, stream=stream, workers=threads,
-            baselines=None if mode == "size" else Baselines.calibrated(setting).measure,
-            advance=tally,
+            keep_counts=mode != "size", advance=tally,
         )  # fmt: skip
         lower, upper = _prior(setting)
         ranked = calibrate_posterior(
@@ -203,19 +203,29 @@ def _pull(trials: Trials, k: int) -> FloatArray:
     return pull
 
 
+def laboratory_estimates(setting: Setting, trials: Trials) -> dict[str, dict[str, FloatArray]]:
+    """Measure the counts that were kept as most laboratories do: Gaussian, and highest pixel."""
+    if trials.counts_e is None:
+        return {}
+    before, after = trials.counts_e
+    job = job_of(setting, before, after, trials.start)
+    return {"gaussian": answer(gauss_ls, job).columns, "peak": answer(peak, job).columns}
+
+
 def _parameters(setting: Setting, found: Trials, ranked: PosteriorRanks) -> dict[str, Any]:
     """Score every free parameter."""
     (crbs, qcrbs), kept = (setting.crb, setting.qcrb), found.usable
     error = found.estimate - found.truth
+    labs = laboratory_estimates(setting, found)
     out: dict[str, Any] = {}
     for i, (name, k) in enumerate(setting.scored.items()):
         crb, qcrb = float(crbs[k]), float(qcrbs[k])
         own = score(error[kept, k], found.sigma[kept, k], crb, qcrb)
         baselines = {}
-        for label, other in (("gaussian", found.gauss), ("peak", found.peak)):
-            if label == "peak" and name != "mass_kda":
+        for label, columns in labs.items():
+            if name not in columns or (label == "peak" and name != "mass_kda"):
                 continue  # the highest pixel gives a mass only, no position
-            miss = other[:, k] - found.truth[:, k]
+            miss = columns[name] - found.truth[:, k]
             finite = miss[np.isfinite(miss)]
             if finite.size >= MIN_TRIALS:
                 scored = score(miss, np.full(miss.size, np.nan), crb, qcrb)

@@ -31,11 +31,10 @@ from iscat_analysis.study import (
     recall_at,
     resamples,
     score_estimates,
-    setup_of,
     trial_generator,
 )
 from iscat_contest.estimators import Estimator
-from iscat_contest.process import Answer, Job, run_estimators
+from iscat_contest.process import Answer, Job, job_of, run_estimators
 
 RANGE_CRB = 5.0
 """Half-width of the truths' range, in bounds, as long as the following are not exceeded."""
@@ -117,11 +116,7 @@ def draw(
         before.append(counts.before_e)
         after.append(counts.after_e)
     limits = limits_of_alike(true.experiment_in_region, true.free, truths, level=true.level)
-    noiseless = setting.draw(setting.truth, None)
-    reference = np.stack([noiseless.before_e, noiseless.after_e])
-    setup = setup_of(setting, starts)
-    known = replace(setup, start=setting.truth[None].copy())
-    return Draws(Job(np.stack(before), np.stack(after), setup, reference, known), truths, limits)
+    return Draws(job_of(setting, np.stack(before), np.stack(after), starts), truths, limits)
 
 
 def compare_estimators(

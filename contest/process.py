@@ -22,7 +22,7 @@ import numpy as np
 from iscat_analysis.executors import Executor, LocalExecutor
 from iscat_analysis.reading import first_line
 from iscat_analysis.records import FloatArray, Progress, silent
-from iscat_analysis.study import EstimatorSetup
+from iscat_analysis.study import EstimatorSetup, Setting, setup_of
 from iscat_contest.estimators import Estimate, Estimator, checked_table
 
 _MEGABYTE = 2.0**20
@@ -41,6 +41,17 @@ class Job:
     setup: EstimatorSetup
     reference: FloatArray
     reference_setup: EstimatorSetup
+
+
+def job_of(setting: Setting, before: FloatArray, after: FloatArray, start: FloatArray) -> Job:
+    """Give an estimator counts, starts, and the noiseless image of the particle of a setting.
+
+    Shapes: `before, after` (n, y, x), `start` (n, 4) [nm, kDa].
+    """
+    noiseless = setting.draw(setting.truth, None)
+    reference = np.stack([noiseless.before_e, noiseless.after_e])
+    known = setup_of(setting, setting.truth[None].copy())
+    return Job(before, after, setup_of(setting, start), reference, known)
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,12 +32,11 @@ from iscat_analysis.study import (
     power_bound,
     resamples,
     score_estimates,
-    setup_of,
     trial_generator,
 )
 from iscat_contest.challenge import Challenge, manifest_sha256
 from iscat_contest.estimators import Estimator
-from iscat_contest.process import Answer, Job, run_estimators
+from iscat_contest.process import Answer, Job, job_of, run_estimators
 from iscat_contest.results import (
     Results,
     match_movie,
@@ -434,12 +433,8 @@ def _job(challenge: Challenge, parts: Sequence[str], events: pd.DataFrame) -> _C
     setting = make_setting(told, about["mode"])
     starts[:, 2:] = told.particle.nominal_height_nm, setting.truth[3]
     setting = replace(setting, truth=np.array([*setting.truth[:2], *starts[0, 2:]]))
-    noiseless = setting.draw(setting.truth, None)
     whole = np.flatnonzero(np.isfinite(sums).all(axis=(0, 2, 3)))
-    setup = setup_of(setting, starts[whole])
-    known = replace(setup, start=setting.truth[None].copy())
-    reference = np.stack([noiseless.before_e, noiseless.after_e])
-    job = Job(sums[0, whole], sums[1, whole], setup, reference, known)
+    job = job_of(setting, sums[0, whole], sums[1, whole], starts[whole])
     return _Cut(job, corners[whole] * pixel, whole, len(events), n_after)
 
 

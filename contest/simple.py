@@ -6,9 +6,7 @@ amplitudes become masses by one factor (see `estimators`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -18,13 +16,12 @@ from scipy.signal import fftconvolve
 
 from iscat_analysis.config import Optics
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
 from iscat_analysis.pieces import psf
 from iscat_analysis.pieces.counts import gather
 from iscat_analysis.pieces.setups import config_of
 from iscat_analysis.records import PARAMETERS, Candidate, FloatArray, Status
-from iscat_analysis.study import EstimatorSetup, Setting
+from iscat_analysis.study import EstimatorSetup
 
 REACH_PX = 3.0
 """A maximum is sought this far from the start [pixels]."""
@@ -361,64 +358,3 @@ def highest(
                 shift[k] = float((before - behind) / (2 * bend))
                 top -= float((before - behind) ** 2 / (8 * bend))
     return np.array([across + shift[0], down + shift[1], polarity * top])
-
-
-@dataclass(frozen=True)
-class Baselines:
-    """Two-dimensional Gaussian least squares, and the peak contrast; build it with `calibrated`."""
-
-    polarity: float
-    sigma_nm: float
-    half_px: int
-    kda_per_gauss: float = math.nan
-    kda_per_peak: float = math.nan
-
-    @classmethod
-    def calibrated(cls, setting: Setting) -> Baselines:
-        """Take the proportionality from the noiseless image."""
-        truth, pixel = setting.truth, setting.context.pixel_nm
-        likelihood = setting.likelihood(setting.draw(truth, None))
-        image = likelihood.measured_signal()
-        start = Candidate(truth[0] / pixel, truth[1] / pixel, truth[2], truth[3], 0.0)
-        optics = setting.config.optics
-        plain = cls(
-            polarity=float(np.sign(image.flat[np.nanargmax(np.abs(image))])) or 1.0,
-            sigma_nm=0.21 * optics.wavelength_nm / optics.na,
-            half_px=half_width(optics, pixel),
-        )
-        gauss, peak = plain._gauss(likelihood, start), plain._peak(likelihood, start)
-        return cls(
-            plain.polarity,
-            plain.sigma_nm,
-            plain.half_px,
-            truth[3] / gauss[3] if gauss[3] else math.nan,
-            truth[3] / peak[3] if peak[3] else math.nan,
-        )
-
-    def measure(self, likelihood: Likelihood, start: Candidate) -> tuple[FloatArray, FloatArray]:
-        """Run both on one region.
-
-        Shapes: `gauss, peak` (4,).
-        """
-        gauss, peak = self._gauss(likelihood, start), self._peak(likelihood, start)
-        gauss[3] *= self.kda_per_gauss
-        peak[3] *= self.kda_per_peak
-        return gauss, peak
-
-    def _gauss(self, likelihood: Likelihood, start: Candidate) -> FloatArray:
-        """Fit amplitude, centre, width and offset; NaN where it does not converge."""
-        grid, image = likelihood.grid, np.nan_to_num(likelihood.measured_signal())
-        pixel, origin = grid.pixel_nm, np.array([grid.x_nm[0], grid.y_nm[0]])
-        begin = np.array([start.x_px, start.y_px]) - origin / pixel
-        cut = around(image.shape, begin, self.half_px)
-        found = fit_gaussian(image[cut], cut, begin, self.sigma_nm / pixel, self.polarity)[0]
-        x, y = found[1:3] * pixel + origin
-        return np.array([x, y, math.nan, found[0]])
-
-    def _peak(self, likelihood: Likelihood, start: Candidate) -> FloatArray:
-        grid = likelihood.grid
-        pixel, origin = grid.pixel_nm, np.array([grid.x_nm[0], grid.y_nm[0]])
-        begin = np.array([start.x_px, start.y_px]) - origin / pixel
-        found = highest(likelihood.measured_signal(), begin, self.polarity, refined=False)
-        x, y = found[:2] * pixel + origin
-        return np.array([x, y, math.nan, found[2]])

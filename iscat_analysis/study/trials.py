@@ -15,14 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from iscat_analysis.inference.fit import fit_particle
-from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import compile_kernels, parts_of
-from iscat_analysis.records import BoolArray, Candidate, FitResult, FloatArray, Status
+from iscat_analysis.records import BoolArray, FitResult, FloatArray, Status
 from iscat_analysis.study.setting import Setting
 from iscat_analysis.threads import threads
-
-Baseline = Callable[[Likelihood, Candidate], tuple[FloatArray, FloatArray]]
-"""Measures two baselines, a Gaussian and the highest pixel, (4,) each, on the same counts."""
 
 CHUNK = 16
 """Trials that a thread takes at a time."""
@@ -30,7 +26,10 @@ CHUNK = 16
 
 @dataclass(frozen=True)
 class Trials:
-    """Estimates of repeated experiments: x, y, z and mass, or in mode `size` the diameter."""
+    """Estimates of repeated experiments: x, y, z and mass, or in mode `size` the diameter.
+
+    Shapes: `start` (n, 4) [nm, kDa]; `counts_e` (2, n, y, x) before and after, where kept.
+    """
 
     truth: FloatArray
     estimate: FloatArray
@@ -40,9 +39,9 @@ class Trials:
     p_value: FloatArray
     chi2_reduced: FloatArray
     gap: FloatArray
-    gauss: FloatArray
-    peak: FloatArray
     seconds: float
+    start: FloatArray
+    counts_e: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -86,7 +85,7 @@ def run_trials(
     workers: int = 1,
     chunk: int = CHUNK,
     truths: FloatArray | None = None,
-    baselines: Baseline | None = None,
+    keep_counts: bool = False,
     correct_bias: bool = True,
     advance: Callable[[int], None] | None = None,
 ) -> Trials:
@@ -96,7 +95,8 @@ def run_trials(
     """
     truth = np.tile(setting.truth, (count, 1)) if truths is None else np.array(truths, dtype=float)
     estimate, sigma = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
-    gauss, peak = np.full((count, 4), np.nan), np.full((count, 4), np.nan)
+    begin = np.empty((count, 4))
+    counts = np.empty((2, count, setting.pixels, setting.pixels)) if keep_counts else None
     p_value, chi2, gap = (np.full(count, np.nan) for _ in range(3))
     fits: list[FitResult | None] = [None] * count
     compile_kernels(setting.context.model, parts_of(setting.free, posteriors=False))
@@ -106,7 +106,8 @@ def run_trials(
         last = min(first + chunk, count)
         for i in range(first, last):
             random = trial_generator(seed, stream, i)
-            likelihood = setting.likelihood(setting.draw(truth[i], random))
+            windows = setting.draw(truth[i], random)
+            likelihood = setting.likelihood(windows)
             start = setting.start(truth[i], random)
             begun = time.thread_time()
             fit = fit_particle(
@@ -119,8 +120,10 @@ def run_trials(
             sigma[i] = fit.sigma
             p_value[i], chi2[i] = fit.p_value, fit.chi2_reduced
             gap[i] = fit.alternatives[0].log_likelihood_gap if fit.alternatives else math.inf
-            if baselines is not None:
-                gauss[i], peak[i] = baselines(likelihood, start)
+            place = np.array([start.x_px, start.y_px]) * setting.context.pixel_nm
+            begin[i] = *place, start.z_nm, start.mass_kda
+            if counts is not None:
+                counts[:, i] = windows.before_e, windows.after_e
         if advance is not None:
             advance(last - first)
         return spent
@@ -139,7 +142,7 @@ def run_trials(
         p_value=p_value,
         chi2_reduced=chi2,
         gap=gap,
-        gauss=gauss,
-        peak=peak,
         seconds=seconds,
+        start=begin,
+        counts_e=counts,
     )

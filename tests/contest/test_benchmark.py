@@ -14,7 +14,7 @@ from sketches import sketch_figures
 
 from iscat_analysis.errors import ConfigError, DataError
 from iscat_analysis.inference.prior import van_trees
-from iscat_analysis.records import FREE_PARAMETERS, Candidate
+from iscat_analysis.records import FREE_PARAMETERS
 from iscat_analysis.report.benchmark import BENCHMARK_NAMES, benchmark_figures, render_benchmark
 from iscat_analysis.study import (
     make_setting,
@@ -27,7 +27,8 @@ from iscat_analysis.study import (
     spread_interval,
 )
 from iscat_contest.benchmark import run_benchmark, write_benchmark
-from iscat_contest.simple import Baselines
+from iscat_contest.process import answer, job_of
+from iscat_contest.simple import gauss_ls, peak
 
 FIELDS = {
     "bias", "bias_se", "spread", "spread_ci95", "crb", "qcrb", "spread_over_crb",
@@ -217,14 +218,12 @@ def test_what_others_do_is_of_dipoles() -> None:
 
 def test_baselines_are_exact_without_noise() -> None:
     made = setting("iscat", "mass")
-    likelihood = made.likelihood(made.draw(made.truth, None))
-    baselines = Baselines.calibrated(made)
-    pixel = made.context.pixel_nm
-    start = Candidate(made.truth[0] / pixel, made.truth[1] / pixel, 5.0, made.truth[3], 0.0)
-    gauss, peak = baselines.measure(likelihood, start)
-    assert gauss[3] == pytest.approx(made.truth[3], rel=1e-6)
-    assert peak[3] == pytest.approx(made.truth[3], rel=1e-9)
-    assert np.hypot(*(gauss[:2] - made.truth[:2])) < 5.0
+    noiseless = made.draw(made.truth, None)
+    job = job_of(made, noiseless.before_e[None], noiseless.after_e[None], made.truth[None].copy())
+    gauss, highest = answer(gauss_ls, job).columns, answer(peak, job).columns
+    assert gauss["mass_kda"][0] == pytest.approx(made.truth[3], rel=1e-6)
+    assert highest["mass_kda"][0] == pytest.approx(made.truth[3], rel=1e-9)
+    assert math.hypot(gauss["x_nm"][0] - made.truth[0], gauss["y_nm"][0] - made.truth[1]) < 5.0
 
 
 # ---- the study and its files ---------------------------------------------------------------------
