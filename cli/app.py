@@ -7,7 +7,8 @@ import io
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Annotated, Any
 
@@ -15,62 +16,43 @@ import typer
 from typer.core import TyperCommand
 
 from iscat_cli import INTERRUPTED
-from iscat_cli.batch import EXAMPLE as BATCH_EXAMPLE
-from iscat_cli.batch import batch
-from iscat_cli.benchmark import EXAMPLE as BENCHMARK_EXAMPLE
-from iscat_cli.benchmark import benchmark
-from iscat_cli.bounds import EXAMPLE as BOUNDS_EXAMPLE
 from iscat_cli.bounds import bounds
-from iscat_cli.calibrate import CAMERA_EXAMPLE, MASS_EXAMPLE, OPTICS_EXAMPLE, camera, mass, optics
 from iscat_cli.calibrate import SUMMARY as CALIBRATE_SUMMARY
-from iscat_cli.challenge import MAKE_EXAMPLE, SCORE_EXAMPLE, make, score
-from iscat_cli.challenge import SUMMARY as CHALLENGE_SUMMARY
-from iscat_cli.config import EXAMPLE as CONFIG_EXAMPLE
-from iscat_cli.config import config
+from iscat_cli.calibrate import camera, mass, optics
 from iscat_cli.console import UNEXPECTED, Messages, silence
-from iscat_cli.export import EXAMPLE as EXPORT_EXAMPLE
-from iscat_cli.export import export
-from iscat_cli.fit import EXAMPLE as FIT_EXAMPLE
+from iscat_cli.day import batch, watch
 from iscat_cli.fit import fit
-from iscat_cli.init import EXAMPLE as INIT_EXAMPLE
-from iscat_cli.init import init
-from iscat_cli.kd import EXAMPLE as KD_EXAMPLE
 from iscat_cli.kd import kd
-from iscat_cli.serve import EXAMPLE as APP_EXAMPLE
-from iscat_cli.serve import app
-from iscat_cli.simulate import EXAMPLE as SIMULATE_EXAMPLE
-from iscat_cli.simulate import simulate
-from iscat_cli.species import EXAMPLE as SPECIES_EXAMPLE
+from iscat_cli.options import Command
+from iscat_cli.results import app, export, view
+from iscat_cli.setup import config, init
 from iscat_cli.species import species
-from iscat_cli.view import EXAMPLE as VIEW_EXAMPLE
-from iscat_cli.view import view
-from iscat_cli.watch import EXAMPLE as WATCH_EXAMPLE
-from iscat_cli.watch import watch
+from iscat_cli.study import SUMMARY as CHALLENGE_SUMMARY
+from iscat_cli.study import benchmark, make, score, simulate
 
-# To add a command: its own file with a function and an EXAMPLE, and one line here.
 COMMANDS = (
-    (init, INIT_EXAMPLE),
-    (fit, FIT_EXAMPLE),
-    (batch, BATCH_EXAMPLE),
-    (watch, WATCH_EXAMPLE),
-    (simulate, SIMULATE_EXAMPLE),
-    (bounds, BOUNDS_EXAMPLE),
-    (benchmark, BENCHMARK_EXAMPLE),
-    (species, SPECIES_EXAMPLE),
-    (kd, KD_EXAMPLE),
-    (export, EXPORT_EXAMPLE),
-    (view, VIEW_EXAMPLE),
-    (app, APP_EXAMPLE),
-    (config, CONFIG_EXAMPLE),
+    init,
+    fit,
+    batch,
+    watch,
+    simulate,
+    bounds,
+    benchmark,
+    species,
+    kd,
+    export,
+    view,
+    app,
+    config,
 )
-
-# A command with commands of its own: its name, what it is for, and they.
-_CALIBRATIONS = ((camera, CAMERA_EXAMPLE), (optics, OPTICS_EXAMPLE), (mass, MASS_EXAMPLE))
-_CHALLENGES = ((make, MAKE_EXAMPLE), (score, SCORE_EXAMPLE))
 GROUPS = (
-    ("calibrate", CALIBRATE_SUMMARY, _CALIBRATIONS),
-    ("challenge", CHALLENGE_SUMMARY, _CHALLENGES),
+    ("calibrate", CALIBRATE_SUMMARY, (camera, optics, mass)),
+    ("challenge", CHALLENGE_SUMMARY, (make, score)),
 )
+"""Commands with commands of their own: their name, what they are for, and these."""
+
+STRICT = "--strict"
+"""The option whose value may be left out."""
 
 
 def run(program: str, arguments: Sequence[str]) -> int:
@@ -78,8 +60,7 @@ def run(program: str, arguments: Sequence[str]) -> int:
     given = list(arguments)
     if program == "iscat-fit":
         app = _empty()
-        example = _as_written(FIT_EXAMPLE.replace("iscat fit", "iscat-fit"))
-        app.command(cls=Command, epilog=example)(fit)
+        _add(app, [replace(fit, example=fit.example.replace("iscat fit", "iscat-fit"))])
     else:
         app = _umbrella()
         if not given or (len(given) == 1 and given[0] in [name for name, _, _ in GROUPS]):
@@ -98,25 +79,24 @@ def _umbrella() -> typer.Typer:
     return app
 
 
-def _add(app: typer.Typer, commands: Sequence[tuple[Callable[..., None], str]]) -> None:
-    for command, example in commands:
-        summary = (command.__doc__ or "").partition("\n")[0]
-        told = _as_written(example)
-        app.command(cls=Command, epilog=told, short_help=summary)(command)
+def _add(app: typer.Typer, commands: Sequence[Command]) -> None:
+    for each in commands:
+        app.command(cls=Parsed, epilog=_as_written(each.example), short_help=each.summary)(each.run)
 
 
-class Command(TyperCommand):
-    """A command that refuses what is given twice and means one thing."""
+class Parsed(TyperCommand):
+    """A command that refuses an option that is given twice and means one thing."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the options, after a look at how often each is given."""
+        args = [f"{STRICT}=" if text == STRICT else text for text in args]
         if not ctx.resilient_parsing:  # of completion, which has half a command
             given, _, order = self.make_parser(ctx).parse_args(args=list(args))
             for option in order:
                 repeated = getattr(option, "multiple", True) or option.nargs != 1
                 if not repeated and order.count(option) > 1:
                     ctx.fail(f"{option.opts[0]} is given twice and means one thing; leave one out")
-            keys = [text.partition("=")[0].strip() for text in given.get("settings") or ()]
+            keys = [text.partition("=")[0].strip() for text in given.get("set_") or ()]
             for key in keys:
                 if keys.count(key) > 1:
                     ctx.fail(f"--set {key} is given twice and means one thing; leave one out")

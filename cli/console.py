@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from rich.progress import TaskID
     from rich.table import Table
 
+    from iscat_analysis.findings import Finding
     from iscat_analysis.records import Progress
 
 UNEXPECTED = 1
@@ -38,6 +39,9 @@ PLAIN_WIDTH = 200
 
 class _Console(Console):
     """Prints names of files and samples as text, whatever a terminal would make of them."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(highlight=False, markup=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Prepare a text, of which every cell of a table is one, to be printed."""
@@ -50,27 +54,59 @@ class Messages:
     """Progress, notes and errors of one command, on stderr.
 
     `quiet` drops progress and notes; errors are always shown, and begin with `name`.  `debug` adds
-    tracebacks.  `command` is the whole command line.
+    tracebacks, and `json` prints results as one JSON object.  `command` is the whole command line.
     """
 
     def __init__(
-        self, name: str, *, quiet: bool = False, debug: bool = False, command: str = ""
+        self,
+        name: str,
+        *,
+        quiet: bool = False,
+        debug: bool = False,
+        json: bool = False,
+        command: str = "",
     ) -> None:
         self.name = name
         self.quiet = quiet
         self.debug = debug
+        self.json = json
         self.command = command
         self.writing = False
-        self._terminal = _Console(stderr=True, highlight=False, markup=False, emoji=False)
+        self._terminal = _Console(stderr=True)
 
     def error(self, text: str) -> None:
         """Say in one line what went wrong, and what to do."""
         self._line(f"{self.name}: error: {_one_line(text)}")
 
-    def notify(self, text: str) -> None:
-        """Say something in one line, unless quiet."""
-        if not self.quiet:
-            self._line(f"{self.name}: {_one_line(text)}")
+    def note(self, *texts: str) -> None:
+        """Print notes, one line each, unless quiet; they name options as users write them."""
+        for text in () if self.quiet else texts:
+            self._line(f"{self.name}: {_one_line(with_options(text))}")
+
+    notify = note
+
+    def report(self, *findings: Finding | None) -> None:
+        """Print findings; what is None was not found."""
+        self.note(*(finding.text for finding in findings if finding is not None))
+
+    def wrote(self, folder: Path, page: str = "") -> None:
+        """Say which folder was written, and what to look at in it."""
+        self.note(f"wrote {folder}" + (f"; look at {folder / page}" if page else ""))
+
+    def show(
+        self, document: str, values: Mapping[str, Any], lines: Iterable[RenderableType]
+    ) -> None:
+        """Print a result on stdout, as lines and tables or as one JSON object.
+
+        `document` names the `iscat_analysis.schema` of `values`.
+        """
+        if self.json:
+            from iscat_analysis.schemas import to_json
+
+            _write(sys.stdout, to_json(document, values) + "\n")
+        else:
+            for line in lines:
+                print_result(line)
 
     def _line(self, text: str) -> None:
         if self._terminal.is_terminal:
@@ -159,7 +195,7 @@ class _Lines:
             if text == self._last_notice:  # a stage that is run again has said so already
                 return
             self._last_notice = text
-        self._messages.notify(text)
+        self._messages.note(text)
 
 
 def duration(seconds: float) -> str:
@@ -191,7 +227,7 @@ def failures(messages: Messages) -> Iterator[None]:
     ) -> None:
         del file, line  # always stderr, never the source
         where = f" ({category.__name__}, {Path(filename).name}:{lineno})" if debug else ""
-        messages.notify(f"warning: {message}{where}")
+        messages.note(f"warning: {message}{where}")
 
     with warnings.catch_warnings(), interrupts(messages) as watched:
         warnings.showwarning = show
@@ -291,29 +327,33 @@ def _verdict(error: Exception, *, debug: bool) -> tuple[str, int]:
 
 def print_result(result: RenderableType) -> None:
     """Print a result on stdout: in colour on a terminal, as plain text elsewhere."""
-    console = _Console(highlight=False, markup=False, emoji=False)
+    console = _Console()
     if not console.is_terminal:
-        console = _Console(
-            highlight=False, markup=False, emoji=False, width=PLAIN_WIDTH, no_color=True
-        )
+        console = _Console(width=PLAIN_WIDTH, no_color=True)
     with _failing_once(sys.stdout), console.capture() as captured:
         console.print(result, soft_wrap=isinstance(result, str))
     _write(sys.stdout, "".join(f"{line.rstrip()}\n" for line in captured.get().splitlines()))
 
 
-def table(title: str, *headings: str) -> Table:
-    """Begin a table: what its rows are about, then a right-aligned column for each heading.
+def table(*headings: str, rows: Iterable[Iterable[str]] = (), left: Container[int] = (0,)) -> Table:
+    """Make a table with a frame on a terminal, and plain elsewhere.
 
-    It has a frame on a terminal and is plain elsewhere.
+    Columns whose numbers are in `left` are aligned to the left.
     """
     from rich import box
     from rich.table import Table
 
     made = Table(box=box.SIMPLE_HEAD if Console().is_terminal else None, pad_edge=False)
-    made.add_column(title, no_wrap=True)
-    for heading in headings:
-        made.add_column(heading, justify="right", no_wrap=True)
+    for number, heading in enumerate(headings):
+        made.add_column(heading, justify="left" if number in left else "right", no_wrap=True)
+    for row in rows:
+        made.add_row(*row)
     return made
+
+
+def grouped(number: float) -> str:
+    """Write a whole number with its digits in groups of three."""
+    return f"{number:,.0f}".replace(",", " ")
 
 
 def short(value: float | None, digits: int = 4) -> str:
@@ -323,9 +363,7 @@ def short(value: float | None, digits: int = 4) -> str:
 
 def print_json(document: str, values: Mapping[str, Any]) -> None:
     """Print one JSON object on stdout; `document` names its `iscat_analysis.schema`."""
-    from iscat_analysis.schemas import to_json
-
-    _write(sys.stdout, to_json(document, values) + "\n")
+    Messages("", json=True).show(document, values, ())
 
 
 def _write(stream: TextIO | None, text: str) -> None:

@@ -1,28 +1,44 @@
-"""Options that several commands share."""
+"""How options are declared: once, beside what they mean, and in groups that commands share.
+
+A command is a function with a type and a default for each of its options, which its docstring
+lists under ``Options`` as a user writes them.  A parameter whose type is a frozen dataclass stands
+for all options of that group; the docstring of a command may describe one of them anew.  Names of
+options that Python reserves end with ``_`` here.
+"""
 
 from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable
-from enum import StrEnum
+import sys
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import typer
+from typer.models import ArgumentInfo, OptionInfo
 
-from iscat_cli.console import Messages
+from iscat_cli.console import Messages, failures
 
+if TYPE_CHECKING:
+    from iscat_analysis.config import Config
 
-class Mode(StrEnum):
-    """What is fitted; the same names as `iscat_analysis.config.Mode`."""
-
-    MASS = "mass"
-    LOCALIZE = "localize"
-    JOINT = "joint"
-    SIZE = "size"
-    TRACK = "track"
+Mode = Literal["mass", "localize", "joint", "size", "track"]
+Instrument = Literal["mass-photometer-445", "mass-photometer-525", "iscat", "cobri"]
+Count = Annotated[int | None, typer.Option(min=1)]
+Seed = Annotated[int | None, typer.Option(min=0)]
 
 
 def complete_setting(incomplete: str) -> list[str]:
@@ -38,44 +54,326 @@ def complete_setting(incomplete: str) -> list[str]:
     return [name for name in found if name.startswith(incomplete)]
 
 
-class Instrument(StrEnum):
-    """Named set-ups; the same names as `iscat_analysis.instruments`."""
+@dataclass(frozen=True)
+class Setup:
+    """The configuration of a command.
 
-    MASS_PHOTOMETER_445 = "mass-photometer-445"
-    MASS_PHOTOMETER_525 = "mass-photometer-525"
-    ISCAT = "iscat"
-    COBRI = "cobri"
+    Options
+    -------
+    --config C.toml
+        Configuration; `iscat config` prints one. Of several, keys of later ones win.
+    --set section.key=value
+        Change one key of the configuration, as in optics.na=1.42; may be repeated.
+    """
+
+    config: list[Path] | None = None
+    set_: Annotated[list[str] | None, typer.Option(autocompletion=complete_setting)] = None
+
+    @property
+    def changes(self) -> list[str]:
+        """Changes of the configuration, in their order: later ones win."""
+        return list(self.set_ or ())
+
+    def load(self) -> Config:
+        """Read the configuration."""
+        from iscat_analysis.config import load_config
+
+        return load_config(self.config, self.changes)
 
 
-InstrumentOption = Annotated[
-    Instrument | None,
-    typer.Option(
-        "--instrument",
-        metavar="NAME",
-        help="Optics, pixels and light of a published set-up in place of the defaults: "
-        f"{', '.join(Instrument)}.",
-    ),
-]
+@dataclass(frozen=True)
+class ModeSetup(Setup):
+    """The configuration, and what is fitted.
 
-ModeOption = Annotated[
-    Mode | None,
-    typer.Option(
-        "--mode",
-        metavar="MODE",
-        help="Free parameters: mass (x, y, mass), localize (x, y, z), joint (all four), "
-        "size (x, y, z, diameter of a sphere), "
-        "track (joint in every frame, linked).",
-    ),
-]
+    Options
+    -------
+    --mode MODE
+        Free parameters: mass (x, y, mass), localize (x, y, z), joint (all four), size (x, y, z,
+        diameter of a sphere), track (joint in every frame, linked).
+    """
 
-ConfigOption = Annotated[
-    list[Path] | None,
-    typer.Option(
-        "--config",
-        metavar="C.toml",
-        help="Configuration; `iscat config` prints one. Of several, keys of later ones win.",
-    ),
-]
+    mode: Mode | None = None
+
+    @property
+    def changes(self) -> list[str]:
+        """Changes of the configuration."""
+        return [*super().changes, *([f'fit.mode="{self.mode}"'] if self.mode else [])]
+
+
+@dataclass(frozen=True)
+class MovieSetup(Setup):
+    """The configuration and the mass line of movies, and where they are analysed.
+
+    Options
+    -------
+    --calibration LINE.toml
+        Mass line, as `iscat calibrate mass` writes it, in place of any other: masses are those of
+        the contrasts.
+    --workers N
+        Threads.
+    --scheduler threads|tcp://HOST:PORT
+        Where the work runs: in threads of this process, or on the workers of a Dask cluster.
+    --scheduler-file F
+        The file to which the scheduler of the cluster wrote its address.
+    """
+
+    calibration: Path | None = None
+    workers: Count = None
+    scheduler: str = "threads"
+    scheduler_file: Path | None = None
+
+    @property
+    def changes(self) -> list[str]:
+        """Changes of the configuration."""
+        return [*super().changes, *([f"compute.workers={self.workers}"] if self.workers else [])]
+
+    def of(self, movie: Path, messages: Messages) -> Config:
+        """Read the configuration of a movie: those given, else ``iscat.toml`` beside it."""
+        from iscat_analysis.calibration.line import with_line
+        from iscat_analysis.config import load_config
+        from iscat_analysis.movie import setup_beside
+        from iscat_analysis.reading import is_file
+
+        source: Path | list[Path] | None = self.config
+        beside = setup_beside(movie)
+        if not source and is_file(beside):
+            messages.notify(f"the configuration is {beside}, which lies beside the movie")
+            source = beside
+        return load_config(with_line(source, self.calibration), self.changes)
+
+
+@dataclass(frozen=True)
+class Printed:
+    """How results are printed.
+
+    Options
+    -------
+    --json
+        Print one JSON object instead of a table.
+    """
+
+    json: bool = False
+
+
+@dataclass(frozen=True)
+class Written(Printed):
+    """How results are written and printed.
+
+    Options
+    -------
+    --overwrite
+        Replace earlier output.
+    """
+
+    overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class Output(Written):
+    """Where results go.
+
+    Options
+    -------
+    --out DIR
+        Output folder.
+    """
+
+    out: Path | None = None
+
+    def beside(self, source: Path, ending: str) -> Path:
+        """Give the output folder; without ``--out`` its name is the source's with an ending."""
+        from iscat_analysis.movie import path_beside
+
+        return path_beside(source, ending) if self.out is None else self.out
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command of the umbrella."""
+
+    name: str
+    summary: str
+    example: str
+    run: Callable[..., None]
+
+
+@dataclass(frozen=True)
+class _Always:
+    """What every command takes.
+
+    Options
+    -------
+    --quiet
+        No progress and no messages; errors are still shown.
+    --debug
+        Show the traceback of an error.
+    """
+
+    quiet: bool = False
+    debug: bool = False
+
+
+def command(work: Callable[..., None]) -> Command:
+    """Make a command of a function, which may ask for `messages`, with the options of all."""
+    about, helps, example = _read(work.__doc__)
+    parameters = dict(inspect.signature(work, eval_str=True).parameters)
+    heard = parameters.pop("messages", None) is not None
+    own = parameters.values()
+    groups: dict[str, Any] = {
+        each.name: each.annotation for each in own if is_dataclass(each.annotation)
+    }
+    arguments = iter([name for name in helps if not name.startswith("--")])
+    for group in (*groups.values(), _Always):
+        for part in group.__mro__:
+            helps = _read(part.__doc__)[1] | helps
+
+    @wraps(work)
+    def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
+        told = Messages(
+            context.command_path,
+            quiet=quiet,
+            debug=debug,
+            command=context.obj,
+            json=given.get("json", False),
+        )
+        if len(configs := given.get("config") or ()) > 1:
+            first, *later = map(str, configs)
+            told.notify(f"the configuration is {first}, with the keys of {', then '.join(later)}")
+        for name, group in groups.items():
+            given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
+        with failures(told):
+            work(**given, **({"messages": told} if heard else {}))
+
+    by_name = inspect.Parameter.KEYWORD_ONLY
+    offered = [inspect.Parameter("context", by_name, annotation=typer.Context)]
+    for each in parameters.values():
+        offered += _members(each.annotation) if each.name in groups else [each]
+    described = [_described(each, helps, arguments) for each in (*offered, *_members(_Always))]
+    named = [each.replace(kind=by_name) for each in described]
+    vars(run)["__signature__"] = inspect.Signature(named)
+    run.__annotations__ = {each.name: each.annotation for each in described}
+    run.__doc__ = about
+    example = example or vars(sys.modules[work.__module__]).get("EXAMPLE", "")
+    return Command(work.__name__, about.partition("\n")[0], example, run)
+
+
+def _members(group: type) -> Iterator[inspect.Parameter]:
+    """Give the options of a group as parameters, those that it adds to others first."""
+    types = get_type_hints(group, include_extras=True)
+    for part in group.__mro__[:-1]:
+        for name in inspect.get_annotations(part):
+            yield inspect.Parameter(
+                name,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=getattr(group, name),
+                annotation=types[name],
+            )
+
+
+def _read(text: str | None) -> tuple[str, dict[str, tuple[str, str]], str]:
+    """Divide a docstring into what a command does, options by name, and the worked example.
+
+    An option has its heading and its help; an argument is named by its heading.
+    """
+    whole, mark, example = inspect.cleandoc(text or "").partition("\nExample: ")
+    about, _, listed = whole.partition("Options\n-------\n")
+    helps: dict[str, tuple[str, str]] = {}
+    name = ""
+    for line in filter(None, listed.splitlines()):
+        if not line.startswith(" "):
+            named = re.match(r"--[a-z-]+", line)
+            name = named[0] if named else line
+            helps[name] = line, ""
+        else:
+            heading, known = helps[name]
+            helps[name] = heading, f"{known} {line.strip()}".strip()
+    return about.strip(), helps, mark.lstrip("\n") + example
+
+
+def _described(
+    parameter: inspect.Parameter, helps: dict[str, tuple[str, str]], arguments: Iterator[str]
+) -> inspect.Parameter:
+    """Add to a parameter how a user writes it, and what it means."""
+    plain, *extras = [parameter.annotation]
+    if get_origin(plain) is Annotated:
+        plain, *extras = get_args(plain)
+    info: OptionInfo | ArgumentInfo
+    if plain is typer.Context or any(extra.help for extra in extras):
+        return parameter
+    if parameter.kind is not inspect.Parameter.KEYWORD_ONLY:
+        info, (metavar, about) = typer.Argument(), helps[next(arguments)]
+    else:
+        heading, about = helps[f"--{parameter.name.rstrip('_').replace('_', '-')}"]
+        names, metavar = re.fullmatch(r"([a-z/-]+) ?(.*)", heading).groups()  # type: ignore[union-attr]
+        info = copy(extras[0]) if extras else typer.Option()
+        info.param_decls = (names,)
+    info.metavar, info.help = metavar or None, about
+    return parameter.replace(annotation=Annotated[plain, info])
+
+
+T = TypeVar("T")
+
+
+def parsed(option: str, text: str | None, read: Callable[[str], T], form: str) -> T | None:
+    """Read the text of an option, None where it is not given; messages say how it is written."""
+    from iscat_analysis.errors import ConfigError
+
+    try:
+        return None if text is None else read(text)
+    except ValueError:
+        raise ConfigError(f"{option} {text}: {form}") from None
+
+
+def two_numbers(text: str, between: str = ":") -> tuple[int, int]:
+    """Read two whole numbers with a sign between them."""
+    found = re.fullmatch(rf"\s*(\d{{1,18}})\s*{between}\s*(\d{{1,18}})\s*", text, flags=re.ASCII)
+    if found is None:
+        raise ValueError(text)
+    return int(found[1]), int(found[2])
+
+
+def frame_range(option: str, text: str | None) -> tuple[int, int] | None:
+    """Read a half-open range of frames, ``"A:B"``."""
+
+    def read(text: str) -> tuple[int, int]:
+        first, last = two_numbers(text)
+        if first >= last:
+            raise ValueError(text)
+        return first, last
+
+    form = "write it as A:B, the first frame and the one after the last, as in"
+    return parsed(option, text, read, f"{form} {option} 0:200")
+
+
+def numbers(option: str, text: str | None, form: str = "masses in kDa as in {} 66,132") -> Any:
+    """Read ``66,132``."""
+    return parsed(
+        option,
+        text,
+        lambda text: [float(part) for part in text.split(",")],
+        f"write {form.format(option)}",
+    )
+
+
+def whole(option: str, text: str | None) -> Any:
+    """Read ``1,2,4``."""
+    return parsed(
+        option,
+        text,
+        lambda text: [int(part) for part in text.split(",")],
+        f"write whole numbers as in {option} 1,2,4",
+    )
+
+
+def pair(option: str, text: str | None) -> tuple[float | None, float | None]:
+    """Read ``40:8`` or ``40``; a number that is missing is None."""
+
+    def read(text: str) -> tuple[float, float | None]:
+        first, colon, second = text.partition(":")
+        return float(first), float(second) if colon else None
+
+    return parsed(option, text, read, f"write it as {option} 40 or {option} 40:8") or (None, None)
+
 
 CalibrationOption = Annotated[
     Path | None,
@@ -86,136 +384,7 @@ CalibrationOption = Annotated[
         "those of the contrasts.",
     ),
 ]
-
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="section.key=value",
-        help="Change one key of the configuration, as in optics.na=1.42; may be repeated.",
-        autocompletion=complete_setting,
-    ),
-]
-
-WorkersOption = Annotated[
-    int | None, typer.Option("--workers", min=1, metavar="N", help="Threads.")
-]
-
-SchedulerOption = Annotated[
-    str,
-    typer.Option(
-        "--scheduler",
-        metavar="threads|tcp://HOST:PORT",
-        help=(
-            "Where the work runs: in threads of this process, or on the workers of a Dask cluster."
-        ),
-    ),
-]
-
-SchedulerFileOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--scheduler-file",
-        metavar="F",
-        help="The file to which the scheduler of the cluster wrote its address.",
-    ),
-]
-
-EstimatorOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--estimator",
-        metavar="NAME|PACKAGE:FUNCTION",
-        help="One that `iscat benchmark --list` names, or a function; may be repeated.",
-    ),
-]
-
-TimeLimitOption = Annotated[
-    float, typer.Option("--time-limit", min=1.0, metavar="S", help="Of each estimator [s].")
-]
-
-ArchiveOption = Annotated[
-    Path | None,
-    typer.Option("--archive", metavar="OUT.zip", help="Pack the output, ready for a repository."),
-]
-
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace earlier output.")]
-
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object instead of a table.")
 ]
-
-QuietOption = Annotated[
-    bool, typer.Option("--quiet", help="No progress and no messages; errors are still shown.")
-]
-
-DebugOption = Annotated[bool, typer.Option("--debug", help="Show the traceback of an error.")]
-
-
-def command(work: Callable[..., None]) -> Callable[..., None]:
-    """Make a command of a function that is given `messages`, with the options of every command."""
-
-    @wraps(work)
-    def run(context: typer.Context, *, quiet: bool, debug: bool, **given: Any) -> None:
-        told = Messages(context.command_path, quiet=quiet, debug=debug, command=context.obj)
-        if len(configs := given.get("config") or ()) > 1:
-            first, *later = map(str, configs)
-            told.notify(f"the configuration is {first}, with the keys of {', then '.join(later)}")
-        work(told, **given)
-
-    _, *own = inspect.signature(work, eval_str=True).parameters.values()
-    only_named = inspect.Parameter.KEYWORD_ONLY
-    offered = (
-        inspect.Parameter("context", inspect.Parameter.POSITIONAL_ONLY, annotation=typer.Context),
-        *own,
-        inspect.Parameter("quiet", only_named, default=False, annotation=QuietOption),
-        inspect.Parameter("debug", only_named, default=False, annotation=DebugOption),
-    )
-    vars(run)["__signature__"] = inspect.Signature(offered)
-    run.__annotations__ = {each.name: each.annotation for each in offered}
-    return run
-
-
-def setup_of(
-    movie: Path, config: list[Path] | None, messages: Messages
-) -> Path | list[Path] | None:
-    """Give the configuration of a movie: those that are named, else ``iscat.toml`` beside it."""
-    from iscat_analysis.movie import setup_beside
-    from iscat_analysis.reading import is_file
-
-    beside = setup_beside(movie)
-    if config or not is_file(beside):
-        return config
-    messages.notify(f"the configuration is {beside}, which lies beside the movie")
-    return beside
-
-
-def frame_range(option: str, text: str) -> tuple[int, int]:
-    """Read a half-open range of frames, ``"A:B"``; messages name the option."""
-    from iscat_analysis.errors import ConfigError
-
-    match = re.fullmatch(r"\s*(\d+)\s*:\s*(\d+)\s*", text, flags=re.ASCII)
-    if match is None or int(match[1]) >= int(match[2]):
-        raise ConfigError(
-            f"{option} {text}: write it as A:B, the first frame and the one after the last, "
-            f"as in {option} 0:200"
-        )
-    return int(match[1]), int(match[2])
-
-
-def channel_of(text: str) -> tuple[int, int]:
-    """Read how many channels take turns, and which one is meant, ``"N:K"``."""
-    from iscat_analysis.errors import ConfigError
-
-    match = re.fullmatch(r"\s*(\d{1,4})\s*:\s*(\d{1,4})\s*", text, flags=re.ASCII)
-    if match is None:
-        raise ConfigError(
-            f"--channels {text}: write it as N:K, how many channels take turns and which one is "
-            "analysed, from 0, as in --channels 2:0"
-        )
-    return int(match[1]), int(match[2])
-
-
-def with_workers(settings: list[str] | None, workers: int | None) -> list[str]:
-    """Add the number of threads to changes of the configuration, last, so that they win."""
-    return [*(settings or ()), *([f"compute.workers={workers}"] if workers else [])]

@@ -71,6 +71,7 @@ def _write_reference() -> None:
     _write_commands()
     _write_schemas()
     _write_columns()
+    _write_findings()
 
 
 def _said(*arguments: str) -> str:
@@ -118,8 +119,8 @@ def _write_commands() -> None:
     from iscat_cli.app import COMMANDS, GROUPS
 
     os.environ["TERMINAL_WIDTH"] = os.environ["COLUMNS"] = "84"
-    names = [(command.__name__,) for command, _ in COMMANDS]
-    names += [(group, command.__name__) for group, _, inner in GROUPS for command, _ in inner]
+    names = [(command.name,) for command in COMMANDS]
+    names += [(group, command.name) for group, _, inner in GROUPS for command in inner]
     pages = [
         f"## iscat {' '.join(name)}\n\n```none\n{_said(*name, '--help')}```\n" for name in names
     ]
@@ -154,6 +155,17 @@ def _write_columns() -> None:
             absent = "; may be absent" if alike[0].optional else ""
             lines.append(f"| {names} | {meaning.format(units)}{absent} |")
         (GENERATED / f"{name}_columns.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _write_findings() -> None:
+    """Write the table of findings from their registry, the values of a sentence in braces."""
+    from iscat_analysis.findings import KINDS
+
+    lines = ["| code | severity | what is printed | what to do |", "|---|---|---|---|"]
+    for code, kind in sorted(KINDS.items()):
+        page = f" {{doc}}`/{kind.page}`" if kind.page else ""
+        lines.append(f"| `{code}` | {kind.severity} | {kind.sentence} | {kind.remedy}{page} |")
+    (GENERATED / "findings.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _run_pages() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from iscat_analysis.schemas import schema
 from iscat_cli import main
-from iscat_cli.benchmark import benchmark_table
+from iscat_cli.study import benchmark_table
 
 pytestmark = pytest.mark.usefixtures("sketched")
 

@@ -23,9 +23,10 @@ import pandas as pd
 import pytest
 from report_factory import summary_of
 
+from iscat_analysis.config import MODES, load_config
 from iscat_analysis.config import Mode as ConfigMode
-from iscat_analysis.config import load_config
 from iscat_analysis.errors import ConfigError, DataError
+from iscat_analysis.findings import KINDS, Finding, FindingKind, Severity
 from iscat_analysis.records import EVENT_COLUMNS, Status
 from iscat_cli import main, main_fit
 from iscat_cli.app import COMMANDS
@@ -43,12 +44,17 @@ def _row(event: int, status: str = "ok", flags: str = "") -> dict[str, Any]:
 
 
 def _analysis(
-    *rows: dict[str, Any], mode: str = "mass", mass_scale: str = "calibration"
+    *rows: dict[str, Any],
+    mode: str = "mass",
+    mass_scale: str = "calibration",
+    findings: tuple[Finding, ...] = (),
 ) -> SimpleNamespace:
     table = pd.DataFrame(list(rows), columns=list(EVENT_COLUMNS))
     summary = summary_of(table, mode, "iscat") | {"count": np.int64(len(rows))}
     summary["mass_scale"] = mass_scale
-    return SimpleNamespace(table=table, mode=mode, scheme="iscat", summary=summary, tracks=None)
+    return SimpleNamespace(
+        table=table, mode=mode, scheme="iscat", summary=summary, tracks=None, findings=findings
+    )
 
 
 @pytest.fixture
@@ -117,7 +123,7 @@ def test_without_options_the_configuration_decides(library) -> None:
 
 
 def test_modes_are_those_of_the_configuration() -> None:
-    assert [mode.value for mode in Mode] == list(get_args(ConfigMode))
+    assert get_args(Mode) == get_args(ConfigMode) == tuple(MODES)
 
 
 # ---- results ---------------------------------------------------------------------------------
@@ -251,6 +257,24 @@ def test_strict_exits_with_3_where_sigma_is_understated(library, understated, st
     library(_returning(analysis))
     assert main_fit(["movie.tif", "--strict"]) == status
     assert main_fit(["movie.tif"]) == 0
+
+
+def test_strict_with_codes_fails_on_these_findings_too(library, capsys, monkeypatch) -> None:
+    """Control: the same finding passes where other codes are given, or none."""
+    kinds = [FindingKind(f"test-{name}", Severity.NOTE, "{n} of them") for name in ("a", "b")]
+    for kind in kinds:
+        monkeypatch.setitem(KINDS, kind.code, kind)
+    library(_returning(_analysis(_row(0), findings=(kinds[0]({"n": 3}),))))
+    for codes, status in {"=test-a": 3, "=test-b,test-a": 3, "=test-b": 0, "": 0}.items():
+        assert main_fit(["movie.tif", f"--strict{codes}"]) == status
+    library(_returning(_analysis(_row(0, "poor_fit", "poor_fit"))))
+    assert main_fit(["movie.tif", "--strict=test-b"]) == 3
+    capsys.readouterr()
+    library(_raising(RuntimeError("must not be reached")))
+    assert main_fit(["movie.tif", "--strict=test-b,tset-a"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "--strict=tset-a: no finding has this code" in line
+    assert all(code in line for code in KINDS)
 
 
 @pytest.mark.parametrize(
@@ -395,7 +419,7 @@ def test_config_prints_a_file_that_reads_back(mode: str, more: list[str], capsys
 # ---- help ------------------------------------------------------------------------------------
 
 
-COMMAND_NAMES = [command.__name__ for command, _ in COMMANDS]
+COMMAND_NAMES = [command.name for command in COMMANDS]
 
 
 @pytest.mark.parametrize("command", COMMAND_NAMES)

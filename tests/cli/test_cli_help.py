@@ -32,11 +32,11 @@ from iscat_contest.challenge import make_challenge, parts_of_config
 PROGRAMS = {"iscat": main, "iscat-fit": main_fit}
 SHELLS = ["bash", "zsh", "fish"]
 
-NAMED = [((command.__name__,), example) for command, example in COMMANDS]
+NAMED = [((command.name,), command.example) for command in COMMANDS]
 NAMED += [
-    ((group, command.__name__), example)
+    ((group, command.name), command.example)
     for group, _, commands in GROUPS
-    for command, example in commands
+    for command in commands
 ]
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import tomllib
 from pathlib import Path
+from typing import get_args
 
 import jsonschema
 import numpy as np
@@ -19,7 +20,7 @@ from iscat_analysis.movie import open_stack
 from iscat_analysis.pipeline.setup import SAMPLES
 from iscat_analysis.schemas import schema
 from iscat_cli import main, main_fit
-from iscat_cli.init import Sample
+from iscat_cli.setup import Sample
 
 GAIN = 4.0
 FRAMES, SIDE = 300, 64
@@ -209,7 +210,7 @@ def test_particles_that_move_are_told_from_those_that_land(
 
 
 def test_the_kinds_of_samples_are_kinds_of_particles() -> None:
-    assert tuple(Sample) == SAMPLES
+    assert get_args(Sample) == SAMPLES
     for kind in SAMPLES:
         assert Particle(kind=kind).kind == kind
 

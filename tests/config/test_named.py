@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ LANDED = {
     "simulation.shape": [72, 72],
     "simulation.events": [{"frame": 100, "x_px": 35.3, "y_px": 36.1, "mass_kda": 480.0}],
 }
-NAMES = tuple(Instrument)
+NAMES = get_args(Instrument)
 
 
 def _snr(config: ia.Config) -> float:

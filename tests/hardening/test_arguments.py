@@ -148,7 +148,7 @@ OPTIONS = [
 ]  # fmt: skip
 ARGUMENTS = st.lists(
     st.one_of(
-        st.sampled_from([command.__name__ for command, _ in COMMANDS if callable(command)]),
+        st.sampled_from([command.name for command in COMMANDS]),
         st.sampled_from(OPTIONS),
         st.text(st.characters(exclude_characters="\0"), max_size=8),
         st.binary(max_size=4).map(lambda raw: os.fsdecode(raw.replace(b"\0", b""))),
