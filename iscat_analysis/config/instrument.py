@@ -195,6 +195,15 @@ class Optics(FieldTerms):
         """Sign of the incident light's direction along the axis of the collected light."""
         return self.kind.direction
 
+    @property
+    def are_learned(self) -> bool:
+        """Whether they were learned from the images that are analysed, now or in an earlier run.
+
+        Such optics have errors, come from no file, and are not learned again.  Those of a file or
+        of a calibrant of the day were learned from other particles.
+        """
+        return self.covariance is not None and self.file is None and self.calibrate == "never"
+
     @model_validator(mode="before")
     @classmethod
     def _emission_of_the_convention(cls, values: Any) -> Any:

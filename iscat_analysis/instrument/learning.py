@@ -63,7 +63,7 @@ from iscat_analysis.optics.parameters import (
     prior_of,
     settings_of,
 )
-from iscat_analysis.records import Progress, Windows, silent
+from iscat_analysis.records import FloatArray, Progress, Windows, silent
 from iscat_analysis.search.frames import measure_frames, well_lit
 from iscat_analysis.threads import threads
 from iscat_analysis.units import count
@@ -156,8 +156,12 @@ class Tested:
     @property
     def summary(self) -> dict[str, Any]:
         """Describe the test in the summary."""
-        said: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
-        return said if self.together is None else said | _doubted(self.together)
+        test: dict[str, Any] = {"tested": self.particles, "median_p": self.median_p}
+        if (one := self.together) is None:
+            return test
+        errors = _with_errors(one.names, one.values, one.posterior, one.field_px)
+        evidence = {"log_bayes_factor": one.log_bayes_factor, "left_over": one.left_over}
+        return test | evidence | errors
 
 
 def _are_rejected(median: float | None, together: ScoreTest | None) -> bool:
@@ -166,12 +170,18 @@ def _are_rejected(median: float | None, together: ScoreTest | None) -> bool:
     return poor or (together is not None and together.rejected)
 
 
-def _doubted(together: ScoreTest) -> dict[str, Any]:
-    """Describe the doubt about optics that are not learned in the summary."""
+def _with_errors(
+    names: Sequence[str],
+    values: Sequence[float],
+    covariance: FloatArray,
+    field_px: tuple[float, float, float] | None,
+) -> dict[str, Any]:
+    """Describe the optics of an analysis, tested or learned, as parameters with errors."""
     return {
-        "log_bayes_factor": together.log_bayes_factor,
-        "left_over": together.left_over,
-        "doubt": together.doubt.model_dump() | {"field_px": together.field_px},
+        "names": list(names),
+        "values": list(values),
+        "covariance": covariance.tolist(),
+        "field_px": None if field_px is None else list(field_px),
     }
 
 
@@ -280,7 +290,9 @@ def adopted(
     warn(f"optics learned from the movie, instead of the configured ones: {headline}")
     for note in found.notes:
         warn(note)
-    return learned, {**tested, **_told(found), "calibrated": True}
+    values = [found.value(name) for name in found.names]
+    errors = _with_errors(found.names, values, found.covariance, learned.optics.field_px)
+    return learned, {**tested, **_told(found), **errors, "calibrated": True}
 
 
 def _turned(config: Config) -> str:
@@ -400,7 +412,4 @@ def _verdict(tested: Tested | None) -> str:
 def _told(found: OpticsCalibration) -> dict[str, Any]:
     """Give what the summary says of a calibration."""
     told = found.to_dict()
-    return {
-        key: told[key]
-        for key in ("accepted", "refusals", "parameters", "names", "covariance", "twin", "notes")
-    }
+    return {key: told[key] for key in ("accepted", "refusals", "parameters", "twin", "notes")}

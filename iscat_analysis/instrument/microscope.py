@@ -97,7 +97,7 @@ def with_sign(config: Config) -> tuple[Config | None, str]:
     phase = config.optics.reference_phase_deg
     reason = ""
     for turned in (phase, (phase + 360) % 360 - 180):
-        update = {"reference_phase_deg": turned, "calibrate": "never"}
+        update = {"reference_phase_deg": turned, "calibrate": "never", "file": None}
         learned = config.model_copy(update={"optics": config.optics.model_copy(update=update)})
         try:
             forward_model(learned, 1000.0)

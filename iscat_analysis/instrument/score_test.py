@@ -26,7 +26,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from iscat_analysis.config import OpticsCovariance
 from iscat_analysis.instrument.joint_fit import asked_changes, excess
 from iscat_analysis.instrument.measure import TWIN_GAP
 from iscat_analysis.instrument.particle_image import Build, ParticleImage
@@ -44,6 +43,9 @@ class ScoreTest:
     """
 
     names: tuple[str, ...]
+    values: tuple[float, ...]
+    """As configured."""
+
     change: FloatArray
     covariance: FloatArray
     log_bayes_factor: float
@@ -62,11 +64,10 @@ class ScoreTest:
         return self.log_bayes_factor > TWIN_GAP and self.left_over > REJECTED_SHARE
 
     @property
-    def doubt(self) -> OpticsCovariance:
-        """Errors that the configured optics may still have after the test."""
+    def posterior(self) -> FloatArray:
+        """Covariance of errors that the configured optics may have after the test, (n, n)."""
         off = float(expit(self.log_bayes_factor))
-        matrix = self.covariance + off * np.outer(self.change, self.change)
-        return OpticsCovariance(names=self.names, matrix=tuple(map(tuple, matrix.tolist())))
+        return np.asarray(self.covariance + off * np.outer(self.change, self.change))
 
 
 def score_test(
@@ -115,7 +116,9 @@ def score_test(
     power = math.fsum(image.snr**2 for image in images)
     explained = float(expit(gain)) * explains[np.argmax(gains)]
     left_over = math.sqrt(explained / power) if power else 0.0
-    return ScoreTest(names, usual * change, spread * np.outer(usual, usual), gain, left_over)
+    values = tuple(float(settings.get(name, 0.0)) for name in names)
+    covariance = spread * np.outer(usual, usual)
+    return ScoreTest(names, values, usual * change, covariance, gain, left_over)
 
 
 def _alternative(information: FloatArray, asks: FloatArray) -> tuple[float, float]:

@@ -284,7 +284,9 @@ class _Wishes:
         size, errors = step[len(self.shared) :], covariance[len(self.shared) :, len(self.shared) :]
         if not np.all(np.diag(errors) > 0):
             return size, 0.0
-        return size, float(size @ np.linalg.solve(errors, size))
+        unit = 1 / np.sqrt(np.diag(errors))  # where all pictures have one place errors are singular
+        inverse = np.linalg.pinv(errors * np.outer(unit, unit), hermitian=True)
+        return size, float((size * unit) @ inverse @ (size * unit))
 
     def _change(
         self, kind: str, names: tuple[str, ...], slopes: FloatArray, trials: int = 1

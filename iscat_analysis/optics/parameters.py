@@ -228,7 +228,7 @@ class Prior:
 
     def errors(self, names: Sequence[str]) -> FloatArray:
         """Give the standard deviations of parameters, shape (n,)."""
-        usual = {name: PARAMETERS[name].usual_error for name in names}
+        usual = {name: PARAMETERS.get(name, _EVEN).usual_error for name in names}
         if not self.middle["mask_na"]:
             usual |= {name: sigma for name, (_, sigma) in _SOME_MASK.items()}
         elif "attenuation" in usual:

@@ -89,14 +89,13 @@ def reported_rows(
 ) -> ReportedRows:
     """Make the rows of all events of a movie, `optics` and `camera` as the summary has them."""
     fits, config, mode = found.fits, found.context.config, found.context.mode
-    learned = bool(optics.get("calibrated"))
     achieved = measure_spread(mode, fits, found.repeats, found.empty) if found.repeats else {}
     evidence, heights, extension = None, None, None
     if found.evidence is not None and len(found.evidence):
         evidence = Evidence(*found.evidence.T)
-        heights = Heights.of(config, fits, evidence, learned_optics=learned)
+        heights = Heights.of(config, fits, evidence)
         if heights is None or not heights.are_wrong:  # which would look like widths
-            extension = Extension.of(config, fits, evidence, achieved, learned_optics=learned)
+            extension = Extension.of(config, fits, evidence, achieved)
     if extension is not None and config.fit.pairs:
         paired = told_as_pairs(fits, extension)
         fits, extension = with_masses_of_pairs(fits, paired), extension.without(paired)
@@ -138,9 +137,8 @@ def reported_rows(
     if mode != "track" or not optics:  # the optics were not tested
         unfit = misfit_error(fits, found.context.roi_px**2)
     threshold = 0.0 if mode == "track" else found.context.templates.threshold
-    doubt = None if learned else optics.get("doubt")
     shared = contributions(
-        config, fits, unfit, found.context.model.scale, shifts, camera, threshold, doubt
+        config, fits, unfit, found.context.model.scale, shifts, camera, threshold, optics
     )
     columns |= {f"systematic_{name}": error for name, error in total(shared, len(fits)).items()}
     if found.repeats:

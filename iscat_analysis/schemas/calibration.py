@@ -237,16 +237,6 @@ class Optics(Document):
     out: str = maybe("The folder that was written; not in the file")
 
 
-class Doubt(Closed):
-    """Errors of optics that were not learned."""
-
-    names: list[str] = key("Parameters, in the order of matrix")
-    matrix: list[list[float]] = key("Their covariance")
-    field_px: list[float] | None = key(
-        "Centre x, y and half the longer side of the field of its terms [pixels]; null without any"
-    )
-
-
 class Learned(Closed):
     """The test of the optics by ``optics.calibrate``, and the learned optics."""
 
@@ -257,7 +247,6 @@ class Learned(Closed):
         "What the configured optics leave over of the images, beyond the noise, over the images "
         "(root mean square)"
     )
-    doubt: Doubt | None = maybe("Errors that the configured optics may have")
     left_over_then: Number = maybe(
         "The same with learned optics that are used although images that were held out reject them"
     )
@@ -266,7 +255,13 @@ class Learned(Closed):
     accepted: bool = maybe("Whether the learned optics could be used")
     refusals: list[str] = maybe("Why not, one line each")
     parameters: list[OpticsParameter] = maybe("Every parameter")
-    names: list[str] = maybe("Measured parameters, in the order of covariance")
-    covariance: list[list[float]] = maybe("Of the measured parameters")
+    names: list[str] = maybe("Parameters that images may tell, in the order of covariance")
+    values: list[float] = maybe("Of the optics of the analysis, learned or as configured")
+    covariance: list[list[float]] = maybe(
+        "Of their errors, by images and by what is known without them"
+    )
+    field_px: list[float] | None = maybe(
+        "Centre x, y and half the longer side of the field of its terms [pixels]; null without any"
+    )
     twin: Twin | None = maybe("Second optics that are as likely")
     notes: list[str] = maybe("What the user should know, one line each")

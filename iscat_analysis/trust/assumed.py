@@ -138,19 +138,13 @@ def _shift(
     Of a particle of a mass; without one, of a faint particle, as standards are.  The `index` of a
     sphere may be free.
     """
-    respond = _response(config, table)
+    respond = response_of(config, table)
     amplitude = respond.faint_amplitude
     if mass_kda is not None:
         scale = forward_model(config, respond.model.reach_nm).scale
         amplitude = float(scale.amplitudes(mass_kda))
     change = _change(key, config, respond, amplitude, sigma)
     return respond.to_input(change, amplitude, index=index).amplitude
-
-
-def _response(config: Config, table: pd.DataFrame) -> Response:
-    errors = config.optics.covariance
-    names = errors.of_the_middle.names if errors is not None else ()
-    return response_of(config, table, names)
 
 
 def _change(
@@ -186,7 +180,7 @@ def _peak_shift(key: str, config: Config, table: pd.DataFrame, sigma: float) -> 
     shift = 0.0
     if key != "magnification":
         shift = (peak(1.0) - peak(-1.0)) / (2 * _STEP) / peak(0.0)
-    respond = _response(config, table)
+    respond = response_of(config, table)
     if respond.names:
         faint = respond.faint_amplitude
         change = _change(key, config, respond, faint, sigma)

@@ -99,8 +99,6 @@ class Extension:
         table: pd.DataFrame,
         evidence: Evidence,
         in_time: Mapping[str, EmpiricalSpread],
-        *,
-        learned_optics: bool = False,
     ) -> Extension | None:
         """Estimate the extension from all rows, beyond a known wiggle; None without evidence."""
         q, se = evidence.spread_nm2, evidence.sigma_spread_nm2
@@ -108,7 +106,9 @@ class Extension:
         many = has_only(table, _JUDGED) & known
         if not many.any():
             return None
-        left, per_mass = _beside_learned_optics(config, table) if learned_optics else (1.0, None)
+        left, per_mass = 1.0, None
+        if config.optics.are_learned:
+            left, per_mass = _beside_learned_optics(config, table)
         mean, error = _mean(q[many], se[many])
         mean, error = mean / left, error / left
         length = _Length.of(*(part[many] for part in evidence[7:10]))
@@ -227,12 +227,9 @@ def _normal(mean: float, error: float) -> LogLikelihood:
     return lambda v: -0.5 * ((v - mean) / error) ** 2
 
 
-def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float | None]:
+def _beside_learned_optics(config: Config, table: pd.DataFrame) -> tuple[float, float]:
     """Share of a width that learned optics do not imitate, and the mass lost per variance."""
-    errors = config.optics.covariance
-    if errors is None:
-        return 1.0, None
-    respond = response_of(config, table, errors.of_the_middle.names)
+    respond = response_of(config, table)
     scale = forward_model(config, respond.model.reach_nm).scale
     shifts = respond.to_width(float(scale.amplitudes(float(table["mass_kda"].abs().median()))))
     return max(shifts.left, _LEAST_LEFT), abs(shifts.amplitude)

@@ -30,9 +30,7 @@ class Heights:
     learned_optics: bool
 
     @classmethod
-    def of(
-        cls, config: Config, table: pd.DataFrame, evidence: Evidence, *, learned_optics: bool
-    ) -> Heights | None:
+    def of(cls, config: Config, table: pd.DataFrame, evidence: Evidence) -> Heights | None:
         """Estimate the heights from all rows; None where there are too few."""
         held = not has_prior(config)
         kinds = _DESCRIBED if held else frozenset({Status.OK.value})
@@ -44,7 +42,7 @@ class Heights:
         if held and spread.is_spread:
             off = math.hypot(spread.sd_nm, spread.mean_nm - config.particle.nominal_height_nm)
             shift = np.abs(np.nan_to_num(evidence.mass_per_z)) * off
-        return cls(spread, held, shift, learned_optics)
+        return cls(spread, held, shift, config.optics.are_learned)
 
     @property
     def are_wrong(self) -> bool:

@@ -9,14 +9,16 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from scipy.optimize import brentq
 
 from iscat_analysis.bounds import eliminated, imitation, joint_information, peak_gradient
-from iscat_analysis.config import ABERRATIONS, Config, Optics
+from iscat_analysis.config import ABERRATIONS, Config, Optics, OpticsCovariance
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.likelihood import Likelihood
 from iscat_analysis.inference.noise import asimov_conditional, asimov_poisson
 from iscat_analysis.inference.sizes import slopes_with_index
 from iscat_analysis.optics.forward import ForwardModel, PixelGrid, forward_model, peak_per_amplitude
+from iscat_analysis.optics.parameters import prior_of
 from iscat_analysis.optics.sized import SizedModel
 from iscat_analysis.records import FREE_PARAMETERS, PARAMETERS, FloatArray
 
@@ -27,7 +29,7 @@ _AMPLITUDES = 4  # at which the response to the optics is computed, for the span
 _HEIGHTS_PER_FRINGE = 10  # between them it is interpolated
 _FAINT = 1e-6  # peak contrast of a particle whose scattered light alone is nothing
 _XX, _YY = 5, 7  # rows of second derivatives
-_UNDETERMINED = 1e-7  # of the information, below which pictures do not tell a parameter
+_KNOWN = 1e-12  # of the prior's variance, below which an error is none
 
 
 class Shifts(NamedTuple):
@@ -59,6 +61,8 @@ class Response:
     level: bool
     frames: tuple[int, int]
     contrast: bool
+    prior: FloatArray  # (k,), standard deviations of the parameters before images were seen
+    posterior: FloatArray  # (k, k), covariance of learned parameters, 0 of known ones
 
     def expected(self, theta: FloatArray) -> Likelihood:
         """Likelihood of the expected counts of a particle.
@@ -120,10 +124,11 @@ class Response:
         return _FAINT / peak_per_amplitude(self.model)
 
     def to_input(self, derivative: FloatArray, amplitude: float, *, index: bool = False) -> Shifts:
-        """Shift of ln a and of the optics where pictures differ by a derivative from the model.
+        """Shift of ln a and of the optics where images differ by a derivative from the model.
 
-        Parameters of the optics that were learned from such pictures imitate the difference as far
-        as they can, and the particle the rest, with the index of a sphere if that is free.
+        Parameters of the optics that were learned from such images imitate the difference as far
+        as images and prior let them, and the particle the rest, with the index of a sphere if it
+        is free.
 
         Shapes: `derivative` (ny, nx).
         """
@@ -136,15 +141,37 @@ class Response:
         chosen = np.concatenate([shared, np.arange(1, len(others)), all_others + self._kept])
         whole = whole[np.ix_(chosen, chosen)]
         information = eliminated(whole, count)
-        size = np.sqrt(np.maximum(np.diag(information)[1:], 1e-300))
-        inverse = np.linalg.pinv(
-            information[1:, 1:] / np.outer(size, size), rcond=_UNDETERMINED, hermitian=True
-        )
-        optics = (inverse @ (information[1:, 0] / size)) / size
+        optics = self._learned(information[1:, 1:], information[1:, 0])
         moved = imitation(whole, count)
         row = len(further) + self._row_of_mass
         left = 1 - float(information[0, 1:] @ optics) / float(information[0, 0])
         return Shifts(float(moved[row, 1:] @ optics - moved[row, 0]) / amplitude, optics, left)
+
+    def _learned(self, information: FloatArray, wrong: FloatArray) -> FloatArray:
+        """Change of learned optics where images of particles are wrong in the same way.
+
+        With N the information of one image about the optics, i what it has in common with the
+        difference, and P the prior's covariance, images of m particles change the optics by
+        (m N + P⁻¹)⁻¹ m i.  The errors C that the optics were learned with tell how many there
+        were: det(1 + m P N) = det P / det C.
+
+        Shapes: `information` (k, k), `wrong` (k,), result (k,).
+        """
+        both = np.outer(self.prior, self.prior)
+        left = np.clip(np.linalg.eigvalsh(self.posterior / both), _KNOWN, 1.0)
+        gained = -float(np.log(left).sum())
+        values, vectors = np.linalg.eigh(information * both)
+        values = np.maximum(values, 0.0)
+        if gained <= 0 or not values.any():
+            return np.zeros(wrong.size)
+
+        def beyond(log_number: float) -> float:
+            return float(np.log1p(np.exp(log_number) * values).sum()) - gained
+
+        least, most = np.log(gained / values.sum()), gained - np.log(values.max())
+        number = np.exp(brentq(beyond, least, most))
+        asked = vectors.T @ (self.prior * wrong)
+        return np.asarray(self.prior * (vectors @ (number * asked / (1 + number * values))))
 
     def to_width(self, amplitude: float) -> Shifts:
         """Shifts per variance of the places of a particle along each axis [1/nm²]."""
@@ -171,22 +198,36 @@ class Response:
 
 
 def response_of(
-    config: Config, table: pd.DataFrame, names: Sequence[str], *, contrast: bool = False
+    config: Config,
+    table: pd.DataFrame,
+    names: Sequence[str] | None = None,
+    *,
+    contrast: bool = False,
 ) -> Response:
-    """Give the response of the particles of a movie, of as many frames as its events have."""
+    """Give the response of the particles of a movie, of as many frames as its events have.
+
+    It is to errors of the named parameters, or of those of the middle of the field that were
+    learned.
+    """
     pixel = config.camera.pixel_size_nm
     if pixel is None:
         raise ConfigError("camera.pixel_size_nm is needed")
     grid = PixelGrid.centred(config.fit.roi_px(pixel), pixel)
     bare = config.model_copy(update={"calibration": None})
+    errors = config.optics.covariance or OpticsCovariance(names=(), matrix=())
+    learned = errors.of_the_middle
+    names = learned.names if names is None else tuple(names)
+    matrix = learned.matrix if names == learned.names else np.zeros((len(names), len(names)))
     return Response(
         forward_model(bare, 1.05 * grid.diagonal_nm / 2),
         grid,
-        tuple(names),
+        names,
         tuple(name in FREE_PARAMETERS[config.fit.mode] for name in PARAMETERS),
         level=config.background.method == "sliding",
         frames=(int(table["n_before"].median()), int(table["n_after"].median())),
         contrast=contrast,
+        prior=prior_of(config).errors(names),
+        posterior=np.array(matrix).reshape(len(names), len(names)),
     )
 
 

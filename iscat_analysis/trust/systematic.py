@@ -128,12 +128,11 @@ def contributions(
     held_kda: Mapping[str, FloatArray] = MappingProxyType({}),
     camera: Mapping[str, Any] | None = None,
     threshold_snr: float = 0.0,
-    doubt: Mapping[str, Any] | None = None,
+    optics: Mapping[str, Any] = MappingProxyType({}),
 ) -> list[Contribution]:
     """Give what each source makes of the events of a movie, where it makes anything of them.
 
-    `camera` is the section of ``summary.json``, `threshold_snr` that of the search, and `doubt` the
-    errors that configured optics may have, as the summary has them.
+    `camera` and `optics` are sections of ``summary.json``, `threshold_snr` is that of the search.
 
     Shapes: `held_kda` (rows,) each: what heights or extensions that were held do to the masses.
     """
@@ -144,9 +143,9 @@ def contributions(
                    partial(_of_the_selection, threshold_snr),
                    "more light, or more frames; species, which know what was missed")
         )  # fmt: skip
-    if doubt is not None:
+    if not optics.get("calibrated", True) and "covariance" in optics:
         sources.append(
-            Source("optics as configured", "assumed", partial(_of_configured_optics, doubt),
+            Source("optics as configured", "assumed", partial(_of_configured_optics, optics),
                    "more or brighter particles, on which the optics are tested and learned")
         )  # fmt: skip
     sources += [_of_held(name, shift) for name, shift in held_kda.items() if shift.any()]
@@ -376,11 +375,11 @@ def _of_the_optics(config: Config, table: pd.DataFrame) -> Mapping[str, FloatArr
 
 
 def _of_configured_optics(
-    doubt: Mapping[str, Any], config: Config, table: pd.DataFrame
+    tested: Mapping[str, Any], config: Config, table: pd.DataFrame
 ) -> Mapping[str, FloatArray]:
-    """Give the error of configured optics that no image has confirmed."""
-    errors = OpticsCovariance(names=doubt["names"], matrix=doubt["matrix"])
-    field = config.optics.field_px or doubt["field_px"]
+    """Give the error that configured optics may have, by the images on which they were tested."""
+    errors = OpticsCovariance(names=tested["names"], matrix=tested["covariance"])
+    field = config.optics.field_px or tested.get("field_px")
     optics = config.optics.model_copy(update={"covariance": errors, "field_px": field})
     return _of_the_optics(config.model_copy(update={"optics": optics}), table)
 

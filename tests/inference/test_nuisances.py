@@ -6,13 +6,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.signal import lfilter
 
-from iscat_analysis.config import load_config
+from iscat_analysis.config import OpticsCovariance, config_to_toml, load_config
 from iscat_analysis.inference.empirical_spread import EmpiricalSpread, pooled
 from iscat_analysis.inference.fit import fit_particle
 from iscat_analysis.inference.height_spread import spread_of_heights
@@ -107,6 +108,9 @@ def test_a_wiggle_is_as_wide_as_the_model_has_it() -> None:
     assert abs(mended.mean() / MASS_KDA - 1) < 0.03
 
 
+FOCUS_LEARNED = OpticsCovariance(names=("focus_nm",), matrix=((1.0,),))
+
+
 def best_focus(shown: FloatArray) -> tuple[float, float, float]:
     """Amplitude of a point at −300 nm, shift of the focus that suits best, and amplitude there."""
     step, found = 2.0, []
@@ -131,14 +135,38 @@ def test_a_learned_focus_takes_a_part_of_a_width() -> None:
         for shown in (model("particle.wiggle_nm=10"), model())
     )
     config = load_config(None, [*SETTINGS, "background.method=sliding"])
+    learned = config.optics.model_copy(update={"covariance": FOCUS_LEARNED})
     amplitude = model().scale.amplitude(MASS_KDA)
-    shifts = response_of(config, rows(4), ("focus_nm",)).to_width(amplitude)
-    alone = response_of(config, rows(4), ()).to_width(amplitude)
+    with_learned = config.model_copy(update={"optics": learned})
+    shifts = response_of(with_learned, rows(4)).to_width(amplitude)
+    alone = response_of(config, rows(4)).to_width(amplitude)
     assert alone.left == 1
     assert 0 < shifts.left < 1
     assert (wide[0] / point[0] - 1) / variance == pytest.approx(alone.amplitude, rel=0.05)
     assert (wide[1] - point[1]) / variance == pytest.approx(shifts.optics[0], rel=0.05)
     assert (wide[2] / point[2] - 1) / variance == pytest.approx(shifts.amplitude, rel=0.05)
+
+
+def test_learned_optics_take_their_part_of_a_width_in_a_later_run_too(tmp_path: Path) -> None:
+    """The table of an analysis with its own ``config.toml`` had a smaller error.
+
+    Control: optics of a file were learned from other particles.
+    """
+    optics = CONFIG.optics.model_copy(update={"covariance": FOCUS_LEARNED, "calibrate": "never"})
+    learned = CONFIG.model_copy(update={"optics": optics})
+    path = tmp_path / "config.toml"
+    path.write_text(config_to_toml(learned), encoding="utf-8")
+    told = of_many(np.full(40, 100.0), 100.0, np.zeros(40), np.zeros(40))
+    file = optics.model_copy(update={"file": "optics.toml"})
+    first, again, other, alone = (
+        Extension.of(config, rows(40), told, {})
+        for config in (
+            learned, load_config(path), CONFIG.model_copy(update={"optics": file}), CONFIG,
+        )
+    )  # fmt: skip
+    np.testing.assert_array_equal(first.mass_shift_kda, again.mass_shift_kda)
+    assert first.variance_se_nm2 > 1.1 * alone.variance_se_nm2
+    np.testing.assert_array_equal(other.mass_shift_kda, alone.mass_shift_kda)
 
 
 @pytest.mark.parametrize("apart_nm", [100.0, 200.0])

@@ -135,10 +135,10 @@ def test_pairs_that_land_at_once_do_not_condemn_the_optics(
 
 
 def _sigma(summary: dict[str, Any], name: str) -> float:
-    """Give the standard deviation that the doubt about configured optics has."""
-    doubt = summary["doubt"]
-    k = doubt["names"].index(name)
-    return float(doubt["matrix"][k][k]) ** 0.5
+    """Give the standard deviation of a parameter of the optics of an analysis."""
+    k = summary["names"].index(name)
+    assert len(summary["values"]) == len(summary["names"]) == len(summary["covariance"])
+    return float(summary["covariance"][k][k]) ** 0.5
 
 
 @pytest.mark.parametrize("noise_differs", [False, True])
@@ -183,6 +183,8 @@ def test_few_particles_move_the_optics(
     rows = {row["parameter"]: row for row in summary["parameters"]}
     for name, value in changes.items():
         assert abs(rows[name]["value"] - value) < max(4 * rows[name]["sigma"], 0.1)
+        assert summary["values"][summary["names"].index(name)] == rows[name]["value"]
+        assert _sigma(summary, name) == pytest.approx(rows[name]["sigma"])
     assert all(row["sigma"] is not None for row in rows.values() if row["state"] != "given")
     assert _learn(monkeypatch, changes, count, "never")[0]
 

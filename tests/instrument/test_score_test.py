@@ -42,12 +42,12 @@ def test_pictures_that_pass_alone_reject_the_optics_together(changes: dict[str, 
 
 
 def test_right_optics_are_confirmed_and_what_is_not_told_keeps_its_usual_error() -> None:
-    prior = np.diag(np.array(_tested({}, 0, 0)[0].doubt.matrix))
+    prior = np.diag(_tested({}, 0, 0)[0].posterior)
     for seed in range(4):
         found, _ = _tested({}, seed)
         assert not found.rejected
         assert found.log_bayes_factor < 0
-        left = dict(zip(found.names, np.diag(np.array(found.doubt.matrix)) / prior, strict=True))
+        left = dict(zip(found.names, np.diag(found.posterior) / prior, strict=True))
         assert 0.3 < left.pop("na") < 1.0
         assert max(left.values()) < 0.25
 
@@ -57,7 +57,7 @@ def test_without_pictures_optics_have_their_usual_errors() -> None:
     assert not found.rejected
     assert found.log_bayes_factor == 0
     focus = found.names.index("focus_nm")
-    assert np.sqrt(found.doubt.matrix[focus][focus]) == pytest.approx(150.0)
+    assert np.sqrt(found.posterior[focus, focus]) == pytest.approx(150.0)
 
 
 @pytest.mark.parametrize(("height", "is_right"), [("auto", True), (5.0, False)])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from calibrations import GRID, PIXEL_NM, configuration
 from shared_errors import systematic
 
 from iscat_analysis.bounds import joint_information
@@ -22,10 +24,15 @@ from iscat_analysis.config import (
 )
 from iscat_analysis.errors import ConfigError
 from iscat_analysis.inference.counts import counts_likelihood
+from iscat_analysis.inference.noise import conditional
 from iscat_analysis.inference.noise_models import CONDITIONAL
+from iscat_analysis.instrument.joint_fit import Estimate, maximise
+from iscat_analysis.instrument.microscope import build_microscope
+from iscat_analysis.instrument.particle_image import ParticleImage
 from iscat_analysis.optics.forward import PixelGrid, forward_model
-from iscat_analysis.optics.parameters import settings_of
-from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS
+from iscat_analysis.optics.parameters import FREE, PRIMARY, free_names, prior_of, settings_of
+from iscat_analysis.records import EVENT_COLUMNS, FREE_PARAMETERS, PARAMETERS, FloatArray
+from iscat_analysis.trust.response import Response, response_of
 from iscat_analysis.trust.systematic import contributions
 
 NAMES = ("focus_nm", "na", "z8", "z11")
@@ -33,6 +40,7 @@ SIGMA = np.array([3.0, 0.003, 1.0, 1.0])
 CORRELATION = np.array([[1, 0.5, 0, -0.9], [0.5, 1, 0, -0.4], [0, 0, 1, 0], [-0.9, -0.4, 0, 1.0]])
 COVARIANCE = CORRELATION * np.outer(SIGMA, SIGMA)
 LIGHT = 1e8
+DIM, HEAVY_KDA, ROI_NM = 4e5, 2000.0, 28 * PIXEL_NM
 LINE = Calibration(
     gradient_per_kda=-3.1e-5, offset=-2e-4, optics=Optics(focus_nm=-280.0), height_nm=5.0
 )
@@ -215,14 +223,64 @@ def test_the_covariance_survives_the_way_through_a_file() -> None:
         _config(np.triu(COVARIANCE))
 
 
+def _learned(count: int, sizes: float) -> tuple[Estimate, Response, FloatArray]:
+    """Learn the optics from noiseless images whose pixels are larger by a share; predict that."""
+    config = configure(
+        configuration(), settings={"background.method": "sliding", "fit.roi_nm": ROI_NM}
+    )
+    settings, reach = settings_of(config), 2600.0
+    model = build_microscope(config, reach, settings)
+    larger = PixelGrid(*((1 + sizes) * axis for axis in (GRID.x_nm, GRID.y_nm)), GRID.pixel_nm)
+    before = np.full(GRID.shape, DIM)
+    images = []
+    for mass in [HEAVY_KDA] * count:
+        after = DIM * (1 + model.image(larger, 0.0, 0.0, 5.0, mass))
+        data = conditional(model, GRID, before, after, 1.0).data
+        images.append(ParticleImage(GRID, CONDITIONAL, data, 0.0, 0.0, 5.0, mass_kda=mass))
+    names = free_names(tuple(FREE), settings, PRIMARY)
+    found = maximise(
+        images, lambda some: build_microscope(config, reach, some), settings, names,
+        prior=prior_of(config), tolerance=1e-9,
+    )  # fmt: skip
+    errors = OpticsCovariance(names=names, matrix=tuple(map(tuple, found.bound.tolist())))
+    optics = config.optics.model_copy(update={"covariance": errors})
+    rows = pd.DataFrame({"n_before": [100], "n_after": [100]})
+    respond = response_of(config.model_copy(update={"optics": optics}), rows)
+    amplitude = float(model.scale.amplitudes(HEAVY_KDA))
+    change = (
+        model.amplitude_image(larger, 0.0, 0.0, 5.0, amplitude)
+        - model.amplitude_image(GRID, 0.0, 0.0, 5.0, amplitude)
+    ) / sizes
+    return found, respond, change
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_learned_optics_follow_a_wrong_input_as_far_as_the_prior_lets_them(count: int) -> None:
+    """Control: without the prior, amplitudes move by half as much again, or twice as much."""
+    sizes = 1e-3
+    found, respond, change = _learned(count, sizes)
+    amplitude = float(respond.model.scale.amplitudes(HEAVY_KDA))
+    middle = settings_of(configuration())
+    moved = np.array([found.values[name] - middle[name] for name in found.names]) / sizes
+    shift = (found.images[0].mass_kda / HEAVY_KDA - 1) / sizes
+    said = respond.to_input(change, amplitude)
+    np.testing.assert_allclose(
+        said.optics / found.errors, moved / found.errors, rtol=0.01, atol=0.1
+    )
+    assert said.amplitude == pytest.approx(shift, rel=0.02)
+    without = replace(respond, posterior=np.zeros_like(respond.posterior))
+    assert without.to_input(change, amplitude).amplitude / shift > 1.3
+
+
 def test_a_doubt_about_the_field_grows_from_its_centre() -> None:
     """A curved focus is another focus at (x² + y²) of the distance to the centre."""
     config = _config(**{"optics.covariance": None})
     table = _event(config, 5.0, 0.06).assign(x_px=72.0, y_px=48.0)
 
     def error(name: str, sigma: float) -> float:
-        doubt = {"names": [name], "matrix": [[sigma**2]], "field_px": [48.0, 48.0, 48.0]}
-        found = contributions(config, table, doubt=doubt)
+        tested = {"names": [name], "covariance": [[sigma**2]], "field_px": [48.0, 48.0, 48.0]}
+        assert contributions(config, table, optics=tested | {"calibrated": True}) == []
+        found = contributions(config, table, optics=tested | {"calibrated": False})
         return float({s.name: e for s, e in found}["optics as configured"]["mass_kda"][0])
 
     assert error("focus_curvature_nm", 8.0) == pytest.approx(error("focus_nm", 8.0 * 0.5**2))
